@@ -1,0 +1,62 @@
+# Verbs, not recipes: people and CI call the same ones.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+SHELL := /bin/bash
+
+# One thread per process: on few cores torch's own threads get in each other's way.
+export OMP_NUM_THREADS ?= 1
+export PYTHONHASHSEED = 0
+
+.DEFAULT_GOAL := help
+
+help: ## show the verbs
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 18
+
+install: $(STAMP) ## put everything into .venv/
+
+$(STAMP): setup.cfg pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || \
+	  { echo "Python is $$($(PYTHON) --version 2>&1), 3.10 or newer is needed; try: make PYTHON=python3.12 $(MAKECMDGOALS)"; exit 1; }
+	@test -x $(BIN)/pip || $(PYTHON) -m venv $(VENV) || \
+	  { rm -rf $(VENV); echo "Python cannot make a virtual environment; type: sudo apt install python3-venv"; exit 1; }
+	$(BIN)/python -m pip install --quiet --upgrade pip
+	$(BIN)/python -m pip install --progress-bar on --editable '.[tests]'
+	@touch $@
+
+demo: install ## train on TorcsLite-v0 and film the best lap (15 minutes; Ctrl-C keeps what was learned)
+	$(BIN)/python examples/demo.py $(DEMO_ARGS)
+
+test: install ## run every test
+	$(BIN)/python -m pytest -n 2 --durations=10
+
+pytest: install ## run the tests that do not train
+	$(BIN)/python -m pytest -n 2 -m 'not slow'
+
+bench: install ## measure speeds
+	$(BIN)/sb3-torcs bench
+
+format: install ## sort imports and format
+	$(BIN)/ruff check --select I --fix --quiet .
+	$(BIN)/ruff format .
+
+check-codestyle: install ## check the format only
+	$(BIN)/ruff check --select I .
+	$(BIN)/ruff format --check .
+
+lint: install ## lint code and hyperparameter files
+	$(BIN)/ruff check .
+	$(BIN)/yamllint --strict zoo_configs
+
+type: install ## check types
+	$(BIN)/mypy
+
+commit-checks: format lint type ## what to run before a commit
+
+ci: check-codestyle lint type test ## everything
+
+clean: ## remove what was built and trained here
+	rm -rf build dist *.egg-info demo logs $(VENV)
+
+.PHONY: help install demo test pytest bench format check-codestyle lint type commit-checks ci clean
