@@ -1,0 +1,28 @@
+"""Stable-Baselines3 for TORCS: racing environments, policies, noises and callbacks.
+
+Importing the package registers ``Torcs-v0`` and ``TorcsLite-v0``; nothing heavy is loaded.
+"""
+
+from __future__ import annotations
+
+from gymnasium.envs.registration import register, registry
+
+__all__ = ["__version__", "register_envs"]
+
+__version__ = "0.1.0"
+
+MAX_EPISODE_STEPS = 3000
+"""Decisions after which an episode is truncated: five minutes at the default action repeat."""
+
+
+def register_envs() -> None:
+    """Register both ids; calling it again changes nothing."""
+    for name, entry_point in (
+        ("TorcsLite-v0", "sb3_torcs.envs.torcs_lite:TorcsLiteEnv"),
+        ("Torcs-v0", "sb3_torcs.envs.torcs:TorcsEnv"),
+    ):
+        if name not in registry:
+            register(name, entry_point=entry_point, max_episode_steps=MAX_EPISODE_STEPS)
+
+
+register_envs()

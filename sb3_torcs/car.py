@@ -1,0 +1,82 @@
+"""What a car tells and what it is told: the two records every world speaks.
+
+SI units and radians throughout. Left is positive for steering, lateral position and yaw.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+__all__ = ["CONTROL_TICK", "CarState", "Controls", "FloatArray", "Start"]
+
+FloatArray = npt.NDArray[np.float64]
+
+CONTROL_TICK = 0.02
+"""[s] The interval at which TORCS calls its robots; one decision lasts a whole number of them."""
+
+
+class Controls(NamedTuple):
+    """What the driver asks of the car for the next control ticks."""
+
+    steering: float  # [-] in [-1, 1], 1 is full lock to the left
+    throttle: float  # [-] in [0, 1]
+    brake: float  # [-] in [0, 1]
+    gear: int | None = None  # [-] None leaves the gearbox to the automatic
+
+
+class Start(NamedTuple):
+    """Where and how an episode begins, if not on the grid."""
+
+    distance: float  # [m] along the road's axis from the start line, in [0, track length)
+    track_position: float = 0.0  # [-] 0 on the axis, 1 on the left edge, -1 on the right edge
+    heading_error: float = 0.0  # [rad] as in CarState
+    speed: float = 0.0  # [m/s] along the car's own axis
+
+
+class CarState(NamedTuple):
+    """
+    The car at one moment, as a simulator knows it. Immutable; its arrays are read-only.
+
+    Fields that the SCR server reports follow its definitions (SCR manual, arXiv:1304.1672,
+    tables 1 and 2), in SI units.
+    """
+
+    time: float  # [s] since the race began
+    x: float  # [m] mass centre, in the track's frame
+    y: float  # [m]
+    yaw: float  # [rad] direction of the car in the track's frame, in [-pi, pi]
+    yaw_rate: float  # [rad/s]
+    speed_x: float  # [m/s] along the car
+    speed_y: float  # [m/s] across the car, left positive
+    speed_z: float  # [m/s] upwards
+    height: float  # [m] of the mass centre above the surface
+    heading_error: float  # [rad] road direction minus yaw, in [-pi, pi]: positive calls for left
+    distance_from_axis: float  # [m] left positive
+    track_width: float  # [m] of the road where the car is
+    distance_from_start: float  # [m] along the axis from the start line, in [0, track length)
+    distance_raced: float  # [m] along the axis since the episode began; driving back subtracts
+    engine_speed: float  # [rad/s]
+    gear: int  # [-] -1 reverse, 0 neutral, 1 and up
+    fuel: float  # [l]
+    damage: float  # [points]
+    laps: int  # whole laps driven
+    lap_time: float  # [s] in the current lap
+    last_lap_time: float  # [s] of the last whole lap, 0 before there is one
+    best_lap_time: float  # [s] of the best whole lap, 0 before there is one
+    race_position: int  # 1 is the leader
+    wheel_speeds: FloatArray  # (4,) [rad/s] front right, front left, rear right, rear left
+    range_finders: FloatArray  # (19,) [m] to the road's edge, left to right; -1 off the road
+    opponents: FloatArray  # (36,) [m] to the nearest car per 10 degree sector, 200 if none
+
+    @property
+    def track_position(self) -> float:
+        """Lateral position [-]: 0 on the axis, 1 on the left edge, -1 on the right edge."""
+        return 2.0 * self.distance_from_axis / self.track_width
+
+    @property
+    def off_track(self) -> bool:
+        """Whether the mass centre has left the road, as the SCR server judges it."""
+        return abs(self.distance_from_axis) > 0.5 * self.track_width

@@ -1,0 +1,79 @@
+"""The errors of this package: one class per mistake, one root.
+
+Each message says what was received, what is allowed, and what to type next.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+__all__ = [
+    "BackendUnavailable",
+    "EnvClosed",
+    "InvalidAction",
+    "InvalidOption",
+    "ModelMismatch",
+    "OutputNotWritable",
+    "Sb3TorcsError",
+    "TrackFileError",
+    "TrackNotFound",
+    "UnknownRewardTerm",
+    "ZooConfigError",
+]
+
+
+class Sb3TorcsError(Exception):
+    """Root of all errors that this package raises on purpose."""
+
+
+class TrackNotFound(Sb3TorcsError, LookupError):
+    """No track has this name."""
+
+
+class TrackFileError(Sb3TorcsError, ValueError):
+    """A track file cannot be read; the message names the file and the line."""
+
+
+class InvalidOption(Sb3TorcsError, ValueError):
+    """A keyword argument or reset option has a value outside what is allowed."""
+
+
+class InvalidAction(Sb3TorcsError, ValueError):
+    """An action has the wrong shape or is not a number."""
+
+
+class UnknownRewardTerm(Sb3TorcsError, LookupError):
+    """A reward names a preset or a term that does not exist."""
+
+
+class EnvClosed(Sb3TorcsError, RuntimeError):
+    """The environment was used after ``close`` or before ``reset``."""
+
+
+class BackendUnavailable(Sb3TorcsError, RuntimeError):
+    """The simulator behind an environment is not installed."""
+
+
+class ModelMismatch(Sb3TorcsError, ValueError):
+    """A saved model does not fit the environment it is asked to drive."""
+
+
+class OutputNotWritable(Sb3TorcsError, OSError):
+    """A folder or file that results should go to cannot be written."""
+
+
+class ZooConfigError(Sb3TorcsError, ValueError):
+    """A hyperparameter file has an entry that nothing would read."""
+
+
+def near_miss(name: str, known: Iterable[str]) -> str:
+    """
+    Suggest the known name that was probably meant.
+
+    :param name: what was typed
+    :param known: the names that exist
+    :return: ``"; did you mean 'x'?"``, or an empty string when nothing is close
+    """
+    close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.6)
+    return f"; did you mean '{close[0]}'?" if close else ""

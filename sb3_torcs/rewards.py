@@ -1,0 +1,143 @@
+"""Rewards as sentences over measurements: named terms, weights, a sum.
+
+A term is a rate per second of simulated time, measured over one decision; a reward is the sum of
+weight × term × duration × scale, plus a single crash term when the episode ends badly. So the
+return of a drive does not depend on how often the agent decides.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+
+from sb3_torcs.car import CarState, Controls
+from sb3_torcs.errors import InvalidOption, UnknownRewardTerm, near_miss
+
+__all__ = ["PRESETS", "TERMS", "Reward"]
+
+Term = Callable[[CarState, CarState, Controls], float]
+
+
+def speed_along(before: CarState, after: CarState, controls: Controls) -> float:
+    """Vx cos θ [m/s]: speed along the road (Lillicrap et al., arXiv:1509.02971, section 4)."""
+    return after.speed_x * math.cos(after.heading_error)
+
+
+def speed_across(before: CarState, after: CarState, controls: Controls) -> float:
+    """|Vx sin θ| [m/s]: speed across the road, of the post's reward."""
+    return abs(after.speed_x * math.sin(after.heading_error))
+
+
+def speed_off_axis(before: CarState, after: CarState, controls: Controls) -> float:
+    """|Vx · trackPos| [m/s]: speed away from the middle of the road, of the post's reward."""
+    return abs(after.speed_x * after.track_position)
+
+
+def progress(before: CarState, after: CarState, controls: Controls) -> float:
+    """Metres of road gained per second [m/s]: exact over a decision, where speeds are samples."""
+    return (after.distance_raced - before.distance_raced) / (after.time - before.time)
+
+
+def time(before: CarState, after: CarState, controls: Controls) -> float:
+    """One per second [-]: weighted below zero, it makes haste."""
+    return 1.0
+
+
+def damage(before: CarState, after: CarState, controls: Controls) -> float:
+    """Damage per second [points/s]."""
+    return (after.damage - before.damage) / (after.time - before.time)
+
+
+def pedals(before: CarState, after: CarState, controls: Controls) -> float:
+    """Throttle × brake [-]: both pedals at once."""
+    return controls.throttle * controls.brake
+
+
+TERMS: dict[str, Term] = {
+    term.__name__: term
+    for term in (speed_along, speed_across, speed_off_axis, progress, time, damage, pedals)
+}
+
+SCALE = 0.1  # [1/m] a reward of 1 for ten metres along the road
+CRASH = -1.0  # what an episode that ends off the road, backwards, stuck or damaged costs
+
+PRESETS: dict[str, dict[str, float]] = {
+    "progress": {"speed_along": 1.0, "scale": SCALE, "crash": CRASH},
+    "blog": {
+        "speed_along": 1.0,
+        "speed_across": -1.0,
+        "speed_off_axis": -1.0,
+        "scale": SCALE,
+        "crash": CRASH,
+    },
+    "apex": {"speed_along": 1.0, "speed_across": -1.0, "scale": SCALE, "crash": CRASH},
+}
+"""``progress``: Lillicrap et al.; ``blog``: the post's; ``apex``: its final update, which leaves
+out the pull to the middle of the road."""
+
+CRASHES = frozenset({"off_track", "backwards", "stuck", "damage"})
+
+
+class Reward:
+    """
+    A weighted sum of terms.
+
+    :param reward: the name of a preset, or a mapping from names of terms to weights; the
+        mapping may also hold ``scale`` (a factor on all terms, 1 if left out) and ``crash`` (added
+        once, unscaled, when the episode ends badly, 0 if left out)
+    :raises UnknownRewardTerm: if a name is unknown
+    :raises InvalidOption: if a weight is not a finite number
+    """
+
+    def __init__(self, reward: str | Mapping[str, float]) -> None:
+        if isinstance(reward, str):
+            if reward not in PRESETS:
+                raise UnknownRewardTerm(
+                    f"no reward '{reward}'{near_miss(reward, PRESETS)} Rewards: "
+                    f"{', '.join(PRESETS)}, or a dict of weights over {', '.join(TERMS)}"
+                )
+            weights = PRESETS[reward]
+        elif isinstance(reward, Mapping):
+            weights = dict(reward)
+        else:
+            raise InvalidOption(
+                f"reward is {reward!r}; expected one of {', '.join(PRESETS)}, or a dict of weights"
+            )
+        for name, weight in weights.items():
+            if name not in TERMS and name not in ("scale", "crash"):
+                raise UnknownRewardTerm(
+                    f"no reward term '{name}'{near_miss(name, TERMS)} Terms: {', '.join(TERMS)}; "
+                    "besides them 'scale' and 'crash'"
+                )
+            if not isinstance(weight, (int, float)) or not math.isfinite(weight):
+                raise InvalidOption(
+                    f"weight of reward term '{name}' is {weight!r}; expected a number"
+                )
+        self.weights = dict(weights)
+        scale = weights.get("scale", 1.0)
+        self._crash = float(weights.get("crash", 0.0))
+        self._terms = tuple(
+            (name, TERMS[name], float(weight) * scale)
+            for name, weight in weights.items()
+            if name in TERMS
+        )
+
+    def __call__(
+        self, before: CarState, after: CarState, controls: Controls, end: str | None
+    ) -> dict[str, float]:
+        """
+        Value one decision.
+
+        :param before: the car when the decision was taken
+        :param after: the car when it had been carried out
+        :param controls: what was done
+        :param end: why the episode ended, or ``None``
+        :return: the weighted terms, ``crash`` last; their sum is the reward
+        """
+        seconds = after.time - before.time
+        terms = {
+            name: weight * seconds * term(before, after, controls)
+            for name, term, weight in self._terms
+        }
+        terms["crash"] = self._crash if end in CRASHES else 0.0
+        return terms

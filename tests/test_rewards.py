@@ -1,0 +1,80 @@
+"""Rewards: known numbers, exact sums, clear refusals."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from conftest import car_state
+
+from sb3_torcs.car import Controls
+from sb3_torcs.errors import InvalidOption, UnknownRewardTerm
+from sb3_torcs.rewards import PRESETS, TERMS, Reward
+
+GAS = Controls(0.0, 1.0, 0.0)
+BEFORE = car_state(time=1.0)
+AFTER = car_state(
+    time=1.5, speed_x=10.0, heading_error=math.pi / 6.0, distance_from_axis=-2.5, distance_raced=4.0
+)
+
+
+@pytest.mark.parametrize(
+    ("term", "value"),
+    [
+        ("speed_along", 10.0 * math.cos(math.pi / 6.0)),
+        ("speed_across", 10.0 * math.sin(math.pi / 6.0)),
+        ("speed_off_axis", 5.0),
+        ("progress", 8.0),
+        ("time", 1.0),
+        ("damage", 0.0),
+        ("pedals", 0.0),
+    ],
+)
+def test_a_term_has_its_known_value(term, value):
+    assert TERMS[term](BEFORE, AFTER, GAS) == value
+
+
+def test_a_weight_multiplies_duration_and_scale():
+    assert Reward({"speed_off_axis": -2.0, "scale": 0.1})(BEFORE, AFTER, GAS, None) == {
+        "speed_off_axis": -2.0 * 0.1 * 0.5 * 5.0,
+        "crash": 0.0,
+    }
+
+
+def test_the_post_is_the_sum_of_its_three_terms():
+    along, across = 10.0 * math.cos(math.pi / 6.0), 10.0 * math.sin(math.pi / 6.0)
+    terms = Reward("blog")(BEFORE, AFTER, GAS, None)
+    assert sum(terms.values()) == pytest.approx(0.05 * (along - across - 5.0), rel=1e-15)
+
+
+@pytest.mark.parametrize("end", ["off_track", "backwards", "stuck", "damage"])
+def test_a_crash_costs_once(end):
+    assert Reward("progress")(BEFORE, AFTER, GAS, end)["crash"] == -1.0
+
+
+@pytest.mark.parametrize("end", [None, "laps"])
+def test_a_good_end_costs_nothing(end):
+    assert Reward("progress")(BEFORE, AFTER, GAS, end)["crash"] == 0.0
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_preset_uses_known_terms(preset):
+    assert set(PRESETS[preset]) <= {*TERMS, "scale", "crash"}
+
+
+def test_an_unknown_name_offers_the_near_miss():
+    with pytest.raises(UnknownRewardTerm, match="no reward 'progres'; did you mean 'progress'?"):
+        Reward("progres")
+    with pytest.raises(UnknownRewardTerm, match="'speed_alon'; did you mean 'speed_along'?"):
+        Reward({"speed_alon": 1.0})
+
+
+@pytest.mark.parametrize("weight", [math.nan, math.inf, "1", None])
+def test_a_weight_must_be_a_number(weight):
+    with pytest.raises(InvalidOption, match="expected a number"):
+        Reward({"progress": weight})
+
+
+def test_a_reward_must_be_a_name_or_weights():
+    with pytest.raises(InvalidOption, match="reward is 3"):
+        Reward(3)
