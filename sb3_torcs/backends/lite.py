@@ -1,0 +1,103 @@
+"""The fallback world: a planar race car on a track, with no TORCS installed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from sb3_torcs.backends import lite_physics as physics
+from sb3_torcs.backends.lite_rays import Edges, cast, road_edges
+from sb3_torcs.car import CarState, Controls, FloatArray, Start
+from sb3_torcs.errors import InvalidOption
+from sb3_torcs.sensors import range_finder_angles
+from sb3_torcs.tracks import Track, load_track
+
+__all__ = ["LiteBackend"]
+
+CARS = ("car1-trb1",)
+
+
+class LiteBackend:
+    """
+    One ``car1-trb1`` alone on a track.
+
+    :param track: a name, a path, a :class:`Track`, or ``"random"`` for a new one each episode
+    :param car: ``"car1-trb1"``
+    :param range_finders: see :func:`sb3_torcs.sensors.range_finder_angles`
+    """
+
+    def __init__(
+        self,
+        track: str | Path | Track = "aalborg",
+        *,
+        car: str = "car1-trb1",
+        range_finders: str | Sequence[float] = "scr",
+    ) -> None:
+        if car not in CARS:
+            raise InvalidOption(
+                f"car is {car!r}; TorcsLite-v0 has {', '.join(CARS)}. The cars of the real game "
+                "are those of Torcs-v0"
+            )
+        self.car = car
+        self.range_finder_angles = range_finder_angles(range_finders)
+        self._random = track == "random"
+        self._set_track(load_track(track, np.random.default_rng(0) if self._random else None))
+
+    def _set_track(self, track: Track) -> None:
+        self.track = track
+        self._table: FloatArray = track.table
+        self._edges: Edges = road_edges(track)
+
+    def reset(self, rng: np.random.Generator, start: Start | None) -> CarState:
+        """Begin an episode; see :class:`~sb3_torcs.backends.base.Backend`."""
+        if self._random:
+            self._set_track(load_track("random", rng))
+        self._flying = start is not None
+        track = self.track
+        if start is None:
+            start = Start(track.length - track.grid.distance)
+            offset = track.grid.offset
+        else:
+            segment, along = track.find(start.distance)
+            width = physics.road_width(self._table, segment, along)
+            offset = 0.5 * start.track_position * width
+        x, y, heading = track.pose(start.distance, offset)
+        segment, _ = track.find(start.distance)
+        yaw = heading - start.heading_error
+        self._state = physics.place(x, y, yaw, start.speed, segment, self._table)
+        return self._read()
+
+    def step(self, controls: Controls, ticks: int) -> CarState:
+        """Drive on; see :class:`~sb3_torcs.backends.base.Backend`."""
+        gear = physics.AUTOMATIC if controls.gear is None else controls.gear
+        physics.advance(
+            self._state,
+            self._table,
+            controls.steering,
+            controls.throttle,
+            controls.brake,
+            gear,
+            ticks,
+            self._flying,
+        )
+        return self._read()
+
+    def close(self) -> None:
+        """Nothing to give back: the world is two arrays."""
+
+    def _read(self) -> CarState:
+        scalars, wheels, beams, opponents = (
+            np.empty(physics.SCALARS),
+            np.empty(4),
+            np.empty(19),
+            np.full(36, 200.0),
+        )
+        physics.read(self._state, self._table, *self._edges, self.range_finder_angles, scalars, wheels, beams)
+        for array in (wheels, beams, opponents):
+            array.flags.writeable = False
+        values = scalars.tolist()
+        values[physics.GEAR_FIELD] = int(values[physics.GEAR_FIELD])
+        values[physics.LAPS_FIELD] = int(values[physics.LAPS_FIELD])
+        return CarState(*values, 1, wheels, beams, opponents)

@@ -1,0 +1,274 @@
+"""The loop, written once: reset, step, the end of an episode, info. It names no simulator."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, ClassVar, TypedDict
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+
+from sb3_torcs.actions import ACTION_HIGH, ACTION_LOW, controls_from_action
+from sb3_torcs.backends.base import Backend
+from sb3_torcs.car import CONTROL_TICK, CarState, Controls, Start
+from sb3_torcs.errors import EnvClosed, InvalidOption
+from sb3_torcs.rewards import Reward
+from sb3_torcs.sensors import OBSERVATION_HIGH, OBSERVATION_LOW, encode
+
+__all__ = ["RacingEnv", "RacingInfo"]
+
+Observation = npt.NDArray[np.float32]
+
+STUCK_SPEED = 5.0 / 3.6  # [m/s] along the road; slower than walking counts as standing
+STUCK_TICKS = 75  # control ticks of standing that end an episode: 1.5 s
+GRACE_TICKS = 150  # 3 s to get going after a standing start
+BACKWARDS_ANGLE = 0.5 * math.pi  # [rad] to the road from which the car faces backwards
+MAX_DAMAGE = 10000.0  # [points] at which TORCS takes a car out of the race
+
+# A random start: anywhere on the track, near the axis, roughly along it, at any moderate speed.
+RANDOM_TRACK_POSITION = 0.6  # [-]
+RANDOM_HEADING_ERROR = 0.25  # [rad]
+RANDOM_SPEED = 30.0  # [m/s]
+STARTS = ("grid", "random")
+RESET_OPTIONS = ("distance", "track_position", "heading_error", "speed")
+
+
+class RacingInfo(TypedDict, total=False):
+    """What ``info`` holds. ``lap_time`` and ``end`` are there only when there is one."""
+
+    laps: int  # whole laps driven in this episode
+    lap_time: float  # [s] of the lap that was just completed
+    best_lap_time: float | None  # [s] of the best whole lap
+    distance: float  # [m] along the road since the episode began
+    off_track: bool
+    damage: float  # [points]
+    reward_terms: dict[str, float]  # they sum to the reward exactly
+    car: CarState  # everything else
+    end: str  # why the episode ended
+
+
+class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
+    """
+    A car on a track, driven by three numbers.
+
+    :param backend: the world
+    :param reward: a preset, or a mapping from terms to weights; see :mod:`sb3_torcs.rewards`
+    :param action_repeat: control ticks of 0.02 s per decision
+    :param start: ``"grid"``, or ``"random"``: anywhere on the track, moving
+    :param laps: whole laps after which the episode is truncated; ``None`` drives on
+    :param render_mode: ``None``, ``"rgb_array"`` or ``"human"``
+    :raises InvalidOption: if an option has a value that is not allowed
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {
+        "render_modes": ["rgb_array", "human"],
+        "render_fps": 10,
+    }
+
+    def __init__(
+        self,
+        backend: Backend,
+        *,
+        reward: str | Mapping[str, float] = "progress",
+        action_repeat: int = 5,
+        start: str = "grid",
+        laps: int | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        if not isinstance(action_repeat, int) or action_repeat < 1:
+            raise InvalidOption(f"action_repeat is {action_repeat!r}; expected a whole number >= 1")
+        if laps is not None and (not isinstance(laps, int) or laps < 1):
+            raise InvalidOption(f"laps is {laps!r}; expected a whole number >= 1, or None")
+        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
+            raise InvalidOption(
+                f"render_mode is {render_mode!r}; expected None, 'rgb_array' or 'human'"
+            )
+        self.backend = backend
+        self.action_repeat = action_repeat
+        self.laps = laps
+        self.render_mode = render_mode
+        self.metadata = {
+            **self.metadata,
+            "render_fps": round(1.0 / (action_repeat * CONTROL_TICK)),
+        }
+        self.observation_space = spaces.Box(OBSERVATION_LOW, OBSERVATION_HIGH, dtype=np.float32)
+        self.action_space = spaces.Box(
+            np.array(ACTION_LOW, np.float32), np.array(ACTION_HIGH, np.float32)
+        )
+        self.set_reward(reward)
+        self.set_start(start)
+        self.car: CarState | None = None
+        self._controls = Controls(0.0, 0.0, 0.0)
+        self._viewer: Any = None
+        self._closed = False
+
+    def set_reward(self, reward: str | Mapping[str, float]) -> str | Mapping[str, float] | None:
+        """
+        Value decisions by another reward from now on.
+
+        :param reward: as in the constructor
+        :return: the reward until now
+        """
+        previous = getattr(self, "_reward_choice", None)
+        self._reward = Reward(reward)
+        self._reward_choice = reward
+        return previous
+
+    def set_start(self, start: str) -> str | None:
+        """
+        Begin episodes elsewhere from the next reset on.
+
+        :param start: ``"grid"`` or ``"random"``
+        :return: the start until now
+        """
+        if start not in STARTS:
+            raise InvalidOption(f"start is {start!r}; expected 'grid' or 'random'")
+        previous = getattr(self, "_start", None)
+        self._start = start
+        return previous
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """
+        Begin an episode.
+
+        :param seed: makes all chance of this and the following episodes repeatable
+        :param options: a place to start from: ``distance`` [m] along the road, ``track_position``
+            [-1 to 1], ``heading_error`` [rad] and ``speed`` [m/s]; what is left out is 0
+        :return: the observation and ``info``
+        """
+        if self._closed:
+            raise EnvClosed("reset after close; make a new environment with gym.make")
+        super().reset(seed=seed)
+        start = self._place(options) if options else self._draw_start()
+        self.car = self.backend.reset(self.np_random, start)
+        self._controls = Controls(0.0, 0.0, 0.0)
+        self._patience = STUCK_TICKS if start is not None and start.speed > 0.0 else GRACE_TICKS
+        self._standing = 0
+        if self.render_mode == "human":
+            self.render()
+        return encode(self.car), dict(self._info(self.car, {}, None))
+
+    def step(
+        self, action: npt.NDArray[np.float32]
+    ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """
+        Hold an action for ``action_repeat`` control ticks.
+
+        :param action: (3,) steering [-1, 1], throttle [0, 1], brake [0, 1]
+        :return: observation, reward, terminated, truncated, info
+        :raises InvalidAction: if the action has another shape or is not a number
+        """
+        if self._closed or self.car is None:
+            when = "close" if self._closed else "reset"
+            remedy = "make a new environment" if self._closed else "call reset first"
+            raise EnvClosed(f"step {'after' if self._closed else 'before'} {when}; {remedy}")
+        before, self._controls = self.car, controls_from_action(action)
+        self.car = after = self.backend.step(self._controls, self.action_repeat)
+        end = self._end(after)
+        terms = self._reward(before, after, self._controls, end)
+        info = self._info(after, terms, end)
+        if after.laps > before.laps:
+            info["lap_time"] = after.last_lap_time
+        if self.render_mode == "human":
+            self.render()
+        terminated = end is not None and end != "laps"
+        return encode(after), sum(terms.values()), terminated, end == "laps", dict(info)
+
+    def render(self) -> npt.NDArray[np.uint8] | None:  # type: ignore[override]
+        """
+        Draw the road and the car from above.
+
+        :return: (height, width, 3) in the mode ``"rgb_array"``, else ``None``
+        """
+        if self.render_mode is None:
+            gym.logger.warn('render without a mode: gym.make(..., render_mode="rgb_array")')
+            return None
+        if self.car is None:
+            raise EnvClosed("render before reset; call reset first")
+        if self._viewer is None:
+            from sb3_torcs.rendering import Viewer  # graphics load only when somebody looks
+
+            self._viewer = Viewer(mode=self.render_mode, fps=self.metadata["render_fps"])
+        angles = self.backend.range_finder_angles
+        frame: npt.NDArray[np.uint8] = self._viewer.frame(
+            self.backend.track, self.car, self._controls, angles
+        )
+        return frame if self.render_mode == "rgb_array" else None
+
+    def close(self) -> None:
+        """Give back the window and the world. Calling it twice does no harm."""
+        if self._closed:
+            return
+        self._closed = True
+        if self._viewer is not None:
+            self._viewer.close()
+        self.backend.close()
+
+    def _end(self, car: CarState) -> str | None:
+        """Say why the episode is over, if it is."""
+        if self.laps is not None and car.laps >= self.laps:
+            return "laps"
+        if car.off_track:
+            return "off_track"
+        if abs(car.heading_error) > BACKWARDS_ANGLE:
+            return "backwards"
+        if car.damage >= MAX_DAMAGE:
+            return "damage"
+        if car.speed_x * math.cos(car.heading_error) >= STUCK_SPEED:
+            self._standing, self._patience = 0, STUCK_TICKS
+            return None
+        self._standing += self.action_repeat
+        return "stuck" if self._standing > self._patience else None
+
+    def _info(self, car: CarState, terms: dict[str, float], end: str | None) -> RacingInfo:
+        info = RacingInfo(
+            laps=car.laps,
+            best_lap_time=car.best_lap_time or None,
+            distance=car.distance_raced,
+            off_track=car.off_track,
+            damage=car.damage,
+            reward_terms=terms,
+            car=car,
+        )
+        if end is not None:
+            info["end"] = end
+        return info
+
+    def _draw_start(self) -> Start | None:
+        if self._start == "grid":
+            return None
+        draw = self.np_random.uniform
+        return Start(
+            draw(0.0, self.backend.track.length),
+            draw(-RANDOM_TRACK_POSITION, RANDOM_TRACK_POSITION),
+            draw(-RANDOM_HEADING_ERROR, RANDOM_HEADING_ERROR),
+            draw(0.0, RANDOM_SPEED),
+        )
+
+    def _place(self, options: dict[str, Any]) -> Start:
+        """Read the options of ``reset``."""
+        for name, value in options.items():
+            if name not in RESET_OPTIONS:
+                raise InvalidOption(
+                    f"unknown reset option {name!r}; allowed: {', '.join(RESET_OPTIONS)}"
+                )
+            if not isinstance(value, (int, float)) or not math.isfinite(value):
+                raise InvalidOption(f"reset option {name} is {value!r}; expected a number")
+        values = {name: float(options.get(name, 0.0)) for name in RESET_OPTIONS}
+        if abs(values["track_position"]) > 1.0:
+            raise InvalidOption(
+                f"track_position is {values['track_position']:g}; expected -1 (right edge) to 1"
+            )
+        if values["speed"] < 0.0:
+            raise InvalidOption(f"speed is {values['speed']:g} m/s; expected 0 or more")
+        return Start(
+            values["distance"] % self.backend.track.length,
+            values["track_position"],
+            values["heading_error"],
+            values["speed"],
+        )

@@ -1,0 +1,49 @@
+"""``TorcsLite-v0``: the racing environment with no TORCS installed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from sb3_torcs.backends.lite import LiteBackend
+from sb3_torcs.envs.racing import RacingEnv
+from sb3_torcs.tracks import Track
+
+__all__ = ["TorcsLiteEnv"]
+
+
+class TorcsLiteEnv(RacingEnv):
+    """
+    A planar ``car1-trb1`` on a TORCS track.
+
+    :param track: ``"aalborg"``, ``"road/aalborg"``, the path of a track file, a ``Track``, or
+        ``"random"`` for a new closed track each episode, drawn from the seed
+    :param car: ``"car1-trb1"``
+    :param reward: ``"progress"``, ``"blog"``, ``"apex"``, or a dict of weights
+    :param action_repeat: control ticks of 0.02 s per decision
+    :param range_finders: ``"scr"``, ``"narrow"``, or 19 angles in degrees
+    :param start: ``"grid"`` or ``"random"``
+    :param laps: whole laps after which the episode is truncated
+    :param render_mode: ``"rgb_array"`` or ``"human"``
+    """
+
+    def __init__(
+        self,
+        *,
+        track: str | Path | Track = "aalborg",
+        car: str = "car1-trb1",
+        reward: str | Mapping[str, float] = "progress",
+        action_repeat: int = 5,
+        range_finders: str | Sequence[float] = "scr",
+        start: str = "grid",
+        laps: int | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        super().__init__(
+            LiteBackend(track, car=car, range_finders=range_finders),
+            reward=reward,
+            action_repeat=action_repeat,
+            start=start,
+            laps=laps,
+            render_mode=render_mode,
+        )

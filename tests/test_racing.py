@@ -1,0 +1,171 @@
+"""The loop: what ends an episode, what info holds, what reset does."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from conftest import ScriptedBackend
+
+from sb3_torcs.car import Controls, Start
+from sb3_torcs.envs.racing import RacingEnv
+from sb3_torcs.errors import EnvClosed, InvalidAction, InvalidOption
+
+GAS = np.array([0.0, 1.0, 0.0], np.float32)
+
+
+def run(track, *states, **options):
+    """Reset, then one step per given state; return the last step's answer."""
+    env = RacingEnv(ScriptedBackend(track, *states), **options)
+    env.reset(seed=0)
+    answer = None
+    for _ in states:
+        answer = env.step(GAS)
+    return answer
+
+
+@pytest.mark.parametrize(
+    ("state", "end"),
+    [
+        ({"distance_from_axis": 5.01}, "off_track"),
+        ({"distance_from_axis": -5.01}, "off_track"),
+        ({"heading_error": 1.6}, "backwards"),
+        ({"damage": 10000.0}, "damage"),
+    ],
+)
+def test_a_crash_terminates_and_says_why(oval, state, end):
+    _, _, terminated, truncated, info = run(oval, state)
+    assert (terminated, truncated, info["end"]) == (True, False, end)
+    assert info["reward_terms"]["crash"] == -1.0
+
+
+def test_the_laps_asked_for_truncate(oval):
+    _, _, terminated, truncated, info = run(oval, {"laps": 2, "last_lap_time": 80.0}, laps=2)
+    assert (terminated, truncated, info["end"], info["lap_time"]) == (False, True, "laps", 80.0)
+    assert info["reward_terms"]["crash"] == 0.0
+
+
+def test_the_edge_of_the_road_is_still_on_it(oval):
+    _, _, terminated, _, info = run(oval, {"distance_from_axis": 5.0})
+    assert not terminated
+    assert not info["off_track"]
+
+
+def test_a_standing_car_is_stuck_after_the_grace_of_the_start(oval):
+    env = RacingEnv(ScriptedBackend(oval, *[{"speed_x": 0.0}] * 40))
+    env.reset(seed=0)
+    ended = [env.step(GAS)[2] for _ in range(31)]
+    assert ended == [False] * 30 + [True]  # 3.0 s of 0.1 s decisions may pass
+
+
+def test_a_car_that_stops_on_the_way_is_stuck_sooner(oval):
+    states = [{"speed_x": 20.0}] + [{"speed_x": 1.0}] * 20
+    env = RacingEnv(ScriptedBackend(oval, *states))
+    env.reset(seed=0)
+    ended = [env.step(GAS)[2] for _ in range(17)]
+    assert ended == [False] * 16 + [True]  # 1.5 s after the one fast decision
+
+
+def test_lap_time_is_in_info_only_when_a_lap_was_just_completed(oval):
+    first = {"laps": 1, "last_lap_time": 70.5, "best_lap_time": 70.5}
+    env = RacingEnv(ScriptedBackend(oval, first, first))
+    env.reset(seed=0)
+    assert env.step(GAS)[4]["lap_time"] == 70.5
+    info = env.step(GAS)[4]
+    assert "lap_time" not in info
+    assert info["best_lap_time"] == 70.5
+
+
+def test_controls_are_held_for_the_action_repeat(oval):
+    env = RacingEnv(ScriptedBackend(oval), action_repeat=7)
+    env.reset(seed=0)
+    env.step(np.array([0.5, 2.0, -1.0], np.float32))
+    assert env.backend.calls[-1] == ("step", Controls(0.5, 1.0, 0.0), 7)
+
+
+def test_reset_options_place_the_car(oval):
+    env = RacingEnv(ScriptedBackend(oval))
+    env.reset(seed=0, options={"distance": 100.0, "speed": 20.0, "track_position": 0.5})
+    assert env.backend.calls[-1] == ("reset", Start(100.0, 0.5, 0.0, 20.0))
+
+
+def test_random_starts_are_on_the_road_and_follow_the_seed(oval):
+    def starts(seed):
+        env = RacingEnv(ScriptedBackend(oval), start="random")
+        env.reset(seed=seed)
+        for _ in range(50):
+            env.reset()
+        return [call[1] for call in env.backend.calls]
+
+    assert starts(1) == starts(1)
+    assert starts(1) != starts(2)
+    for start in starts(1):
+        assert 0.0 <= start.distance < oval.length
+        assert abs(start.track_position) < 1.0
+        assert start.speed >= 0.0
+
+
+def test_setting_the_start_returns_the_one_before(oval):
+    env = RacingEnv(ScriptedBackend(oval))
+    assert env.set_start("random") == "grid"
+    env.reset(seed=0)
+    assert env.backend.calls[-1][1] is not None
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"action_repeat": 0}, "action_repeat is 0; expected a whole number >= 1"),
+        ({"laps": 0}, "laps is 0"),
+        ({"start": "pits"}, "start is 'pits'; expected 'grid' or 'random'"),
+        ({"render_mode": "ansi"}, "render_mode is 'ansi'"),
+    ],
+)
+def test_a_bad_option_says_what_is_allowed(oval, options, message):
+    with pytest.raises(InvalidOption, match=message):
+        RacingEnv(ScriptedBackend(oval), **options)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"place": 3.0}, "unknown reset option 'place'"),
+        ({"speed": math.nan}, "reset option speed is nan"),
+        ({"speed": -1.0}, "expected 0 or more"),
+        ({"track_position": 2.0}, "expected -1"),
+    ],
+)
+def test_a_bad_reset_option_says_what_is_allowed(oval, options, message):
+    with pytest.raises(InvalidOption, match=message):
+        RacingEnv(ScriptedBackend(oval)).reset(options=options)
+
+
+@pytest.mark.parametrize("actuator", ["steering", "throttle", "brake"])
+def test_nan_names_the_actuator(oval, actuator):
+    env = RacingEnv(ScriptedBackend(oval))
+    env.reset(seed=0)
+    action = np.zeros(3, np.float32)
+    action[["steering", "throttle", "brake"].index(actuator)] = np.nan
+    with pytest.raises(InvalidAction, match=f"{actuator} is nan"):
+        env.step(action)
+
+
+def test_a_wrong_shape_says_the_right_one(oval):
+    env = RacingEnv(ScriptedBackend(oval))
+    env.reset(seed=0)
+    with pytest.raises(InvalidAction, match=r"shape \(2,\), expected \(3,\)"):
+        env.step(np.zeros(2, np.float32))
+
+
+def test_an_environment_out_of_use_says_what_to_do(oval):
+    env = RacingEnv(ScriptedBackend(oval))
+    with pytest.raises(EnvClosed, match="call reset first"):
+        env.step(GAS)
+    env.close()
+    env.close()
+    assert env.backend.closed == 1
+    with pytest.raises(EnvClosed, match="after close"):
+        env.reset()
+    with pytest.raises(EnvClosed, match="after close"):
+        env.step(GAS)
