@@ -1,0 +1,247 @@
+"""What every world owes every agent, over every id. A new world joins by one line in ``WORLDS``."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import pickle
+import subprocess
+import sys
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env as check_gymnasium
+from gymnasium.utils.env_checker import data_equivalence
+from stable_baselines3.common.env_checker import check_env as check_sb3
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+
+import sb3_torcs
+from sb3_torcs.drivers import ScriptedDriver
+from sb3_torcs.errors import BackendUnavailable
+
+WORLDS = ["TorcsLite-v0"]
+
+ROLLOUT = """
+import sys, hashlib, gymnasium as gym, numpy as np, sb3_torcs
+env = gym.make(sys.argv[1], start="random")
+env.action_space.seed(7)
+digest = hashlib.sha256(env.reset(seed=7)[0].tobytes())
+for _ in range(300):
+    observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
+    digest.update(observation.tobytes() + np.float64(reward).tobytes())
+    if terminated or truncated:
+        digest.update(env.reset()[0].tobytes())
+print(digest.hexdigest())
+"""
+
+
+@pytest.fixture(params=WORLDS)
+def world(request):
+    return request.param
+
+
+def rollout(world, seed, steps=300, **options):
+    """Drive with seeded random actions; return everything that was seen."""
+    env = gym.make(world, **options)
+    env.action_space.seed(seed)
+    seen = [env.reset(seed=seed)]
+    for _ in range(steps):
+        answer = env.step(env.action_space.sample())
+        seen.append(answer)
+        if answer[2] or answer[3]:
+            seen.append(env.reset())
+    env.close()
+    return seen
+
+
+def assert_equal(first, second):
+    for step, (one, other) in enumerate(zip(first, second, strict=True)):
+        assert data_equivalence(one, other, exact=True), f"step {step}: {one} != {other}"
+
+
+def test_gymnasium_finds_nothing_to_warn_of(world):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env = gym.make(world, render_mode="rgb_array")
+        check_gymnasium(env.unwrapped)
+        env.close()
+
+
+def test_stable_baselines3_finds_nothing_to_warn_of(world):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", message="We recommend you to use a symmetric")
+        env = gym.make(world)
+        check_sb3(env.unwrapped)
+        env.close()
+
+
+@pytest.mark.parametrize("start", ["grid", "random"])
+def test_the_same_seed_gives_the_same_bytes(world, start):
+    assert_equal(rollout(world, 3, start=start), rollout(world, 3, start=start))
+
+
+def test_the_same_seed_gives_the_same_bytes_in_another_process(world):
+    def digest(hash_seed):
+        return subprocess.run(
+            [sys.executable, "-c", ROLLOUT, world],
+            capture_output=True,
+            text=True,
+            check=True,
+            env={**os.environ, "PYTHONHASHSEED": hash_seed},
+        ).stdout
+
+    namespace = {}
+    argv, sys.argv = sys.argv, ["", world]
+    try:
+        exec(ROLLOUT.replace("print(", "result = ("), namespace)  # noqa: S102
+    finally:
+        sys.argv = argv
+    assert digest("1").strip() == digest("2").strip() == namespace["result"]
+    assert len(namespace["result"]) == hashlib.sha256().digest_size * 2
+
+
+def test_another_seed_gives_another_drive(world):
+    one, other = rollout(world, 1, 5, start="random"), rollout(world, 2, 5, start="random")
+    assert not np.array_equal(one[0][0], other[0][0])
+
+
+def test_environments_side_by_side_do_not_share_state(world):
+    alone = rollout(world, 5, 100)
+    first, second = gym.make(world), gym.make(world)
+    first.action_space.seed(5)
+    seen = [first.reset(seed=5)]
+    second.reset(seed=99)
+    for _ in range(100):
+        action = first.action_space.sample()
+        answer = first.step(action)
+        seen.append(answer)
+        if second.step(np.array([0.3, 1.0, 0.0], np.float32))[2]:
+            second.reset()
+        if answer[2] or answer[3]:
+            seen.append(first.reset())
+    assert_equal(alone, seen)
+
+
+def test_observations_stay_in_their_space(world):
+    env = gym.make(world)
+    for answer in rollout(world, 11, 500, start="random"):
+        assert env.observation_space.contains(answer[0]), answer[0]
+
+
+def test_no_memory_is_shared_between_steps(world):
+    env = gym.make(world)
+    first, info = env.reset(seed=0)
+    kept, car = first.copy(), info["car"]
+    beams = car.range_finders.copy()
+    second = env.step(np.array([0.1, 1.0, 0.0], np.float32))[0]
+    second[:] = 0.5
+    env.step(np.array([0.1, 1.0, 0.0], np.float32))
+    np.testing.assert_array_equal(first, kept)
+    np.testing.assert_array_equal(car.range_finders, beams)
+    assert not car.range_finders.flags.writeable
+
+
+def test_no_sensor_is_dead(world):
+    driver, env = ScriptedDriver(), gym.make(world, start="random")
+    rows = []
+    for seed in range(4):
+        observation, _ = env.reset(seed=seed)
+        for _ in range(100):
+            rows.append(observation)
+            observation, _, terminated, _, _ = env.step(driver.predict(observation)[0])
+            if terminated:
+                break
+    dead = np.flatnonzero(np.ptp(rows, axis=0) == 0.0).tolist()
+    flat = [23]  # speed_z: a plane has none
+    assert dead == (flat if world == "TorcsLite-v0" else [])
+
+
+def test_the_reward_is_the_sum_of_its_terms(world):
+    for _, reward, _, _, info in (s for s in rollout(world, 2, reward="blog") if len(s) == 5):
+        assert sum(info["reward_terms"].values()) == reward
+
+
+def test_info_has_what_it_promises(world):
+    _, _, _, _, info = rollout(world, 4, 1)[1]
+    assert {"laps", "best_lap_time", "distance", "off_track", "damage", "reward_terms"} <= set(info)
+
+
+def test_actions_out_of_range_are_clipped(world):
+    def first_step(action):
+        env = gym.make(world, disable_env_checker=True)
+        env.reset(seed=0)
+        return env.step(np.array(action, np.float32))[:2]
+
+    assert_equal([first_step([9.0, 5.0, -3.0])], [first_step([1.0, 1.0, 0.0])])
+
+
+def test_a_closed_environment_can_be_closed_again(world):
+    env = gym.make(world)
+    env.reset()
+    env.close()
+    env.close()
+
+
+def test_an_environment_survives_pickling(world):
+    env = gym.make(world)
+    env.reset(seed=0)
+    copy = pickle.loads(pickle.dumps(env.unwrapped))
+    assert_equal([copy.reset(seed=1)], [env.unwrapped.reset(seed=1)])
+
+
+def test_action_repeat_holds_the_controls(world):
+    action = np.array([0.05, 0.8, 0.0], np.float32)
+    fine, coarse = gym.make(world, action_repeat=1), gym.make(world, action_repeat=5)
+    fine.reset(seed=0)
+    coarse.reset(seed=0)
+    for _ in range(5):
+        last = fine.step(action)[0]
+    np.testing.assert_array_equal(last, coarse.step(action)[0])
+
+
+@pytest.mark.parametrize("kind", ["dummy", "spawn", "forkserver"])
+def test_vector_environments_drive_as_one_alone(world, kind):
+    """Also where the children must import the package themselves."""
+    choice = (
+        {"vec_env_cls": DummyVecEnv}
+        if kind == "dummy"
+        else {"vec_env_cls": SubprocVecEnv, "vec_env_kwargs": {"start_method": kind}}
+    )
+    vector = make_vec_env(f"sb3_torcs:{world}", n_envs=2, seed=5, **choice)
+    try:
+        single = gym.make(world)
+        observations, expected = vector.reset(), single.reset(seed=6)[0]
+        np.testing.assert_array_equal(observations[1], expected)
+        action = np.array([0.1, 0.7, 0.0], np.float32)
+        for _ in range(10):
+            observations = vector.step(np.stack([action, action]))[0]
+            expected = single.step(action)[0]
+        np.testing.assert_array_equal(observations[1], expected)
+    finally:
+        vector.close()
+
+
+def test_nothing_graphical_loads_before_the_first_picture(world):
+    code = (
+        "import sys, gymnasium as gym\n"
+        f"env = gym.make('sb3_torcs:{world}', render_mode='rgb_array')\n"
+        "env.reset(seed=0); env.step(env.action_space.sample())\n"
+        "print([m for m in ('pygame', 'matplotlib', 'highway_env', 'torch') if m in sys.modules])"
+    )
+    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert answer.stdout.strip() == "[]"
+
+
+def test_importing_the_package_twice_registers_once():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        sb3_torcs.register_envs()
+
+
+def test_the_real_game_is_never_replaced_in_silence():
+    with pytest.raises(BackendUnavailable, match="TorcsLite-v0"):
+        gym.make("sb3_torcs:Torcs-v0", track="aalborg")
