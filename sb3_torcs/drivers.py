@@ -18,11 +18,11 @@ _WHERE = feature_slices()
 STEERING_GAIN = 2.5  # [1/rad] steering per angle to where the road is longest
 CENTRING = 0.12  # [-] steering per track position
 LOOK = 3  # range finders on each side of the longest that also count
-BRAKING = 6.0  # [m/s²] what the driver trusts the brakes with
+BRAKING = 5.0  # [m/s²] what the driver trusts the brakes with
 CORNER_SPEED = 9.0  # [m/s] through a bend of which nothing is seen ahead
 TOP_SPEED = 70.0  # [m/s]
 PEDAL_GAIN = 0.35  # [s/m] pedal per difference of speed
-MAX_BRAKE = 0.4  # [-] more locks the rear wheels
+MAX_BRAKE = 0.3  # [-] more locks the rear wheels
 SLIP_LIMIT = 2.0  # [m/s] of wheel slip before the driver lifts
 
 

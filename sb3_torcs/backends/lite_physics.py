@@ -150,7 +150,9 @@ def locate(state: Floats, track: Floats) -> None:
             side = 1.0 if curvature > 0.0 else -1.0
             radius = 1.0 / abs(curvature)
             inward = radius - side * left  # from the centre of the arc towards the start
-            along = math.atan2(ahead, inward) * radius
+            # Measured from the middle of the arc, so that one of more than half a turn works too.
+            half = 0.5 * abs(curvature) * track[segment, column.LENGTH]
+            along = (_wrap(math.atan2(ahead, inward) - half) + half) * radius
             offset = side * (radius - math.sqrt(ahead * ahead + inward * inward))
         if along < 0.0:
             segment = (segment - 1) % n
