@@ -143,7 +143,7 @@ class Track:
     start_x: float = 0.0
     start_y: float = 0.0
     start_heading: float = 0.0
-    grid: Grid = Grid(distance=10.0, offset=0.0)
+    grid: Grid = field(default=Grid(distance=10.0, offset=0.0))
 
     @functools.cached_property
     def length(self) -> float:
@@ -362,7 +362,8 @@ def load_track(
         if name in (candidate, candidate.rpartition("/")[2]):
             return _read(path, source)
     known = [key for full in _known_files() for key in (full.rpartition("/")[2], full)]
-    raise TrackNotFound(f"no track '{name}'{near_miss(name, known)} `sb3-torcs tracks` lists them")
+    hint = near_miss(name, known) or ";"
+    raise TrackNotFound(f"no track '{name}'{hint} `sb3-torcs tracks` lists them")
 
 
 def available_tracks() -> list[TrackSummary]:

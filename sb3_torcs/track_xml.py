@@ -1,0 +1,372 @@
+"""The track files of TORCS: XML, versions 3 and 4 of the format.
+
+A track file is a tree of sections holding numbers and texts. The road is a list of segments:
+``str`` has a length, ``lft`` and ``rgt`` have a radius, an arc and perhaps another radius at the
+end. What a segment does not say of its sides, it inherits from the segment before it. The rules
+are those of the game's loader (``src/modules/track/track3.cpp`` and ``track4.cpp`` of TORCS
+1.3.7); elevation, banking, pits, cameras and graphics are not read: the world is a plane.
+
+Beside the road come a border (a kerb), a side (grass, sand, more asphalt) and the barrier. Border
+and side become one strip of ground with the surface of the wider one, and the barrier stands at
+its outer edge.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from sb3_torcs.errors import TrackFileError
+from sb3_torcs.torcs_params import Section, read_params
+from sb3_torcs.tracks import Grid, Segment, Surface, Track
+
+__all__ = ["read_track_xml"]
+
+LEFT, RIGHT = "left", "right"
+MAX_STEPS = 10_000  # [-] of one segment; the game's tracks stay below a hundred
+SAMPLES_PER_ARC = 36  # as TORCS does when it looks for the corner of its map
+
+
+@dataclass
+class _Verge:
+    """What stands beside the road on one side; segments hand it on to the next."""
+
+    side: str
+    end_width: float = 0.0  # [m] of the side
+    material: str = "grass"
+    border_width: float = 0.0  # [m]
+    border_material: str = "grass"
+    barrier_material: str = "barrier"
+
+
+class _Strip(NamedTuple):
+    """The ground beside one segment."""
+
+    start: float  # [m]
+    end: float  # [m]
+    surface: Surface
+    wall: Surface
+
+    def at(self, fraction: float) -> float:
+        """
+        Return the width of the strip [m].
+
+        :param fraction: of the segment's length
+        """
+        return self.start + fraction * (self.end - self.start)
+
+
+class _Builder:
+    """Lays the road segment by segment."""
+
+    def __init__(self, root: Section, version: int) -> None:
+        self.root = root
+        self.version = version
+        self.main = root.child("Main Track")
+        self.width = self.main.numbers.get("width", 15.0)
+        if self.width <= 0.0:
+            raise TrackFileError(f"{self.main.place}: the road's width has to be above 0")
+        self.step_length = self.main.numbers.get("profil steps length", 0.0)
+        self.material = self.main.texts.get("surface", "asphalt")
+        self.verges = {side: _Verge(side) for side in (LEFT, RIGHT)}
+        for verge in self.verges.values():
+            verge.end_width = self._of(self.main, verge, "side").number("width", 0.0)
+            self._update(self.main, verge)
+        self.segments: list[Segment] = []
+        self.fine: list[Segment] = []
+        """The same road in the steps of the game's loader."""
+
+    def _of(self, section: Section, verge: _Verge, part: str) -> _Keys:
+        """
+        Find what a section says of a part of the verge.
+
+        :param section: of the segment, or the one with the defaults
+        :param verge: left or right
+        :param part: ``"side"``, ``"border"`` or ``"barrier"``
+        :return: the way to the values
+        """
+        if self.version >= 4:
+            return _Keys(section.child(f"{verge.side.title()} {part.title()}"), "")
+        return _Keys(section, f"{verge.side[0]}{part} ")
+
+    def _update(self, section: Section, verge: _Verge) -> None:
+        """
+        Hand on what a section changes of the verge, but for the side's width.
+
+        :param section: of the segment, or the one with the defaults
+        :param verge: is changed
+        """
+        border = self._of(section, verge, "border")
+        # Version 3 knows one barrier for the whole track.
+        barrier = self._of(section if self.version >= 4 else self.main, verge, "barrier")
+        verge.material = self._of(section, verge, "side").text("surface", verge.material)
+        verge.border_width = border.number("width", verge.border_width)
+        verge.border_material = border.text("surface", verge.border_material)
+        verge.barrier_material = barrier.text("surface", verge.barrier_material)
+
+    def _strip(self, section: Section, verge: _Verge) -> _Strip:
+        """
+        Work out the ground beside a segment.
+
+        :param section: of the segment
+        :param verge: is handed on to the next segment
+        :return: the ground
+        """
+        self._update(section, verge)
+        side = self._of(section, verge, "side")
+        start = side.number("start width", verge.end_width)
+        end = start if self.version < 4 else side.number("width", start)
+        end = side.number("end width", end)
+        verge.end_width = end
+        border = max(verge.border_width, 0.0)
+        wider = verge.material if start + end >= 2.0 * border else verge.border_material
+        return _Strip(
+            border + max(start, 0.0),
+            border + max(end, 0.0),
+            self.surface(wider),
+            self.surface(verge.barrier_material),
+        )
+
+    def surface(self, name: str) -> Surface:
+        """
+        Look up a surface; one that is not defined has the game's defaults.
+
+        :param name: of the surface
+        :return: the surface
+        """
+        inside = () if self.version >= 4 else ("List",)
+        numbers = self.root.child("Surfaces", *inside, name).numbers
+        return Surface(
+            name,
+            numbers.get("friction", 0.8),
+            numbers.get("rolling resistance", 0.001),
+            numbers.get("rebound", 0.5 if self.version >= 4 else 1.0),
+            numbers.get("dammage", 10.0),
+        )
+
+    def add(self, section: Section) -> None:
+        """
+        Add one segment of the file.
+
+        :param section: of the segment
+        """
+        self.material = section.texts.get("surface", self.material)
+        road = self.surface(self.material)
+        left, right = (self._strip(section, verge) for verge in self.verges.values())
+        bends = list(self._bends(section))
+        fine = []
+        for i, (length, curvature) in enumerate(bends):
+            begin, end = i / len(bends), (i + 1) / len(bends)
+            step = Segment(
+                length=length,
+                curvature=curvature,
+                width_start=self.width,
+                width_end=self.width,
+                left_start=left.at(begin),
+                left_end=left.at(end),
+                right_start=right.at(begin),
+                right_end=right.at(end),
+                road=road,
+                left=left.surface,
+                right=right.surface,
+                left_wall=left.wall,
+                right_wall=right.wall,
+            )
+            fine.append(step)
+        self.fine += fine
+        self.segments += _joined(fine)
+
+    def _bends(self, section: Section) -> Iterator[tuple[float, float]]:
+        """
+        Cut a segment into the steps of the game's loader.
+
+        :param section: of the segment
+        :return: lengths [m] and curvatures [1/m]
+        """
+        kind = section.texts["type"]
+        if kind == "str":
+            length = _positive(section, "lg")
+            steps = self._steps(section, length)
+            yield from [(length / steps, 0.0)] * steps
+            return
+        if kind not in ("lft", "rgt"):
+            raise TrackFileError(
+                f"{section.place}: unknown type '{kind}' of a segment; it is str, lft or rgt"
+            )
+        sign = 1.0 if kind == "lft" else -1.0
+        radius, arc = _positive(section, "radius"), _positive(section, "arc")
+        end_radius = _positive(section, "end radius") if "end radius" in section.numbers else radius
+        length = 0.5 * (radius + end_radius) * arc
+        steps = self._steps(section, length)
+        if steps == 1 or end_radius == radius:
+            yield from [(length / steps, sign / radius)] * steps
+            return
+        # A spiral is a row of arcs of equal length; that length makes them turn by the arc.
+        change = (end_radius - radius) / (steps - 1)
+        radii = [radius + step * change for step in range(steps)]
+        step_length = arc / math.fsum(1.0 / r for r in radii)
+        for r in radii:
+            yield step_length, sign / r
+
+    def _steps(self, section: Section, length: float) -> int:
+        """
+        Return the number of steps that the game's loader cuts a segment into.
+
+        :param section: of the segment
+        :param length: of the segment [m]
+        """
+        if section.texts.get("profil", "spline") != "spline":
+            return 1
+        steps = int(section.numbers.get("profil steps", 1.0))
+        step_length = section.numbers.get("profil steps length", self.step_length)
+        if steps == 1 and step_length > 0.0:
+            steps = int(length / step_length) + 1
+        if steps > MAX_STEPS:
+            raise TrackFileError(
+                f"{section.place}: the segment is cut into {steps} steps, at most {MAX_STEPS} make "
+                "sense; see 'profil steps' and 'profil steps length'"
+            )
+        return max(steps, 1)
+
+
+class _Keys(NamedTuple):
+    """Values of a section whose names have a common beginning."""
+
+    section: Section
+    prefix: str
+
+    def number(self, name: str, default: float) -> float:
+        """
+        Return a number.
+
+        :param name: after the prefix
+        :param default: if it is not there
+        """
+        return self.section.numbers.get(self.prefix + name, default)
+
+    def text(self, name: str, default: str) -> str:
+        """
+        Return a text.
+
+        :param name: after the prefix
+        :param default: if it is not there
+        """
+        return self.section.texts.get(self.prefix + name, default)
+
+
+def _positive(section: Section, name: str) -> float:
+    """
+    Read a number that has to be there and above 0.
+
+    :param section: of a segment
+    :param name: of the number
+    :return: its value
+    """
+    value = section.numbers.get(name, 0.0)
+    if value <= 0.0:
+        raise TrackFileError(f"{section.place}: the segment needs '{name}' above 0, it is {value}")
+    return value
+
+
+def _joined(steps: list[Segment]) -> list[Segment]:
+    """
+    Join the steps of one segment again unless it is a spiral: they serve elevation only.
+
+    :param steps: of one segment of the file
+    :return: one segment, or the steps of a spiral
+    """
+    first, last = steps[0], steps[-1]
+    if first.curvature != last.curvature:
+        return steps
+    return [
+        first._replace(
+            length=first.length * len(steps), left_end=last.left_end, right_end=last.right_end
+        )
+    ]
+
+
+def _corner(segments: Iterable[Segment]) -> tuple[float, float]:
+    """
+    Find the lower left corner of the map, which TORCS makes the origin of its coordinates.
+
+    The game's loader of version 3 mirrors the right side of right bends when it looks for the
+    corner; of the tracks it ships, that moves the origin of dirt-4 only. It is not done here.
+
+    :param segments: in the steps of the game's loader
+    :return: x and y [m] with the beginning of the road's right edge as origin
+    """
+    low_x = low_y = x = y = heading = 0.0
+    for i, s in enumerate(segments):
+        y = 0.5 * s.width_start if i == 0 else y
+        samples = SAMPLES_PER_ARC if s.curvature else 1
+        left, right = s.left_end, s.right_end
+        if s.curvature:
+            left, right = max(s.left_start, left), max(s.right_start, right)
+        half_width = 0.5 * s.width_end
+        turn = s.curvature * s.length / samples
+        chord = s.length / samples * (math.sin(0.5 * turn) / (0.5 * turn) if turn else 1.0)
+        for _ in range(samples):
+            x += chord * math.cos(heading + 0.5 * turn)
+            y += chord * math.sin(heading + 0.5 * turn)
+            heading += turn
+            for offset in (half_width, half_width + left, -half_width, -half_width - right):
+                low_x = min(low_x, x - offset * math.sin(heading))
+                low_y = min(low_y, y + offset * math.cos(heading))
+    return low_x, low_y
+
+
+def _grid(root: Section, segments: list[Segment], width: float) -> Grid:
+    """
+    Find where the race engine puts the only car of a practice session.
+
+    The rules and defaults are those of ``initStartingGrid`` in the game's ``raceinit.cpp``: two
+    places side by side, the first of them 10 m before the start line, on the side of the first
+    bend unless the track says otherwise.
+
+    :param root: the outermost section
+    :param segments: of the track
+    :param width: of the road [m]
+    :return: the place
+    """
+    section = root.child("Starting Grid")
+    first_bend = next((s.curvature for s in segments if s.curvature), -1.0)
+    side = section.texts.get("pole position side", LEFT if first_bend > 0.0 else RIGHT)
+    places = max(int(section.numbers.get("rows", 2.0)), 1)
+    from_pole_edge = width / (places + 1)
+    offset = 0.5 * width - from_pole_edge
+    return Grid(section.numbers.get("distance to start", 10.0), offset if side == LEFT else -offset)
+
+
+def read_track_xml(path: Path) -> Track:
+    """
+    Read a track file of TORCS.
+
+    :param path: of the file
+    :return: the track as the game lays it, its gap at the start line included
+    :raises TrackFileError: naming file and line
+    """
+    root = read_params(path)
+    header = root.child("Header")
+    version = int(header.numbers.get("version", 0.0))
+    if version > 4:
+        raise TrackFileError(f"{header.place}: version {version} of the format; known are up to 4")
+    builder = _Builder(root, version)
+    listed = builder.main.child("Track Segments" if version >= 4 else "segments")
+    for section in listed.children.values():
+        if "type" in section.texts:
+            builder.add(section)
+    if not builder.segments:
+        raise TrackFileError(f"{listed.place}: there are no track segments")
+    low_x, low_y = _corner(builder.fine)
+    return Track(
+        path.stem,
+        header.texts.get("category", "road"),
+        tuple(builder.segments),
+        "torcs",
+        start_x=-low_x,
+        start_y=0.5 * builder.width - low_y,
+        grid=_grid(root, builder.segments, builder.width),
+    )
