@@ -1,0 +1,115 @@
+"""Frames to a video file that every player opens."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from contextlib import closing, suppress
+from itertools import chain
+from pathlib import Path
+
+import imageio_ffmpeg  # type: ignore[import-untyped]
+import numpy as np
+import numpy.typing as npt
+from tqdm import tqdm
+
+from sb3_torcs.errors import InvalidOption, OutputNotWritable
+
+__all__ = ["write_video"]
+
+Frame = npt.NDArray[np.uint8]
+
+ENCODING = {
+    "codec": "libx264",
+    "quality": 7,  # of 10: figures stay sharp
+    "pix_fmt_out": "yuv420p",  # what browsers and phones can show
+    "macro_block_size": 2,  # yuv420p halves the colours' resolution: sizes must be even
+    "output_params": ["-movflags", "+faststart"],  # plays before it is loaded
+}
+
+
+def write_video(
+    path: str | os.PathLike[str], frames: Iterable[Frame], fps: float, total: int | None = None
+) -> Path:
+    """
+    Write frames to an mp4 file (H.264, yuv420p), with a progress bar on a terminal's stderr.
+
+    The file appears whole or not at all: it grows beside its place and is moved there at the end.
+
+    :param path: of the file, ending in ``.mp4``; its folder is made if it is missing
+    :param frames: (height, width, 3) each, all of one size
+    :param fps: frames per second
+    :param total: number of frames, for the progress bar, if known
+    :return: the path
+    :raises InvalidOption: if the name does not end in ``.mp4``, or there are no frames
+    :raises OutputNotWritable: if the file cannot be written; no part of it is left behind
+    """
+    path = Path(path)
+    if path.suffix.lower() != ".mp4":
+        raise InvalidOption(f"the video's name is '{path}'; expected a name that ends in '.mp4'")
+    part = path.with_name(f".{path.stem}.{os.getpid()}.part.mp4")
+    try:
+        _claim(path, part)
+        _encode(path, part, frames, fps, total)
+        part.replace(path)
+    finally:
+        with suppress(OSError):  # no folder, no part
+            part.unlink()
+    return path
+
+
+def _claim(path: Path, part: Path) -> None:
+    """Make the folder and an empty file in it, so that what cannot be written is known at once."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.is_dir():
+            raise IsADirectoryError(f"'{path}' is a folder")
+        part.touch()
+    except OSError as error:
+        raise OutputNotWritable(
+            f"cannot write the video '{path}': {error.strerror or error}; "
+            "choose a file in a folder that you may write to"
+        ) from error
+
+
+def _encode(path: Path, part: Path, frames: Iterable[Frame], fps: float, total: int | None) -> None:
+    """
+    Send the frames through ffmpeg.
+
+    :param path: of the video, for messages
+    :param part: file to write
+    :param frames: (height, width, 3) each
+    :param fps: frames per second
+    :param total: number of frames, if known
+    """
+    remaining = iter(frames)
+    first = next(remaining, None)
+    if first is None:
+        raise InvalidOption(
+            f"there are no frames for '{path}'; pass at least one array from env.render(), "
+            'of an environment made with render_mode="rgb_array"'
+        )
+    size = (first.shape[1], first.shape[0])
+    every = chain([first], remaining)
+    # disable=None: no bar where stderr is a file
+    bar = tqdm(every, total=total, unit="frame", desc=path.name, disable=None)
+    # imageio's own writer stays open, and its ffmpeg alive, when a frame raises; this one closes.
+    with closing(imageio_ffmpeg.write_frames(part, size, fps=fps, **ENCODING)) as ffmpeg:
+        ffmpeg.send(None)
+        for frame in bar:
+            if frame.shape != first.shape or frame.dtype != np.uint8:
+                raise InvalidOption(
+                    f"a frame is {frame.dtype} {frame.shape}; the first is uint8 {first.shape}, "
+                    "and all must be alike"
+                )
+            try:
+                ffmpeg.send(np.ascontiguousarray(frame))
+            except OSError as error:
+                raise _out_of_room(path) from error
+    if part.stat().st_size == 0:
+        raise _out_of_room(path)
+
+
+def _out_of_room(path: Path) -> OutputNotWritable:
+    """Say that ffmpeg gave up; its own words went to stderr."""
+    return OutputNotWritable(f"ffmpeg stopped writing '{path}'; is there room on the disk?")
