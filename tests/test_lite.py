@@ -139,7 +139,7 @@ def test_a_lap_counts_from_line_to_line(oval):
     assert car.laps == 2
     first = laps.index(1)
     assert distances[first] == pytest.approx(oval.length + 30.0, abs=2.0)  # the way to the line
-    assert car.last_lap_time == pytest.approx((laps.index(2) - first) * 0.02, abs=0.03)
+    assert car.last_lap_time == pytest.approx((laps.index(2) - first) * 0.02, abs=0.02)
     assert car.best_lap_time == min(car.last_lap_time, car.best_lap_time)
 
 

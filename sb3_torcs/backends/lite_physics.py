@@ -23,6 +23,7 @@ from sb3_torcs.car import FloatArray as Floats
 
 SUBSTEPS = 10  # physics steps per control tick, as in TORCS
 DT = CONTROL_TICK / SUBSTEPS  # [s]
+STEPS_PER_SECOND = 500.0  # time is counted in steps, so that it never drifts
 GRAVITY = 9.80665  # [m/s²]
 
 # Body
@@ -98,7 +99,7 @@ MAX_DAMAGE = 10000.0  # [points] TORCS takes the car out of the race
 
 # The state vector
 (
-    TIME, X, Y, YAW, VX, VY, YAW_RATE, ACC_X, ACC_Y, STEER,
+    STEPS, X, Y, YAW, VX, VY, YAW_RATE, ACC_X, ACC_Y, STEER,
     SPIN_FR, SPIN_FL, SPIN_RR, SPIN_RL, ENGINE, GEAR, SHIFT, DAMAGE,
     SEGMENT, ALONG, OFFSET, TANGENT, RACED, CROSSINGS, LAPS, LAP_START, LAST_LAP, BEST_LAP,
 ) = range(28)  # fmt: skip
@@ -177,14 +178,14 @@ def _count_laps(state: Floats, track: Floats, previous: float, flying: bool) -> 
         moved += length
         state[CROSSINGS] += 1.0
         if state[CROSSINGS] == 1.0 and flying:
-            state[LAP_START] = state[TIME]  # the way to the line was not a lap
+            state[LAP_START] = state[STEPS]  # the way to the line was not a lap
         elif state[CROSSINGS] > state[LAPS] + 1.0:
-            lap = state[TIME] - state[LAP_START]
+            lap = (state[STEPS] - state[LAP_START]) / STEPS_PER_SECOND
             state[LAPS] += 1.0
             state[LAST_LAP] = lap
             if state[BEST_LAP] == 0.0 or lap < state[BEST_LAP]:
                 state[BEST_LAP] = lap
-            state[LAP_START] = state[TIME]
+            state[LAP_START] = state[STEPS]
     elif moved > 0.5 * length:  # back over the line: the next crossing must not count again
         moved -= length
         state[CROSSINGS] -= 1.0
@@ -435,18 +436,17 @@ def advance(
     :param ticks: control ticks of 0.02 s
     :param flying: whether the episode began elsewhere than on the grid
     """
-    for _ in range(ticks):
+    for _tick in range(ticks):
         wanted = gear
         if gear == AUTOMATIC:
             wanted = automatic_gear(int(state[GEAR]), state[ENGINE], GEARS)
         if wanted != int(state[GEAR]) and state[SHIFT] <= 0.0:
             state[GEAR] = wanted
             state[SHIFT] = SHIFT_TIME if wanted != 0 else 0.0
-        start = state[TIME]
-        for step in range(SUBSTEPS):
+        for _step in range(SUBSTEPS):
             distance = track[int(state[SEGMENT]), column.START] + state[ALONG]
             _substep(state, track, steering, throttle, brake)
-            state[TIME] = start + (step + 1) * DT
+            state[STEPS] += 1.0
             locate(state, track)
             _hit_walls(state, track)
             _count_laps(state, track, distance, flying)
@@ -515,7 +515,7 @@ def read(
     yaw = state[YAW]
     cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
     width = road_width(track, segment, along)
-    scalars[0] = state[TIME]
+    scalars[0] = state[STEPS] / STEPS_PER_SECOND
     scalars[1], scalars[2], scalars[3] = state[X], state[Y], yaw
     scalars[4] = state[YAW_RATE]
     scalars[5] = state[VX] * cos_yaw + state[VY] * sin_yaw
@@ -532,7 +532,7 @@ def read(
     scalars[16] = FUEL
     scalars[17] = state[DAMAGE]
     scalars[18] = state[LAPS]
-    scalars[19] = state[TIME] - state[LAP_START]
+    scalars[19] = (state[STEPS] - state[LAP_START]) / STEPS_PER_SECOND
     scalars[20], scalars[21] = state[LAST_LAP], state[BEST_LAP]
     wheels[:] = state[SPIN_FR : SPIN_RL + 1]
     if abs(state[OFFSET]) > 0.5 * width:  # off the road the SCR server gives -1
