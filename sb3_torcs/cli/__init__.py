@@ -1,0 +1,51 @@
+"""The command ``sb3-torcs``: one module per verb, each with ``add_parser`` and ``run``."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+from sb3_torcs.cli import bench, doctor, evaluate, tracks, train
+from sb3_torcs.errors import Sb3TorcsError
+
+__all__ = ["main"]
+
+USAGE_ERROR = 2
+INTERRUPTED = 130
+VERBS = (doctor, tracks, train, evaluate, bench)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """
+    Run one verb.
+
+    :param argv: the words after the command's name; ``None`` takes those of the process
+    :return: the exit status: 0, 2 for a mistake in what was asked, 130 after Ctrl-C
+    """
+    words = list(sys.argv[1:] if argv is None else argv)
+    split = words.index("--") if "--" in words else len(words)
+    parser = _parser()
+    args = parser.parse_args(words[:split])
+    args.zoo_args = words[split + 1 :]
+    if args.zoo_args and args.verb != "train":
+        parser.error(f"{args.verb} passes nothing on; leave out '--' and what follows it")
+    try:
+        status: int = args.run(args)
+    except Sb3TorcsError as error:
+        print(f"sb3-torcs: {error}", file=sys.stderr)
+        return USAGE_ERROR
+    except KeyboardInterrupt:
+        print("sb3-torcs: interrupted", file=sys.stderr)
+        return INTERRUPTED
+    return status
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="sb3-torcs", description="Train, watch and measure cars that learn to race."
+    )
+    subparsers = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
+    for verb in VERBS:
+        verb.add_parser(subparsers)
+    return parser

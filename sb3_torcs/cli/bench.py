@@ -1,0 +1,73 @@
+"""``sb3-torcs bench``: how fast everything is on this machine."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from typing import Any
+
+from sb3_torcs.cli.common import print_json, quiet_output, table
+
+__all__ = ["add_parser", "run"]
+
+DESCRIPTION = """\
+Measure speeds on one core, in processor time, the compared ones in turns.
+
+lite_ticks_per_s: env.step of TorcsLite-v0, action_repeat=1, on actions that a scripted driver
+chose beforehand; resets are not counted. racetrack_v1_steps_per_s: env.step of highway-env's
+racetrack-v1. policy_*: updates of a DDPG with SplitHeadPolicy, batch 64. training_env_share: part
+of a DDPG training step (shipped hyperparameters) that the environment and the callbacks take.
+What cannot be measured here is null.
+"""
+
+
+def add_parser(subparsers: Any) -> None:
+    """
+    :param subparsers: of the command
+    """
+    parser = subparsers.add_parser(
+        "bench",
+        help="measure speeds",
+        description=DESCRIPTION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument(
+        "--json", action="store_true", help="print one JSON object and nothing else"
+    )
+    parser.add_argument(
+        "--seconds", type=float, default=30.0, metavar="S", help="to spend, about; default: 30"
+    )
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """
+    :param args: from the command line
+    :return: the exit status
+    """
+    from tqdm import tqdm
+
+    from sb3_torcs import bench
+    from sb3_torcs.errors import InvalidOption
+
+    if not args.seconds > 0.0:
+        raise InvalidOption(f"--seconds is {args.seconds:g}; expected more than 0")
+    figures: dict[str, float | None] = dict.fromkeys(bench.KEYS)
+    stages = bench.stages(args.seconds)
+    with (
+        quiet_output(args.json),
+        tqdm(total=len(stages), file=sys.stderr, leave=False, disable=None) as bar,
+    ):
+        for name, measure in stages.items():
+            bar.set_description(name)
+            figures.update(measure())
+            bar.update()
+    if args.json:
+        print_json(figures)
+        return 0
+    print(table(("figure", "value"), [(name, _number(value)) for name, value in figures.items()]))
+    return 0
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.5g}" if value < 1000.0 else f"{value:.0f}"

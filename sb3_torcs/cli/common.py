@@ -1,0 +1,123 @@
+"""What several verbs share: numbers from the command line, places to write, JSON."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import math
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from sb3_torcs.errors import OutputNotWritable
+
+__all__ = ["positive", "print_json", "quiet_output", "table", "writable_file", "writable_folder"]
+
+
+def positive(text: str) -> int:
+    """
+    Read a whole number of at least 1, for argparse.
+
+    :param text: from the command line
+    :return: the number
+    """
+    number = int(text) if text.strip().lstrip("-").isdigit() else 0
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"{text!r}: expected a whole number >= 1")
+    return number
+
+
+def writable_folder(folder: str | Path) -> Path:
+    """
+    Make a folder, and make sure that files can be put there.
+
+    :param folder: that results should go to
+    :return: the folder
+    :raises OutputNotWritable: if it cannot be made or written
+    """
+    path = Path(folder).expanduser()
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path):
+            pass
+    except OSError as error:
+        raise OutputNotWritable(
+            f"cannot write to the folder '{path}': {error.strerror or error}; give another one"
+        ) from error
+    return path
+
+
+def writable_file(file: str | Path, suffixes: tuple[str, ...]) -> Path:
+    """
+    Make sure that a file can be written.
+
+    :param file: that a result should go to
+    :param suffixes: kinds that can be written, e.g. ``(".png",)``
+    :return: its path
+    :raises OutputNotWritable: if its folder cannot be written, or its kind is another
+    """
+    path = Path(file).expanduser()
+    if path.suffix.lower() not in suffixes:
+        raise OutputNotWritable(f"'{path}' should end in {' or '.join(suffixes)}")
+    if path.is_dir():
+        raise OutputNotWritable(f"'{path}' is a folder; give a file in it")
+    writable_folder(path.parent)
+    return path
+
+
+@contextlib.contextmanager
+def quiet_output(active: bool) -> Iterator[None]:
+    """
+    Send what libraries print to standard error, so that standard output holds results only.
+
+    :param active: whether to do so
+    """
+    if not active:
+        yield
+        return
+    with contextlib.redirect_stdout(sys.stderr):
+        yield
+
+
+def print_json(value: Any) -> None:
+    """
+    Print one JSON value; what is not a finite number becomes ``null``.
+
+    :param value: of plain Python types
+    """
+    print(json.dumps(_finite(value), indent=2, allow_nan=False))
+
+
+def _finite(value: Any) -> Any:
+    """Replace infinities and NaN, which JSON does not have."""
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def table(headers: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """
+    Lay out a table: words to the left, numbers to the right.
+
+    :param headers: of the columns
+    :param rows: cells, as many per row as there are headers
+    :return: lines without trailing spaces
+    """
+    columns = list(zip(headers, *rows, strict=True))
+    widths = [max(len(cell) for cell in column) for column in columns]
+    numeric = [all(_is_number(cell) for cell in column[1:]) for column in columns]
+    lines = []
+    for row in (headers, ["-" * width for width in widths], *rows):
+        cells = zip(row, widths, numeric, strict=True)
+        padded = [cell.rjust(width) if right else cell.ljust(width) for cell, width, right in cells]
+        lines.append("  ".join(padded).rstrip())
+    return "\n".join(lines)
+
+
+def _is_number(cell: str) -> bool:
+    return cell[:1].isdigit() or cell[:1] == "-"

@@ -1,0 +1,147 @@
+"""``sb3-torcs evaluate``: drive some laps and write down what happened."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from typing import TYPE_CHECKING, Any
+
+from sb3_torcs.cli.common import positive, print_json, quiet_output, table, writable_file
+
+if TYPE_CHECKING:
+    from sb3_torcs.evaluation import Episode
+    from sb3_torcs.models import TrainingRecord
+
+__all__ = ["add_parser", "environment_kwargs", "run", "time_limit"]
+
+DEFAULT_ENV = "TorcsLite-v0"
+LONGEST_TRACK = 10000.0  # [m] for a random track, whose length is not known beforehand
+KEPT = ("track", "car", "reward", "action_repeat", "range_finders")
+"""What is taken from the training's own environment, unless the command line says otherwise."""
+
+HEADERS = ("episode", "laps", "lap times s", "distance m", "end", "damage", "return")
+
+DESCRIPTION = """\
+Drive some episodes from the grid, deterministically, and write down what happened.
+
+An episode ends after --laps laps or when the car leaves the road, faces backwards, stands or
+breaks. The time limit is what the slowest car needs that does not count as standing, so it cuts
+no lap short.
+
+What is not given is as in the training, if its config.yml lies beside the model (the RL Zoo puts
+it there): environment, track, car, reward, action repeat and range finders.
+"""
+
+
+def add_parser(subparsers: Any) -> None:
+    """
+    :param subparsers: of the command
+    """
+    parser = subparsers.add_parser(
+        "evaluate",
+        help="drive laps with a saved model",
+        description=DESCRIPTION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add("model", metavar="MODEL", help="a saved .zip, a run's folder, or 'scripted'")
+    add("--env", metavar="ID", help=f"default: that of the training, or {DEFAULT_ENV}")
+    add("--track", metavar="T", help="`sb3-torcs tracks` lists them")
+    add("--car", metavar="C", help="e.g. car1-trb1")
+    add("--episodes", type=positive, default=1, metavar="N", help="default: 1")
+    add("--laps", type=positive, default=3, metavar="L", help="laps per episode; default: 3")
+    add("--seed", type=int, default=0, metavar="S", help="of the first reset; default: 0")
+    add("--action-repeat", type=positive, metavar="N", help="control ticks of 0.02 s per decision")
+    add("--range-finders", metavar="SET", help="scr or narrow")
+    add("--algo", help="the model's algorithm, if it cannot be found out")
+    add("--json", action="store_true", help="print one JSON object and nothing else")
+    add("--video", metavar="FILE.mp4", help="film the best lap from above")
+    add("--line", metavar="FILE.png", help="draw the line of the best lap, coloured by speed")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """
+    :param args: from the command line
+    :return: the exit status
+    """
+    video = writable_file(args.video, (".mp4",)) if args.video else None
+    line = writable_file(args.line, (".png",)) if args.line else None
+    with quiet_output(args.json):
+        result, recorder = _drive(args)
+        if video is not None:
+            recorder.film(video)
+        if line is not None:
+            recorder.draw_line(line)
+        recorder.close()
+    if args.json:
+        episodes = [episode.as_dict() for episode in result]
+        print_json({"env": recorder.env_id, **recorder.names(), "episodes": episodes})
+        return 0
+    print(f"{recorder.env_id}, {', '.join(recorder.names().values())}")
+    print(table(HEADERS, [_row(number, episode) for number, episode in enumerate(result, 1)]))
+    for what, path in (("video", video), ("line", line)):
+        if path is not None:
+            print(f"{what}: {path}")
+    return 0
+
+
+def _drive(args: argparse.Namespace) -> tuple[list[Episode], Any]:
+    """Build the environment, load the driver, drive."""
+    from sb3_torcs.cli.recording import Recorder
+    from sb3_torcs.evaluation import evaluate
+    from sb3_torcs.models import TrainingRecord, find_model, load_driver, training_record
+
+    scripted = args.model == "scripted"
+    record = TrainingRecord() if scripted else training_record(find_model(args.model))
+    env_id = args.env or record.env_id or DEFAULT_ENV
+    kwargs = environment_kwargs(args, record)
+    recorder = Recorder(env_id, kwargs, time_limit(kwargs))
+    driver = load_driver(args.model, recorder, args.algo)
+    result = evaluate(recorder, driver, episodes=args.episodes, seed=args.seed)
+    return result, recorder
+
+
+def environment_kwargs(args: argparse.Namespace, record: TrainingRecord) -> dict[str, Any]:
+    """
+    Decide what environment to drive in.
+
+    :param args: from the command line; they win
+    :param record: of the training
+    :return: keyword arguments of the environment
+    """
+    kwargs = {name: record.env_kwargs[name] for name in KEPT if name in record.env_kwargs}
+    given = {name: getattr(args, name, None) for name in KEPT}
+    kwargs.update({name: value for name, value in given.items() if value is not None})
+    return {**kwargs, "laps": args.laps}
+
+
+def time_limit(kwargs: dict[str, Any]) -> int:
+    """
+    Work out after how many decisions to give up: later than any drive that is not standing.
+
+    :param kwargs: of the environment, with ``laps``
+    :return: decisions
+    """
+    from sb3_torcs.car import CONTROL_TICK
+    from sb3_torcs.envs.racing import STUCK_SPEED
+    from sb3_torcs.tracks import load_track
+
+    track = kwargs.get("track", "aalborg")
+    length = LONGEST_TRACK if track == "random" else load_track(track).length
+    # One lap more than asked for: the way from the grid to the line, and some patience.
+    seconds = (kwargs["laps"] + 1) * length / STUCK_SPEED
+    return math.ceil(seconds / (kwargs.get("action_repeat", 5) * CONTROL_TICK))
+
+
+def _row(number: int, episode: Episode) -> list[str]:
+    times = ", ".join(f"{seconds:.3f}" for seconds in episode.lap_times) or "-"
+    return [
+        str(number),
+        str(episode.laps),
+        times,
+        f"{episode.distance:.1f}",
+        episode.end,
+        f"{episode.damage:.0f}",
+        f"{episode.episode_return:.2f}",
+    ]

@@ -1,0 +1,155 @@
+"""What was driven, kept: the best lap as a film and as a line on the map."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+
+from sb3_torcs.car import CarState
+
+__all__ = ["Decision", "Recorder", "Stretch", "best_stretch"]
+
+FILM_TICKS = 2  # control ticks per frame: 25 frames per second, in real time
+FILM_FPS = 25
+
+
+class Decision(NamedTuple):
+    """One decision of a drive, and where it led."""
+
+    action: npt.NDArray[np.float32]
+    car: CarState
+    lap_time: float | None  # [s] if it completed a lap
+
+
+class Stretch(NamedTuple):
+    """Some decisions of an episode."""
+
+    episode: int
+    first: int
+    last: int  # exclusive
+
+
+def best_stretch(episodes: list[list[Decision]]) -> Stretch:
+    """
+    Find the fastest whole lap, or the longest drive if there is none.
+
+    :param episodes: of an evaluation, each with at least one decision
+    :return: where it is
+    """
+    best, best_time = None, float("inf")
+    for number, decisions in enumerate(episodes):
+        first = 0
+        for index, decision in enumerate(decisions):
+            if decision.lap_time is None:
+                continue
+            if decision.lap_time < best_time:
+                best, best_time = Stretch(number, first, index + 1), decision.lap_time
+            first = index + 1
+    if best is not None:
+        return best
+    farthest = max(range(len(episodes)), key=lambda n: episodes[n][-1].car.distance_raced)
+    return Stretch(farthest, 0, len(episodes[farthest]))
+
+
+class Recorder(gym.Wrapper[Any, Any, Any, Any]):
+    """
+    An environment for an evaluation that remembers what was done in it.
+
+    :param env_id: a registered environment
+    :param kwargs: of the environment
+    :param max_episode_steps: decisions after which an episode is truncated
+    """
+
+    def __init__(self, env_id: str, kwargs: dict[str, Any], max_episode_steps: int) -> None:
+        self.env_id = env_id
+        self.episodes: list[list[Decision]] = []
+        self._kwargs = kwargs
+        self._limit = max_episode_steps
+        self._seed: int | None = None
+        super().__init__(gym.make(env_id, max_episode_steps=max_episode_steps, **kwargs))
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """
+        Begin an episode, as ``gymnasium.Env.reset``.
+
+        :param seed: of the environment's generator
+        :param options: of the environment
+        :return: observation and info
+        """
+        self._seed = seed if seed is not None else self._seed
+        self.episodes.append([])
+        return self.env.reset(seed=seed, options=options)
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """
+        Do one decision, as ``gymnasium.Env.step``.
+
+        :param action: of the driver
+        :return: observation, reward, terminated, truncated, info
+        """
+        result = self.env.step(action)
+        info = result[4]
+        self.episodes[-1].append(Decision(action, info["car"], info.get("lap_time")))
+        return result
+
+    def names(self) -> dict[str, str]:
+        """Return the track's and the car's names."""
+        backend = self.get_wrapper_attr("backend")
+        return {"track": backend.track.name, "car": backend.car}
+
+    def draw_line(self, path: Path) -> None:
+        """
+        Draw the line of the best lap, coloured by speed.
+
+        :param path: of the picture
+        """
+        from sb3_torcs.track_plot import plot_track
+
+        stretch = best_stretch(self.episodes)
+        cars = [d.car for d in self.episodes[stretch.episode][stretch.first : stretch.last]]
+        line = np.array([(car.x, car.y) for car in cars])
+        speed = np.array([car.speed_x for car in cars])
+        with self._again(stretch.episode, action_repeat=1) as env:
+            plot_track(env.get_wrapper_attr("backend").track, path, line=line, speed=speed)
+
+    def film(self, path: Path) -> None:
+        """
+        Film the best lap from above, in real time.
+
+        :param path: of the video
+        """
+        from sb3_torcs.video import write_video
+
+        stretch = best_stretch(self.episodes)
+        repeat = self.get_wrapper_attr("action_repeat")
+        total = (stretch.last - stretch.first) * repeat // FILM_TICKS
+        write_video(path, self._frames(stretch, repeat), FILM_FPS, total=total)
+
+    def _frames(self, stretch: Stretch, repeat: int) -> Iterator[npt.NDArray[np.uint8]]:
+        """Drive the episode again, tick by tick, and look at the stretch."""
+        decisions = self.episodes[stretch.episode]
+        with self._again(stretch.episode, action_repeat=1, render_mode="rgb_array") as env:
+            tick = 0
+            for index, decision in enumerate(decisions[: stretch.last]):
+                for _ in range(repeat):
+                    env.step(decision.action)
+                    tick += 1
+                    if index >= stretch.first and tick % FILM_TICKS == 0:
+                        yield env.render()  # type: ignore[misc]
+
+    def _again(self, episode: int, **changes: Any) -> gym.Env[Any, Any]:
+        """Build the environment anew, at the beginning of an episode."""
+        limit = self._limit * self.get_wrapper_attr("action_repeat") + 1
+        kwargs = {**self._kwargs, **changes}
+        env = gym.make(self.env_id, max_episode_steps=limit, **kwargs)
+        env.reset(seed=self._seed)
+        for _ in range(episode):  # the generator goes on from episode to episode
+            env.reset()
+        return env

@@ -1,0 +1,63 @@
+"""``sb3-torcs tracks``: which tracks there are, and what they look like."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from sb3_torcs.cli.common import print_json, table, writable_file
+
+__all__ = ["add_parser", "run"]
+
+HEADERS = ("name", "category", "length m", "width m", "tightest radius m", "source")
+
+
+def add_parser(subparsers: Any) -> None:
+    """
+    :param subparsers: of the command
+    """
+    parser = subparsers.add_parser(
+        "tracks",
+        help="list the tracks, or draw one",
+        description="List the bundled tracks and those of an installed TORCS, or draw one.",
+    )
+    parser.add_argument("names", nargs="*", metavar="NAME", help="only these; also file paths")
+    parser.add_argument("--json", action="store_true", help="print a JSON list and nothing else")
+    parser.add_argument("--plot", metavar="FILE.png", help="draw the named track")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """
+    :param args: from the command line
+    :return: the exit status
+    """
+    import numpy as np
+
+    from sb3_torcs.errors import InvalidOption
+    from sb3_torcs.tracks import available_tracks, load_track
+
+    tracks = [load_track(name, np.random.default_rng(0)) for name in args.names]
+    if args.plot is not None:
+        if len(tracks) != 1:
+            raise InvalidOption(
+                f"--plot draws one track, {len(tracks)} are named; "
+                "type e.g.: sb3-torcs tracks aalborg --plot aalborg.png"
+            )
+        path = writable_file(args.plot, (".png",))
+        from sb3_torcs.track_plot import plot_track
+
+        plot_track(tracks[0], path)
+    summaries = [track.summary() for track in tracks] if tracks else available_tracks()
+    if args.json:
+        print_json([summary._asdict() for summary in summaries])
+        return 0
+    rows = [
+        (s.name, s.category, f"{s.length_m:.1f}", f"{s.width_m:.1f}", f"{s.tightest_radius_m:.1f}",
+         s.source)
+        for s in summaries
+    ]  # fmt: skip
+    print(table(HEADERS, rows))
+    if args.plot is not None:
+        print(f"drawn: {args.plot}")
+    return 0

@@ -1,0 +1,341 @@
+"""``sb3-torcs train``: a thin front to the RL Zoo that finds and checks the files itself."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import dataclasses
+import shlex
+import signal
+import sys
+import tempfile
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from sb3_torcs.cli.common import positive, writable_folder
+
+__all__ = ["Run", "TrainOptions", "add_parser", "run", "train", "train_run"]
+
+EVALUATIONS = 20  # of a whole training, unless --eval-freq says otherwise
+SHORTEST_EVAL_FREQ = 1000  # decisions
+
+PROGRESS = "sb3_torcs.progress.RacingProgressCallback"
+
+EPILOG = """\
+What follows -- goes to the RL Zoo as it is, after our own words, so it wins:
+  sb3-torcs train --timesteps 20000 -- --save-freq 5000 --hyperparams batch_size:64
+
+Ctrl-C keeps what was learned and prints the command that goes on.
+"""
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainOptions:
+    """
+    What to train, and where to put it.
+
+    :param algo: as the RL Zoo calls it
+    :param env: a registered environment
+    :param entry: of the hyperparameter file; ``None`` is the environment's own
+    :param conf_file: hyperparameter file; ``None`` is the shipped one of the algorithm
+    :param track: instead of the entry's
+    :param timesteps: decisions to learn from; ``None`` is what the entry says
+    :param seed: of everything
+    :param folder: gets ``ALGO/ENV_1``, ``ALGO/ENV_2``, ...
+    :param tensorboard: its log folder; ``None`` is ``FOLDER/tensorboard``
+    :param eval_freq: decisions between evaluations; ``None`` is a twentieth of the
+        training, and at least 1000 where it has as many
+    :param eval_episodes: per evaluation
+    :param resume: a saved model (.zip) or a run's folder to go on from
+    :param progress: show a progress bar
+    :param zoo_args: further words for the RL Zoo; they win
+    """
+
+    algo: str = "ddpg"
+    env: str = "TorcsLite-v0"
+    entry: str | None = None
+    conf_file: str | Path | None = None
+    track: str | None = None
+    timesteps: int | None = None
+    seed: int = 0
+    folder: str | Path = "logs"
+    tensorboard: str | Path | None = None
+    eval_freq: int | None = None
+    eval_episodes: int = 1
+    resume: str | Path | None = None
+    progress: bool = True
+    zoo_args: tuple[str, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """What came of a training."""
+
+    folder: Path
+    steps: int  # decisions learned from
+    wanted: int  # decisions that were asked for
+    interrupted: bool
+    last_model: Path
+    track: str | None
+
+    @property
+    def best_model(self) -> Path:
+        """The best model by evaluation, or the last one if there was no evaluation yet."""
+        best = self.folder / "best_model.zip"
+        return best if best.is_file() else self.last_model
+
+
+def add_parser(subparsers: Any) -> None:
+    """
+    :param subparsers: of the command
+    """
+    parser = subparsers.add_parser(
+        "train",
+        help="train an agent with the RL Zoo and the shipped hyperparameters",
+        description=(__doc__ or "").split(": ", 1)[1],
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add("--algo", default="ddpg", help="ddpg (default), td3, sac, ppo, or any of the zoo")
+    add("--env", default="TorcsLite-v0", metavar="ID", help="default: TorcsLite-v0")
+    add("--entry", metavar="NAME", help='entry of the file, e.g. "as the post"; default: the id')
+    add("--conf-file", metavar="FILE", help="hyperparameter file; default: the shipped one")
+    add("--track", metavar="T", help="instead of the entry's; `sb3-torcs tracks` lists them")
+    add("--timesteps", type=positive, metavar="N", help="decisions; default: what the entry says")
+    add("--seed", type=int, default=0, metavar="S", help="default: 0")
+    add("--folder", default="logs", help="for models and logs; default: logs")
+    add("--tensorboard", metavar="DIR", help="default: FOLDER/tensorboard")
+    add(
+        "--eval-freq",
+        type=int,
+        metavar="N",
+        help="decisions between evaluations; default: a twentieth",
+    )
+    add("--eval-episodes", type=positive, default=1, metavar="N", help="per evaluation; default: 1")
+    add("--resume", metavar="MODEL", help="go on from a saved model (.zip) or a run's folder")
+    add("--progress", action=argparse.BooleanOptionalAction, default=True, help="progress bar")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """
+    :param args: from the command line
+    :return: the exit status
+    """
+    names = [field.name for field in dataclasses.fields(TrainOptions)]
+    values = {name: getattr(args, name) for name in names}
+    options = TrainOptions(**{**values, "zoo_args": tuple(args.zoo_args)})
+    result = train_run(options)
+    print("\n".join(_closing_words(options, result)))
+    return 130 if result.interrupted else 0
+
+
+def train(options: TrainOptions) -> Path:
+    """
+    Train, and keep the model even if Ctrl-C ends it early.
+
+    :param options: what to train, and where to put it
+    :return: the run's folder: ``best_model.zip``, ``ENV.zip`` (the last one), logs
+    """
+    return train_run(options).folder
+
+
+def train_run(options: TrainOptions) -> Run:
+    """
+    Train, and say how far it came.
+
+    :param options: what to train, and where to put it
+    :return: what came of it
+    :raises ZooConfigError: if the hyperparameters have something that nothing would read
+    :raises OutputNotWritable: if a folder cannot be written
+    """
+    from sb3_torcs.models import saved_steps
+
+    entry = _entry(options)
+    resume = _resumed(options, entry)
+    folder = writable_folder(options.folder)
+    tensorboard = writable_folder(options.tensorboard or folder / "tensorboard")
+    wanted = options.timesteps or int(entry["n_timesteps"])
+    if options.progress:
+        entry["callback"] = _with_progress(entry.get("callback"))
+    with tempfile.TemporaryDirectory() as scratch:
+        conf_file = _write_entry(Path(scratch) / "zoo.yml", options.env, entry)
+        words = _zoo_words(options, wanted, entry.get("env_kwargs") or {})
+        words += ["--conf-file", str(conf_file), "--log-folder", str(folder)]
+        words += ["--tensorboard-log", str(tensorboard)]
+        words += ["--trained-agent", str(resume)] if resume else []
+        run_folder = _next_run_folder(folder, options)
+        interrupted = _run_zoo([*words, *options.zoo_args])
+    last_model = run_folder / f"{options.env.replace('/', '-')}.zip"
+    return Run(
+        folder=run_folder,
+        steps=saved_steps(last_model),
+        wanted=wanted,
+        interrupted=interrupted,
+        last_model=last_model,
+        track=(entry.get("env_kwargs") or {}).get("track"),
+    )
+
+
+def _entry(options: TrainOptions) -> dict[str, Any]:
+    """Read and check the hyperparameters, and build the environment once to see that it can be."""
+    import gymnasium as gym
+
+    from sb3_torcs import zoo
+    from sb3_torcs.errors import ZooConfigError, near_miss
+
+    if options.env not in gym.registry:
+        ours = ("Torcs-v0", "TorcsLite-v0")
+        raise ZooConfigError(
+            f"no environment '{options.env}' is registered{near_miss(options.env, ours)} "
+            f"ours: {', '.join(ours)}"
+        )
+    path = zoo.config_file(options.algo, options.conf_file)
+    name = options.entry or options.env
+    entry = zoo.read_entry(path, name)
+    if options.track is not None:
+        entry["env_kwargs"] = {**(entry.get("env_kwargs") or {}), "track": options.track}
+    zoo.check_entry(entry, options.algo, options.env, zoo.Place(path, name))
+    gym.make(options.env, **(entry.get("env_kwargs") or {})).close()
+    return entry
+
+
+def _resumed(options: TrainOptions, entry: dict[str, Any]) -> Path | None:
+    """Find and check the model to go on from; with its memory it needs no new warm-up."""
+    if options.resume is None:
+        return None
+    import gymnasium as gym
+
+    from sb3_torcs.models import check_spaces, find_model, saved_spaces
+
+    path = find_model(options.resume, prefer_last=True)
+    env = gym.make(options.env, **(entry.get("env_kwargs") or {}))
+    check_spaces(path, saved_spaces(path), env)
+    env.close()
+    if "learning_starts" in entry and (path.parent / "replay_buffer.pkl").is_file():
+        entry["learning_starts"] = 0
+    return path
+
+
+def _write_entry(path: Path, env_id: str, entry: dict[str, Any]) -> Path:
+    """Write the one entry that the zoo shall read, under the environment's id."""
+    import yaml
+
+    path.write_text(yaml.safe_dump({env_id: entry}), encoding="utf-8")
+    return path
+
+
+def _zoo_words(options: TrainOptions, wanted: int, env_kwargs: dict[str, Any]) -> list[str]:
+    """Compose the zoo's command line, files and folders aside."""
+    eval_freq = options.eval_freq or max(wanted // EVALUATIONS, min(wanted, SHORTEST_EVAL_FREQ))
+    words = ["--gym-packages", "sb3_torcs", "--algo", options.algo, "--env", options.env]
+    words += ["--n-timesteps", str(wanted), "--seed", str(options.seed)]
+    words += ["--eval-freq", str(eval_freq), "--eval-episodes", str(options.eval_episodes)]
+    words += ["--num-threads", "1", "--device", "cpu", "--verbose", "0", "--save-replay-buffer"]
+    if env_kwargs:
+        # The zoo does not give the file's env_kwargs to the evaluation's environment; and an
+        # evaluation is from the grid, wherever the training starts.
+        evaluation = {name: value for name, value in env_kwargs.items() if name != "start"}
+        words += ["--eval-env-kwargs", *(f"{name}:{value!r}" for name, value in evaluation.items())]
+    return words
+
+
+def _with_progress(callbacks: Any) -> list[Any]:
+    """
+    Add our progress bar, in front: the zoo cleans up after the first one when it is interrupted.
+
+    :param callbacks: of the entry, in any of the zoo's forms
+    :return: as a list, with the bar
+    """
+    items = callbacks if isinstance(callbacks, list) else [] if callbacks is None else [callbacks]
+    return [PROGRESS, *(item for item in items if item != PROGRESS)]
+
+
+def _next_run_folder(folder: Path, options: TrainOptions) -> Path:
+    """Foretell the folder that the zoo will make."""
+    from rl_zoo3.utils import get_latest_run_id
+
+    name = options.env.replace("/", "-")
+    parent = folder / options.algo
+    return parent / f"{name}_{get_latest_run_id(f'{parent}/', name) + 1}"
+
+
+def _run_zoo(words: list[str]) -> bool:
+    """
+    Run the zoo's own training in this process.
+
+    :param words: of its command line
+    :return: whether it was interrupted
+    """
+    from rl_zoo3.train import train as zoo_train
+
+    before = sys.argv
+    sys.argv = ["rl_zoo3.train", *words]
+    try:
+        with _noted_interrupts() as seen:
+            zoo_train()
+    finally:
+        sys.argv = before
+    return bool(seen)
+
+
+@contextlib.contextmanager
+def _noted_interrupts() -> Iterator[list[int]]:
+    """
+    Note Ctrl-C, which the zoo takes as the end of the training and swallows.
+
+    A second one, while the model is being saved, must not break the file: only a third does.
+    """
+    seen: list[int] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield seen
+        return
+
+    def note(number: int, frame: FrameType | None) -> None:
+        del frame
+        seen.append(number)
+        if len(seen) == 2:
+            print("saving what was learned; Ctrl-C once more drops it", file=sys.stderr)
+            return
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGINT, note)
+    try:
+        yield seen
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _closing_words(options: TrainOptions, result: Run) -> list[str]:
+    """Say what there is now, and what to type next."""
+    lines = [f"learned from {result.steps} of {result.wanted} decisions; folder: {result.folder}"]
+    evaluated = result.best_model != result.last_model
+    lines += [f"best model by evaluation: {result.best_model}"] if evaluated else []
+    lines += [f"last model: {result.last_model}"]
+    if options.resume is not None:
+        lines += [f"before that, which may be better still: {options.resume}"]
+    if result.steps < result.wanted:
+        more = dataclasses.replace(
+            options, resume=result.last_model, timesteps=result.wanted - result.steps
+        )
+        lines += ["go on with:", f"  {_command(more)}"]
+    track = ["--track", result.track] if result.track else []
+    words = ["sb3-torcs", "evaluate", str(result.best_model), "--env", options.env, *track]
+    lines += ["see what it learned:", f"  {shlex.join(words)}"]
+    return lines
+
+
+def _command(options: TrainOptions) -> str:
+    """Compose the command line that means these options."""
+    words = ["sb3-torcs", "train"]
+    for field in dataclasses.fields(options):
+        value = getattr(options, field.name)
+        if field.name == "zoo_args" or (value == field.default and field.name != "seed"):
+            continue
+        option = field.name.replace("_", "-")
+        words += [f"--no-{option}"] if value is False else [f"--{option}", str(value)]
+    return shlex.join([*words, *(["--", *options.zoo_args] if options.zoo_args else [])])

@@ -1,0 +1,278 @@
+"""Loading a saved model: which algorithm it is, how it was trained, whether it fits."""
+
+from __future__ import annotations
+
+import io
+import json
+import pickle
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+import yaml
+from gymnasium import spaces
+
+from sb3_torcs.errors import InvalidOption, ModelMismatch, near_miss
+
+__all__ = [
+    "NormalizedDriver",
+    "TrainingRecord",
+    "check_spaces",
+    "find_model",
+    "load_driver",
+    "saved_spaces",
+    "saved_steps",
+    "training_record",
+]
+
+BEST_MODEL = "best_model.zip"
+
+# What only one family of algorithms saves; the first that is there names it. DDPG saves what TD3
+# does, and either class drives the other's models.
+TELLING_KEYS = (
+    ("top_quantiles_to_drop_per_net", "tqc"),
+    ("line_search_shrinking_factor", "trpo"),
+    ("clip_range", "ppo"),
+    ("exploration_fraction", "dqn"),
+    ("target_entropy", "sac"),
+    ("target_policy_noise", "td3"),
+    ("vf_coef", "a2c"),
+)
+
+
+@dataclass(frozen=True)
+class TrainingRecord:
+    """What the zoo wrote down beside a model; empty where it was not trained by the zoo."""
+
+    algo: str | None = None
+    env_id: str | None = None
+    env_kwargs: Mapping[str, Any] = field(default_factory=dict)
+    statistics: Path | None = None  # of VecNormalize
+
+
+class NormalizedDriver:
+    """
+    A model that learned from normalized observations, with the statistics it learned with.
+
+    :param model: a Stable-Baselines3 model
+    :param statistics: a pickled ``VecNormalize``
+    """
+
+    def __init__(self, model: Any, statistics: Path) -> None:
+        with statistics.open("rb") as file:
+            self._statistics = pickle.load(file)
+        self._model = model
+
+    def predict(
+        self, observation: npt.NDArray[np.float32], *, deterministic: bool = True
+    ) -> tuple[npt.NDArray[np.float32], Any]:
+        """
+        Choose an action.
+
+        :param observation: as the environment gives it
+        :param deterministic: whether to leave out chance
+        :return: the action and the model's state
+        """
+        normalized = self._statistics.normalize_obs(observation)
+        action, state = self._model.predict(normalized, deterministic=deterministic)
+        return action, state
+
+
+class _PlainLoader(yaml.SafeLoader):
+    """Reads the zoo's records, which name Python classes, without building any but mappings."""
+
+
+def _plain(loader: _PlainLoader, tag: str, node: yaml.Node) -> Any:
+    if isinstance(node, yaml.SequenceNode):
+        items = loader.construct_sequence(node, deep=True)
+        return dict(items[0]) if tag.endswith("OrderedDict") and items else items
+    if isinstance(node, yaml.MappingNode):
+        return loader.construct_mapping(node, deep=True)
+    return None
+
+
+_PlainLoader.add_multi_constructor("tag:yaml.org,2002:python/", _plain)
+
+
+def find_model(path: str | Path, *, prefer_last: bool = False) -> Path:
+    """
+    Find a saved model.
+
+    :param path: of a ``.zip`` file, with or without its suffix, or of a run's folder
+    :param prefer_last: of a folder take the last model rather than the best one
+    :return: the file
+    :raises InvalidOption: if there is none
+    """
+    given = Path(path).expanduser()
+    if given.is_file():
+        return given
+    if given.with_name(f"{given.name}.zip").is_file():
+        return given.with_name(f"{given.name}.zip")
+    if not given.is_dir():
+        siblings = [file.name for file in given.parent.glob("*.zip")]
+        raise InvalidOption(
+            f"there is no model '{given}'{near_miss(given.name, siblings)} "
+            "give the .zip that a training saved, or the folder of its run"
+        )
+    best = given / BEST_MODEL
+    last = [
+        file for file in (given / f"{sub.name}.zip" for sub in given.iterdir()) if file.is_file()
+    ]
+    order = [*last, best] if prefer_last else [best, *last]
+    for candidate in order:
+        if candidate.is_file():
+            return candidate
+    raise InvalidOption(f"the folder '{given}' holds no model; give the .zip that a training saved")
+
+
+def training_record(model: Path) -> TrainingRecord:
+    """
+    Read what the zoo wrote beside a model: ``config.yml``, ``args.yml``, ``vecnormalize.pkl``.
+
+    :param model: the file
+    :return: what is known
+    """
+    folders = [model.parent, *sorted(path for path in model.parent.iterdir() if path.is_dir())]
+    for folder in folders:
+        config, arguments = _read_plain(folder / "config.yml"), _read_plain(folder / "args.yml")
+        if not config and not arguments:
+            continue
+        statistics = folder / "vecnormalize.pkl"
+        return TrainingRecord(
+            algo=arguments.get("algo"),
+            env_id=arguments.get("env"),
+            env_kwargs=config.get("env_kwargs") or {},
+            statistics=statistics if statistics.is_file() else None,
+        )
+    return TrainingRecord()
+
+
+def _read_plain(path: Path) -> dict[str, Any]:
+    """Read one of the zoo's records; a broken or missing one is as good as none."""
+    try:
+        content = yaml.load(path.read_text(encoding="utf-8"), Loader=_PlainLoader)
+    except (OSError, yaml.YAMLError, UnicodeDecodeError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def _saved_data(model: Path) -> dict[str, Any]:
+    """Read the readable part of a saved model, without unpickling anything."""
+    try:
+        with zipfile.ZipFile(model) as archive:
+            data: dict[str, Any] = json.loads(archive.read("data"))
+    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
+        raise ModelMismatch(
+            f"'{model}' is not a model that Stable-Baselines3 saved ({error}); give the .zip that "
+            "a training saved"
+        ) from error
+    return data
+
+
+def saved_steps(model: Path) -> int:
+    """
+    Return how many decisions the last training of a model had.
+
+    :param model: the file
+    :return: ``num_timesteps``
+    """
+    return int(_saved_data(model)["num_timesteps"])
+
+
+def saved_spaces(model: Path) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
+    """
+    Return what a model sees and does.
+
+    :param model: the file
+    :return: the observation space and the action space
+    """
+    from stable_baselines3.common.save_util import json_to_data
+
+    data = _saved_data(model)
+    wanted = {name: data[name] for name in ("observation_space", "action_space")}
+    loaded = json_to_data(json.dumps(wanted))
+    return loaded["observation_space"], loaded["action_space"]
+
+
+def check_spaces(
+    model: Path,
+    saved: tuple[spaces.Space[Any], spaces.Space[Any]],
+    env: gym.Env[Any, Any],
+) -> None:
+    """
+    Make sure that a model fits an environment.
+
+    :param model: the file, for the message
+    :param saved: what the model sees and does
+    :param env: that it is to drive
+    :raises ModelMismatch: if the layouts differ
+    """
+    given = (env.observation_space, env.action_space)
+    for what, has, needs in zip(("observations", "actions"), saved, given, strict=True):
+        if has == needs:
+            continue
+        record = training_record(model)
+        hint = f" (it was trained on {record.env_id})" if record.env_id else ""
+        name = env.spec.id if env.spec else "the environment"
+        raise ModelMismatch(
+            f"'{model}'{hint} has {what} {_layout(has)}, but {name} has {_layout(needs)}; give the "
+            "--env that it was trained on, or train a model for this one: sb3-torcs train "
+            f"--env {name}"
+        )
+
+
+def _layout(space: spaces.Space[Any]) -> str:
+    """Say in a few words what a space is."""
+    if isinstance(space, spaces.Box):
+        low, high = float(np.min(space.low)), float(np.max(space.high))
+        return f"{space.shape} {space.dtype} within [{low:g}, {high:g}]"
+    return str(space)
+
+
+def load_driver(path: str | Path, env: gym.Env[Any, Any], algo: str | None = None) -> Any:
+    """
+    Load what is to drive.
+
+    :param path: of a saved model or its run's folder, or ``"scripted"``
+    :param env: that it is to drive
+    :param algo: as the zoo calls it; ``None`` finds out
+    :return: something with ``predict(observation, deterministic=...)``
+    :raises InvalidOption: if there is no such file or algorithm
+    :raises ModelMismatch: if the file is no model, or one for another environment
+    """
+    if str(path) == "scripted":
+        from sb3_torcs.drivers import ScriptedDriver
+
+        return ScriptedDriver()
+    model_file = find_model(path)
+    data = _saved_data(model_file)
+    check_spaces(model_file, saved_spaces(model_file), env)
+    record = training_record(model_file)
+    algorithm = _algorithm(algo or record.algo, data, model_file)
+    # On the CPU: for one decision at a time it is the fastest, and it is always there. The
+    # schedules are of no use to a driver, and the saved ones may be from another version.
+    model = algorithm.load(io.BytesIO(model_file.read_bytes()), device="cpu", buffer_size=1)
+    return NormalizedDriver(model, record.statistics) if record.statistics else model
+
+
+def _algorithm(name: str | None, data: dict[str, Any], model: Path) -> Any:
+    """Find the class of a saved model."""
+    from rl_zoo3.utils import ALGOS
+
+    if name is None and "recurrent" in str(data.get("policy_class")).lower():
+        name = "ppo_lstm"
+    if name is None:
+        name = next((algo for key, algo in TELLING_KEYS if key in data), None)
+    if name is None:
+        raise ModelMismatch(f"'{model}' does not tell its algorithm; say it: --algo ddpg")
+    if name not in ALGOS:
+        raise InvalidOption(
+            f"the RL Zoo has no algorithm '{name}'{near_miss(name, ALGOS)} it has: "
+            f"{', '.join(sorted(ALGOS))}"
+        )
+    return ALGOS[name]

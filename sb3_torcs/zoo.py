@@ -1,0 +1,276 @@
+"""Hyperparameter files: finding them, and reading them before anything starts.
+
+The RL Zoo hands whatever it does not know to the algorithm, hours later for some keys. Here an
+entry is read by the same rules, and what nothing would read is an error that names it.
+"""
+
+from __future__ import annotations
+
+import copy
+import importlib
+import importlib.util
+import inspect
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import yaml
+
+from sb3_torcs.errors import ZooConfigError, near_miss
+
+__all__ = ["ZOO_KEYS", "Place", "check_entry", "config_file", "read_config", "read_entry"]
+
+Entry = dict[str, Any]
+
+ZOO_KEYS = frozenset(
+    {
+        "callback", "env_kwargs", "env_wrapper", "frame_stack", "monitor_kwargs", "n_envs",
+        "n_timesteps", "noise_std", "noise_type", "normalize", "policy", "policy_kwargs",
+        "vec_env_wrapper",
+    }
+)  # fmt: skip
+"""What the RL Zoo itself reads of an entry; all else goes to the algorithm's constructor."""
+
+GIVEN_BY_ZOO = ("self", "env", "tensorboard_log", "seed", "verbose", "device", "_init_setup_model")
+"""Arguments of the constructor that the zoo passes itself: in an entry they would clash."""
+
+GIVEN_BY_POLICY_OWNER = ("self", "observation_space", "action_space", "lr_schedule")
+"""Arguments of a policy that the algorithm passes itself."""
+
+REQUIRED = ("n_timesteps", "policy")
+
+
+class Place(NamedTuple):
+    """Where in which file an entry stands, for messages."""
+
+    file: Path
+    entry: str
+
+    def __str__(self) -> str:
+        return f"{self.file}, entry '{self.entry}'"
+
+
+def shipped_folder() -> Path:
+    """Return the folder of the shipped files: the installed package, or that of a checkout."""
+    spec = importlib.util.find_spec("sb3_torcs.zoo_configs")
+    if spec is not None and spec.submodule_search_locations:
+        return Path(next(iter(spec.submodule_search_locations)))
+    return Path(__file__).resolve().parent.parent / "zoo_configs"
+
+
+def config_file(algo: str, conf_file: str | Path | None = None) -> Path:
+    """
+    Find the hyperparameter file of an algorithm.
+
+    :param algo: as the zoo calls it, e.g. ``"ddpg"``
+    :param conf_file: a file to use instead of the shipped one
+    :return: its path
+    :raises ZooConfigError: if there is none
+    """
+    if conf_file is not None:
+        path = Path(conf_file).expanduser()
+        if not path.is_file():
+            raise ZooConfigError(f"there is no hyperparameter file '{path}'; give a .yml file")
+        return path
+    path = shipped_folder() / f"{algo}.yml"
+    if not path.is_file():
+        known = sorted(file.stem for file in shipped_folder().glob("*.yml"))
+        raise ZooConfigError(
+            f"no hyperparameters are shipped for the algorithm '{algo}'{near_miss(algo, known)} "
+            f"shipped: {', '.join(known)}; for another one give a file: --conf-file FILE.yml"
+        )
+    return path
+
+
+def read_config(path: Path) -> dict[str, Entry]:
+    """
+    Read a hyperparameter file.
+
+    :param path: of a YAML file
+    :return: its entries by name
+    :raises ZooConfigError: if it is not a mapping of mappings
+    """
+    try:
+        entries = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f", line {mark.line + 1}" if mark else ""
+        problem = getattr(error, "problem", None) or error
+        raise ZooConfigError(f"{path}{line}: not YAML: {problem}") from error
+    if not isinstance(entries, dict) or not entries:
+        raise ZooConfigError(f"{path}: expected entries 'ENV-ID: {{key: value}}'")
+    for name, entry in entries.items():
+        if not isinstance(entry, dict):
+            raise ZooConfigError(f"{Place(path, name)}: expected a mapping, got {entry!r}")
+    return entries
+
+
+def read_entry(path: Path, name: str) -> Entry:
+    """
+    Read one entry; changing it changes nothing else.
+
+    :param path: of a YAML file
+    :param name: of the entry: an environment's id, or what the file calls it
+    :return: the entry
+    :raises ZooConfigError: if the file has no such entry
+    """
+    entries = read_config(path)
+    if name not in entries and "default" in entries:
+        name = "default"
+    if name not in entries:
+        raise ZooConfigError(
+            f"{path} has no entry '{name}'{near_miss(name, entries)} it has: {', '.join(entries)}"
+        )
+    return copy.deepcopy(entries[name])
+
+
+def check_entry(entry: Entry, algo: str, env_id: str, place: Place) -> None:
+    """
+    Make sure that everything in an entry will be read by something.
+
+    :param entry: as read from the file
+    :param algo: as the zoo calls it
+    :param env_id: a registered environment
+    :param place: where the entry stands
+    :raises ZooConfigError: for the first thing that nothing would read
+    """
+    from rl_zoo3.utils import ALGOS
+
+    if algo not in ALGOS:
+        raise ZooConfigError(
+            f"the RL Zoo has no algorithm '{algo}'{near_miss(algo, ALGOS)} it has: "
+            f"{', '.join(sorted(ALGOS))}"
+        )
+    for key in REQUIRED:
+        if key not in entry:
+            raise ZooConfigError(f"{place}: key '{key}' is missing")
+    constructor = (_arguments(ALGOS[algo]) or set()) - set(GIVEN_BY_ZOO)
+    _check_keys(entry, ZOO_KEYS | constructor, "key", place)
+    policy = _policy(entry["policy"], ALGOS[algo], place)
+    _check_call("policy_kwargs", policy, entry.get("policy_kwargs"), place, GIVEN_BY_POLICY_OWNER)
+    for key in ("callback", "env_wrapper", "vec_env_wrapper"):
+        for path, arguments in _items(entry.get(key), key, place):
+            _check_call(f"{key} {path}", _imported(path, key, place), arguments, place)
+    _check_call("env_kwargs", _env_class(env_id), entry.get("env_kwargs"), place)
+    _check_wrappers(entry, place)
+
+
+def _check_wrappers(entry: Entry, place: Place) -> None:
+    """Check what goes to Monitor and to VecNormalize."""
+    from stable_baselines3.common.monitor import Monitor
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    _check_call("normalize", VecNormalize, entry.get("normalize"), place, ("self", "venv"))
+    keywords = entry.get("monitor_kwargs")
+    _check_call("monitor_kwargs", Monitor, keywords, place, ("self", "env", "filename"))
+    if isinstance(keywords, Mapping):
+        kinds = {type(keywords.get(key, ())) for key in ("info_keywords", "reset_keywords")}
+        if len(kinds) > 1:  # Monitor adds the two, and a tuple is its default
+            raise ZooConfigError(
+                f"{place}: monitor_kwargs needs both info_keywords and reset_keywords as lists; "
+                "add the other one as []"
+            )
+
+
+def _env_class(env_id: str) -> Callable[..., Any]:
+    """Return what builds an environment."""
+    entry_point = gym.spec(env_id).entry_point
+    if isinstance(entry_point, str):
+        module, _, name = entry_point.partition(":")
+        return getattr(importlib.import_module(module), name)
+    if entry_point is None:
+        raise ZooConfigError(f"{env_id} has no entry point; register it with one")
+    return entry_point
+
+
+def _policy(name: Any, algorithm: Any, place: Place) -> Callable[..., Any]:
+    """Find the class that a policy's alias or dotted path stands for."""
+    if isinstance(name, str) and "." in name:
+        return _imported(name, "policy", place)
+    if name not in algorithm.policy_aliases:
+        known = algorithm.policy_aliases
+        raise ZooConfigError(
+            f"{place}: unknown policy {name!r}{near_miss(str(name), known)} allowed: "
+            f"{', '.join(known)}, or a dotted path such as sb3_torcs.policies.SplitHeadPolicy"
+        )
+    return algorithm.policy_aliases[name]
+
+
+def _items(value: Any, key: str, place: Place) -> list[tuple[str, Mapping[str, Any]]]:
+    """
+    Read what the zoo takes for callbacks and wrappers.
+
+    :param value: a dotted path, ``{path: {argument: value}}``, a list of those, or ``None``
+    :param key: its key
+    :param place: where it stands
+    :return: dotted paths and their arguments
+    """
+    items = value if isinstance(value, list) else [] if value is None else [value]
+    result: list[tuple[str, Mapping[str, Any]]] = []
+    for item in items:
+        single = isinstance(item, dict) and len(item) == 1
+        path, arguments = next(iter(item.items())) if single else (item, {})
+        if not isinstance(path, str) or not isinstance(arguments, dict):
+            raise ZooConfigError(
+                f"{place}: {key} has {item!r}; expected a dotted path, or one dotted path with "
+                "its arguments indented below it (check the indentation)"
+            )
+        result.append((path, arguments))
+    return result
+
+
+def _imported(path: str, key: str, place: Place) -> Callable[..., Any]:
+    """Import a class by its dotted path."""
+    module_name, _, name = path.rpartition(".")
+    try:
+        module = importlib.import_module(module_name)
+    except (ImportError, ValueError) as error:
+        raise ZooConfigError(f"{place}: {key} '{path}' does not import: {error}") from error
+    if not hasattr(module, name):
+        raise ZooConfigError(
+            f"{place}: {key} '{path}': {module_name} has no '{name}'{near_miss(name, vars(module))}"
+        )
+    return getattr(module, name)
+
+
+def _arguments(function: Callable[..., Any]) -> set[str] | None:
+    """
+    Return the names of the arguments that a constructor takes, also those it hands to its bases.
+
+    :param function: a class, or a function that builds one
+    :return: the names; ``None`` if it takes any
+    """
+    names: set[str] = set()
+    for step in function.__mro__[:-1] if inspect.isclass(function) else (function,):
+        own = vars(step).get("__init__") if inspect.isclass(step) else step
+        if own is None:
+            continue
+        parameters = inspect.signature(own).parameters.values()
+        kinds = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+        names.update(p.name for p in parameters if p.kind in kinds)
+        if not any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters):
+            return names
+    return None
+
+
+def _check_call(
+    what: str,
+    function: Callable[..., Any],
+    arguments: Any,
+    place: Place,
+    given: Iterable[str] = ("self",),
+) -> None:
+    """Make sure that a constructor has all these arguments; strings are the zoo's to evaluate."""
+    known = _arguments(function)
+    if isinstance(arguments, Mapping) and known is not None:
+        _check_keys(arguments, known - set(given), f"{what}: argument", place)
+
+
+def _check_keys(mapping: Mapping[str, Any], known: Iterable[str], what: str, place: Place) -> None:
+    """Make sure that all keys are known."""
+    known = sorted(known)
+    for key in mapping:
+        if key not in known:
+            hint = near_miss(str(key), known) or f"; allowed: {', '.join(known)}"
+            raise ZooConfigError(f"{place}: unknown {what} '{key}'{hint}")

@@ -1,0 +1,460 @@
+import itertools
+import json
+import shlex
+import signal
+import subprocess
+import sys
+import types
+
+import numpy as np
+import pytest
+import yaml
+from stable_baselines3 import DDPG
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_torcs import bench, models
+from sb3_torcs.cli import VERBS, common, doctor, evaluate, main, recording, train
+from sb3_torcs.cli.train import TrainOptions
+
+NAMES = [verb.__name__.rpartition(".")[2] for verb in VERBS]
+PNG = b"\x89PNG"
+
+ENTRY = {
+    "n_timesteps": 60,
+    "policy": "MlpPolicy",
+    "learning_starts": 20,
+    "buffer_size": 100,
+    "batch_size": 4,
+    "policy_kwargs": {"net_arch": [4]},
+    "env_kwargs": {"track": "aalborg", "reward": "progress", "start": "random"},
+}
+
+
+def run(capsys, *words):
+    """Run the command: exit status, standard output, standard error."""
+    capsys.readouterr()
+    status = main(list(words))
+    return status, *capsys.readouterr()
+
+
+def write_config(tmp_path, **changes):
+    path = tmp_path / "own.yml"
+    path.write_text(yaml.safe_dump({"TorcsLite-v0": {**ENTRY, **changes}, "other": ENTRY}))
+    return str(path)
+
+
+def options(tmp_path, **changes):
+    conf_file = write_config(tmp_path, **changes.pop("entry_changes", {}))
+    return TrainOptions(conf_file=conf_file, folder=tmp_path / "logs", **changes)
+
+
+class InterruptingCallback(BaseCallback):
+    """Presses Ctrl-C, and once more while the training ends."""
+
+    def __init__(self, at):
+        super().__init__()
+        self.at = at
+
+    def _on_step(self):
+        if self.num_timesteps == self.at:
+            try:
+                signal.raise_signal(signal.SIGINT)
+            finally:
+                signal.raise_signal(signal.SIGINT)
+        return True
+
+
+# The frame of it.
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_each_verb_has_help(capsys, name):
+    with pytest.raises(SystemExit) as caught:
+        main([name, "--help"])
+    assert caught.value.code == 0
+    assert f"sb3-torcs {name}" in capsys.readouterr().out
+
+
+def loaded_by(*words):
+    """Run the command in a new process, and say what it has loaded at its end."""
+    code = (
+        "import sys\nfrom sb3_torcs.cli import main\n"
+        "try: main(sys.argv[1:])\nexcept SystemExit: pass\n"
+        "print(*sys.modules)"
+    )
+    call = [sys.executable, "-c", code, *words]
+    done = subprocess.run(call, capture_output=True, text=True, check=True)
+    return set(done.stdout.splitlines()[-1].split())
+
+
+def test_help_loads_nothing_heavy():
+    """It starts in a blink; torch alone takes seconds."""
+    heavy = {"torch", "numba", "stable_baselines3", "matplotlib", "pygame"}
+    assert loaded_by("--help") & heavy == set()
+
+
+def test_listing_tracks_does_not_load_torch():
+    assert "torch" not in loaded_by("tracks")
+
+
+def test_an_unknown_verb_is_a_usage_error(capsys):
+    with pytest.raises(SystemExit) as caught:
+        main(["drive"])
+    assert caught.value.code == 2
+    assert "'drive'" in capsys.readouterr().err
+
+
+def test_a_mistake_is_told_in_one_line_without_a_traceback(capsys):
+    status, out, err = run(capsys, "tracks", "aalborgg")
+    assert (status, out) == (2, "")
+    assert err.startswith("sb3-torcs: no track 'aalborgg'; did you mean 'aalborg'?")
+    assert err.count("\n") == 1
+
+
+def test_an_interrupt_is_told_by_the_exit_status(capsys, monkeypatch):
+    def interrupted(args):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(doctor, "run", interrupted)
+    assert run(capsys, "doctor") == (130, "", "sb3-torcs: interrupted\n")
+
+
+def test_only_train_passes_words_on(capsys):
+    with pytest.raises(SystemExit) as caught:
+        main(["tracks", "--", "--verbose"])
+    assert caught.value.code == 2
+    assert "passes nothing on" in capsys.readouterr().err
+
+
+def test_json_has_no_infinities(capsys):
+    common.print_json({"a": float("inf"), "b": [float("nan"), 1.5], "c": "x"})
+    assert json.loads(capsys.readouterr().out) == {"a": None, "b": [None, 1.5], "c": "x"}
+
+
+def test_a_table_puts_numbers_to_the_right():
+    assert common.table(("name", "m"), [("a", "10.0"), ("bcdef", "9.5")]) == (
+        "name      m\n-----  ----\na      10.0\nbcdef   9.5"
+    )
+
+
+# tracks
+
+
+def test_tracks_as_json_is_a_list_of_what_is_in_the_table(capsys):
+    status, out, _ = run(capsys, "tracks", "--json")
+    tracks = json.loads(out)
+    keys = {"name", "category", "length_m", "width_m", "tightest_radius_m", "source"}
+    assert status == 0
+    assert [set(track) for track in tracks] == [keys] * len(tracks)
+    listed = run(capsys, "tracks")[1]
+    assert [line.split()[0] for line in listed.splitlines()[2:]] == [t["name"] for t in tracks]
+
+
+def test_tracks_lists_only_those_that_are_named(capsys):
+    _, out, _ = run(capsys, "tracks", "alpine-1", "road/aalborg", "--json")
+    assert [track["name"] for track in json.loads(out)] == ["alpine-1", "aalborg"]
+
+
+def test_a_track_is_drawn(capsys, tmp_path):
+    pytest.importorskip("sb3_torcs.track_plot")
+    picture = tmp_path / "new" / "aalborg.png"
+    assert run(capsys, "tracks", "aalborg", "--plot", str(picture))[0] == 0
+    assert picture.read_bytes()[:4] == PNG
+
+
+@pytest.mark.parametrize("names", [(), ("aalborg", "alpine-1")])
+def test_one_track_at_a_time_is_drawn(capsys, names):
+    status, _, err = run(capsys, "tracks", *names, "--plot", "x.png")
+    assert status == 2
+    assert f"--plot draws one track, {len(names)} are named" in err
+
+
+def test_a_picture_of_another_kind_is_refused(capsys):
+    assert "should end in .png" in run(capsys, "tracks", "aalborg", "--plot", "x.jpg")[2]
+
+
+# evaluate
+
+
+def test_an_evaluation_says_what_happened(capsys):
+    words = ["evaluate", "scripted", "--track", "g-track-1", "--laps", "1", "--json"]
+    status, out, _ = run(capsys, *words)
+    result = json.loads(out)
+    assert status == 0
+    assert list(result) == ["env", "track", "car", "episodes"]
+    assert (result["env"], result["track"]) == ("TorcsLite-v0", "g-track-1")
+    (episode,) = result["episodes"]
+    keys = {"laps", "lap_times", "distance", "end", "damage", "return"}
+    assert set(episode) == keys
+    assert (episode["laps"], episode["end"], len(episode["lap_times"])) == (1, "laps", 1)
+    assert run(capsys, *words) == (0, out, "")
+
+
+def test_an_evaluation_as_a_table_has_a_row_per_episode(capsys):
+    words = ["evaluate", "scripted", "--track", "g-track-1", "--laps", "1", "--episodes", "2"]
+    _, out, _ = run(capsys, *words)
+    lines = out.splitlines()
+    assert lines[0] == "TorcsLite-v0, g-track-1, car1-trb1"
+    assert [line.split()[:2] for line in lines[3:]] == [["1", "1"], ["2", "1"]]
+
+
+def test_a_missing_model_is_told(capsys, tmp_path):
+    status, _, err = run(capsys, "evaluate", str(tmp_path / "none.zip"))
+    assert status == 2
+    assert "there is no model" in err
+
+
+def test_torcs_is_not_replaced_by_something_else(capsys):
+    status, out, err = run(capsys, "evaluate", "scripted", "--env", "Torcs-v0", "--json")
+    assert (status, out) == (2, "")
+    assert err.startswith("sb3-torcs: Torcs-v0 needs")
+
+
+def test_an_output_that_cannot_be_written_is_told_before_the_drive(capsys, tmp_path):
+    (tmp_path / "file").write_text("")
+    words = ["--video", str(tmp_path / "file" / "v.mp4")]
+    status, _, err = run(capsys, "evaluate", "none.zip", *words)
+    assert status == 2
+    assert "cannot write to the folder" in err
+
+
+def test_the_environment_is_that_of_the_training_unless_the_words_say_otherwise():
+    kept = {"track": "alpine-1", "range_finders": "narrow", "action_repeat": 2}
+    record = models.TrainingRecord(env_kwargs={**kept, "start": "random", "laps": 9})
+    nothing = dict.fromkeys(("track", "car", "action_repeat", "range_finders"))
+    args = types.SimpleNamespace(laps=3, **nothing)
+    assert evaluate.environment_kwargs(args, record) == {**kept, "laps": 3}
+    args.track = "aalborg"
+    assert evaluate.environment_kwargs(args, record) == {**kept, "track": "aalborg", "laps": 3}
+
+
+def test_the_time_limit_cuts_no_lap_of_a_car_that_does_not_count_as_standing():
+    """Three laps of 2587.5 m at 5 km/h take 5589 s, and a decision takes 0.1 s."""
+    kwargs = {"track": "aalborg", "laps": 3}
+    assert evaluate.time_limit(kwargs) > 55890
+    assert evaluate.time_limit({**kwargs, "action_repeat": 1}) > 5 * 55890
+    assert evaluate.time_limit({**kwargs, "track": "random"}) > 55890
+
+
+def decision(lap_time=None, distance=0.0):
+    return recording.Decision(None, types.SimpleNamespace(distance_raced=distance), lap_time)
+
+
+def test_the_best_stretch_is_the_fastest_whole_lap():
+    slow_then_fast = [decision(), decision(90.0), decision(), decision(80.0), decision()]
+    stretch = recording.best_stretch([[decision(), decision(85.0)], slow_then_fast])
+    assert stretch == (1, 2, 4)
+
+
+def test_without_a_whole_lap_the_best_stretch_is_the_longest_drive():
+    episodes = [[decision(distance=5.0)], [decision(distance=1.0), decision(distance=9.0)]]
+    assert recording.best_stretch(episodes) == (1, 0, 2)
+
+
+@pytest.fixture
+def recorded():
+    """A second episode that a driver ended soon, in a recorder."""
+    recorder = recording.Recorder("TorcsLite-v0", {"track": "random"}, 100)
+    for seed in (3, None):
+        recorder.reset(seed=seed)
+        for _ in range(12 if seed is None else 2):
+            recorder.step(np.array([0.0, 1.0, 0.0], np.float32))
+    yield recorder
+    recorder.close()
+
+
+def test_an_episode_is_driven_again_exactly(recorded):
+    """Tick by tick, on the track that was drawn for the second episode."""
+    env = recorded._again(1, action_repeat=1)
+    for step in recorded.episodes[1]:
+        for _ in range(recorded.get_wrapper_attr("action_repeat")):
+            info = env.step(step.action)[4]
+        assert (info["car"].x, info["car"].y) == (step.car.x, step.car.y)
+    env.close()
+
+
+def test_a_stretch_is_filmed_in_real_time(recorded, tmp_path):
+    """12 decisions of 0.1 s at 25 frames per second."""
+    frames = list(recorded._frames(recording.best_stretch(recorded.episodes), 5))
+    assert len(frames) == 30
+    assert {frame.shape for frame in frames} == {frames[0].shape}
+    recorded.film(tmp_path / "v.mp4")
+    assert (tmp_path / "v.mp4").stat().st_size > 1000
+
+
+def test_a_stretch_is_drawn(recorded, tmp_path):
+    pytest.importorskip("sb3_torcs.track_plot")
+    recorded.draw_line(tmp_path / "line.png")
+    assert (tmp_path / "line.png").read_bytes()[:4] == PNG
+
+
+# train
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"entry_changes": {"learning_rat": 1}}, "unknown key 'learning_rat'"),
+        ({"env": "TorcsLight-v0"}, "no environment 'TorcsLight-v0' is registered; did you mean"),
+        ({"track": "aalborgg"}, "no track 'aalborgg'; did you mean 'aalborg'?"),
+        ({"entry": "othr"}, "no entry 'othr'; did you mean 'other'?"),
+        ({"resume": "none.zip"}, "there is no model 'none.zip'"),
+        ({"algo": "dpg"}, "no algorithm 'dpg'; did you mean 'ddpg'?"),
+    ],
+)
+def test_a_mistake_is_told_before_anything_starts(tmp_path, changes, message):
+    with pytest.raises(Exception) as caught:
+        train.train(options(tmp_path, **changes))
+    assert message in str(caught.value)
+    assert not (tmp_path / "logs").exists()
+
+
+@pytest.mark.parametrize("option", ["--folder", "--tensorboard"])
+def test_a_folder_that_cannot_be_written_is_told_before_the_training(capsys, tmp_path, option):
+    (tmp_path / "file").write_text("")
+    words = ["--conf-file", write_config(tmp_path), "--folder", str(tmp_path / "logs")]
+    status, _, err = run(capsys, "train", *words, option, str(tmp_path / "file" / "logs"))
+    assert status == 2
+    assert err.startswith("sb3-torcs: cannot write to the folder")
+
+
+def test_numbers_of_steps_have_to_be_positive(capsys):
+    with pytest.raises(SystemExit):
+        main(["train", "--timesteps", "0"])
+    assert "expected a whole number >= 1" in capsys.readouterr().err
+
+
+def test_the_words_for_the_zoo_say_what_was_asked():
+    asked = TrainOptions(eval_episodes=2, seed=7)
+    words = train._zoo_words(asked, 100000, {"track": "aalborg", "start": "random", "laps": 2})
+    pairs = dict(itertools.pairwise(words))
+    assert (pairs["--seed"], pairs["--eval-freq"], pairs["--eval-episodes"]) == ("7", "5000", "2")
+    assert (pairs["--num-threads"], pairs["--device"]) == ("1", "cpu")
+    assert words[words.index("--eval-env-kwargs") + 1 :] == ["track:'aalborg'", "laps:2"]
+
+
+def test_the_command_that_goes_on_means_the_same_options():
+    asked = TrainOptions(
+        entry="as the post", timesteps=5, seed=3, progress=False, zoo_args=("--save-freq", "2")
+    )
+    words = shlex.split(train._command(asked))
+    assert words[:2] == ["sb3-torcs", "train"]
+    assert words[-3:] == ["--", "--save-freq", "2"]
+    assert words[2:-3] == [
+        "--entry", "as the post", "--timesteps", "5", "--seed", "3", "--no-progress",
+    ]  # fmt: skip
+
+
+@pytest.mark.slow
+def test_a_training_leaves_models_and_logs(capsys, tmp_path):
+    words = ["--conf-file", write_config(tmp_path), "--folder", str(tmp_path / "logs")]
+    words += ["--track", "alpine-1", "--seed", "1", "--", "--save-freq", "30"]
+    status, out, err = run(capsys, "train", *words)
+    folder = tmp_path / "logs" / "ddpg" / "TorcsLite-v0_1"
+    assert status == 0
+    assert "100% 60/60 steps" in err
+    assert f"best model by evaluation: {folder / 'best_model.zip'}" in out
+    assert models.saved_steps(folder / "TorcsLite-v0.zip") == 60
+    assert (folder / "rl_model_30_steps.zip").is_file()
+    assert list((tmp_path / "logs" / "tensorboard").rglob("events.*")) != []
+    record = models.training_record(folder / "best_model.zip")
+    assert record.env_kwargs == {**ENTRY["env_kwargs"], "track": "alpine-1"}
+    (command,) = [line for line in out.splitlines() if "sb3-torcs evaluate" in line]
+    status, out, _ = run(capsys, *shlex.split(command)[1:], "--json")
+    assert status == 0
+    assert json.loads(out)["track"] == "alpine-1"
+
+
+@pytest.mark.slow
+def test_the_same_seed_trains_the_same_model(tmp_path):
+    folders = [train.train(options(tmp_path, progress=False)) for _ in range(2)]
+    assert [folder.name for folder in folders] == ["TorcsLite-v0_1", "TorcsLite-v0_2"]
+    first, second = (DDPG.load(folder / "TorcsLite-v0.zip") for folder in folders)
+    for one, other in zip(first.policy.parameters(), second.policy.parameters(), strict=True):
+        assert one.equal(other)
+
+
+@pytest.mark.slow
+def test_an_interrupted_training_keeps_what_it_learned_and_says_how_to_go_on(capsys, tmp_path):
+    callback = {f"{__name__}.InterruptingCallback": {"at": 40}}
+    conf_file = write_config(tmp_path, callback=[callback])
+    words = ["--conf-file", conf_file, "--folder", str(tmp_path / "logs"), "--no-progress"]
+    status, out, err = run(capsys, "train", *words)
+    last_model = tmp_path / "logs" / "ddpg" / "TorcsLite-v0_1" / "TorcsLite-v0.zip"
+    assert status == 130
+    assert "saving what was learned" in err
+    assert models.saved_steps(last_model) == 40
+    (command,) = [line for line in out.splitlines() if "--resume" in line]
+    assert "--timesteps 20" in command
+    status, out, _ = run(capsys, *shlex.split(command)[1:])
+    folder = last_model.parent.with_name("TorcsLite-v0_2")
+    assert (status, "learned from 20 of 20" in out) == (0, True)
+    config = models._read_plain(folder / "TorcsLite-v0" / "config.yml")
+    assert config["learning_starts"] == 0  # it has its memory, so it needs no new warm-up
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+@pytest.mark.slow
+def test_the_shipped_hyperparameters_train(tmp_path):
+    run_folder = train.train(TrainOptions(timesteps=150, folder=tmp_path, progress=False))
+    assert (run_folder / "best_model.zip").is_file()
+
+
+# doctor
+
+
+def test_the_doctor_is_not_content_without_the_game(capsys):
+    """Torcs-v0 has no engine in this version, and the exit status must say so."""
+    status, out, _ = run(capsys, "doctor", "--json")
+    result = json.loads(out)
+    by_name = {check["name"]: check for check in result["checks"]}
+    assert (status, result["ok"]) == (1, False)
+    assert {tuple(check) for check in result["checks"]} == {("name", "ok", "found", "fix")}
+    assert by_name["TorcsLite-v0"]["ok"]
+    assert not by_name["Torcs-v0"]["ok"]
+    assert "TorcsLite-v0" in by_name["Torcs-v0"]["fix"]
+    assert all(bool(check["fix"]) != check["ok"] for check in result["checks"])
+
+
+def test_the_doctor_survives_what_is_broken():
+    def broken():
+        raise RuntimeError("no luck")
+
+    check = doctor._guarded(broken)
+    assert (check.ok, check.found) == (False, "RuntimeError: no luck")
+
+
+def test_the_doctor_says_what_to_type(capsys, monkeypatch):
+    monkeypatch.setattr(doctor, "PACKAGES", {"no-such-package": "no_such_package"})
+    _, out, _ = run(capsys, "doctor")
+    assert "MISSING  no-such-package" in out
+    assert "-> pip install 'no-such-package'" in out
+
+
+# bench
+
+
+@pytest.fixture
+def quick_bench(monkeypatch):
+    def stages(seconds):
+        return {"one": lambda: {"lite_ticks_per_s": 1000.0 * seconds}}
+
+    monkeypatch.setattr(bench, "stages", stages)
+
+
+def test_the_bench_prints_every_figure_and_null_for_what_it_cannot_measure(capsys, quick_bench):
+    status, out, _ = run(capsys, "bench", "--json", "--seconds", "25")
+    figures = json.loads(out)
+    assert (status, tuple(figures)) == (0, bench.KEYS)
+    assert [name for name, value in figures.items() if value is not None] == ["lite_ticks_per_s"]
+    assert figures["lite_ticks_per_s"] == 25000.0
+
+
+def test_the_bench_as_a_table(capsys, quick_bench):
+    lines = run(capsys, "bench")[1].splitlines()
+    assert lines[2].split() == ["lite_ticks_per_s", "30000"]
+    assert lines[-1].split() == ["training_env_share", "-"]
+
+
+def test_the_bench_needs_time(capsys):
+    assert "expected more than 0" in run(capsys, "bench", "--seconds", "0")[2]

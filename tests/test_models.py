@@ -1,0 +1,156 @@
+import gymnasium as gym
+import numpy as np
+import pytest
+import yaml
+from gymnasium import spaces
+from stable_baselines3 import DDPG, PPO, SAC
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+import sb3_torcs  # noqa: F401  registers the environments
+from sb3_torcs import models
+from sb3_torcs.drivers import ScriptedDriver
+from sb3_torcs.errors import InvalidOption, ModelMismatch
+
+SMALL = {"device": "cpu", "seed": 0}
+
+
+@pytest.fixture(scope="module")
+def env():
+    with gym.make("TorcsLite-v0") as made:
+        yield made
+
+
+@pytest.fixture
+def saved(env, tmp_path):
+    """An untrained DDPG, and its file."""
+    model = DDPG("MlpPolicy", env, buffer_size=1, **SMALL)
+    model.save(tmp_path / "TorcsLite-v0.zip")
+    return model, tmp_path / "TorcsLite-v0.zip"
+
+
+def zoo_record(folder, algo="ddpg", **env_kwargs):
+    """Write down a training as the zoo does."""
+    (folder / "TorcsLite-v0").mkdir()
+    ordered = "!!python/object/apply:collections.OrderedDict\n"
+    words = [["algo", algo], ["env", "TorcsLite-v0"], ["seed", 1]]
+    (folder / "TorcsLite-v0" / "args.yml").write_text(ordered + yaml.safe_dump([words]))
+    config = [["env_kwargs", env_kwargs], ["gamma", 0.98]]
+    (folder / "TorcsLite-v0" / "config.yml").write_text(ordered + yaml.safe_dump([config]))
+
+
+def observation(env):
+    return np.linspace(-0.5, 0.5, env.observation_space.shape[0], dtype=np.float32)
+
+
+@pytest.mark.parametrize("algorithm", [DDPG, SAC, PPO])
+def test_a_model_without_a_record_is_loaded_by_what_it_saved(env, tmp_path, algorithm):
+    kwargs = {} if algorithm is PPO else {"buffer_size": 1}
+    model = algorithm("MlpPolicy", env, **kwargs, **SMALL)
+    model.save(tmp_path / "m.zip")
+    driver = models.load_driver(tmp_path / "m.zip", env)
+    expected = model.predict(observation(env), deterministic=True)[0]
+    np.testing.assert_array_equal(driver.predict(observation(env), deterministic=True)[0], expected)
+
+
+def test_the_record_of_the_zoo_names_the_algorithm_and_the_environment(saved, env):
+    _, path = saved
+    zoo_record(path.parent, track="alpine-1", range_finders="narrow")
+    record = models.training_record(path)
+    assert (record.algo, record.env_id) == ("ddpg", "TorcsLite-v0")
+    assert record.env_kwargs == {"track": "alpine-1", "range_finders": "narrow"}
+    assert isinstance(models.load_driver(path, env), DDPG)
+
+
+def test_a_record_that_is_broken_is_as_good_as_none(saved):
+    _, path = saved
+    (path.parent / "config.yml").write_text("a: [")
+    assert models.training_record(path) == models.TrainingRecord()
+
+
+def test_a_record_builds_no_objects(tmp_path):
+    """A record may come from anywhere; reading it must not run what it names."""
+    marker = tmp_path / "ran"
+    text = f"a: !!python/object/apply:os.mkdir ['{marker}']"
+    (tmp_path / "config.yml").write_text(text)
+    models.training_record(tmp_path / "m.zip")
+    assert not marker.exists()
+
+
+def test_the_word_scripted_is_the_scripted_driver(env):
+    assert isinstance(models.load_driver("scripted", env), ScriptedDriver)
+
+
+def test_a_folder_stands_for_its_best_model(saved):
+    _, path = saved
+    (path.parent / "TorcsLite-v0").mkdir()
+    assert models.find_model(path.parent) == path
+    (path.parent / "best_model.zip").write_bytes(path.read_bytes())
+    assert models.find_model(path.parent) == path.parent / "best_model.zip"
+    assert models.find_model(path.parent, prefer_last=True) == path
+
+
+def test_the_suffix_may_be_left_out(saved):
+    _, path = saved
+    assert models.find_model(path.with_suffix("")) == path
+
+
+def test_a_missing_model_is_told_the_near_miss(saved):
+    _, path = saved
+    with pytest.raises(InvalidOption, match=r"there is no model .*did you mean 'TorcsLite-v0.zip'"):
+        models.find_model(path.parent / "TorcsLite-v00.zip")
+
+
+def test_an_empty_folder_holds_no_model(tmp_path):
+    with pytest.raises(InvalidOption, match="holds no model"):
+        models.find_model(tmp_path)
+
+
+def test_a_file_that_is_no_model_is_refused(tmp_path, env):
+    (tmp_path / "m.zip").write_text("not a zip")
+    with pytest.raises(ModelMismatch, match="is not a model that Stable-Baselines3 saved"):
+        models.load_driver(tmp_path / "m.zip", env)
+
+
+def test_an_unknown_algorithm_is_told_the_near_miss(saved, env):
+    with pytest.raises(InvalidOption, match=r"no algorithm 'dpg'; did you mean 'ddpg'\?"):
+        models.load_driver(saved[1], env, algo="dpg")
+
+
+class OtherEnv(gym.Env):
+    """65 numbers, and the same three actuators."""
+
+    observation_space = spaces.Box(-1.0, 1.0, (65,), np.float32)
+
+    def __init__(self, env):
+        self.action_space = env.action_space
+
+
+def test_a_model_of_another_observation_layout_is_refused_with_both_named(env, tmp_path):
+    DDPG("MlpPolicy", OtherEnv(env), buffer_size=1, **SMALL).save(tmp_path / "m.zip")
+    with pytest.raises(ModelMismatch) as caught:
+        models.load_driver(tmp_path / "m.zip", env)
+    message = str(caught.value)
+    assert "observations (65,) float32 within [-1, 1], but TorcsLite-v0 has (29,)" in message
+    assert "sb3-torcs train --env TorcsLite-v0" in message
+
+
+def test_the_statistics_beside_a_model_are_applied(saved, env):
+    """A model that learned from normalized numbers would drive blindly without."""
+    model, path = saved
+    zoo_record(path.parent)
+    wrapped = VecNormalize(DummyVecEnv([lambda: gym.make("TorcsLite-v0")]))
+    wrapped.obs_rms.mean = np.full(29, 0.25)
+    wrapped.save(path.parent / "TorcsLite-v0" / "vecnormalize.pkl")
+    driver = models.load_driver(path, env)
+    normalized = wrapped.normalize_obs(observation(env))
+    expected = model.predict(normalized, deterministic=True)[0]
+    np.testing.assert_array_equal(driver.predict(observation(env), deterministic=True)[0], expected)
+    assert not np.array_equal(expected, model.predict(observation(env), deterministic=True)[0])
+    wrapped.close()
+
+
+def test_the_steps_of_a_training_are_read_from_its_model(env, tmp_path):
+    model = DDPG("MlpPolicy", env, buffer_size=8, learning_starts=100, **SMALL)
+    model.learn(7)
+    model.save(tmp_path / "m.zip")
+    assert models.saved_steps(tmp_path / "m.zip") == 7

@@ -1,0 +1,188 @@
+import gymnasium as gym
+import pytest
+import yaml
+
+import sb3_torcs  # noqa: F401  registers the environments
+from sb3_torcs import zoo
+from sb3_torcs.errors import ZooConfigError
+
+SHIPPED = sorted(zoo.shipped_folder().glob("*.yml"))
+ENTRIES = [(path, name) for path in SHIPPED for name in zoo.read_config(path)]
+MODULE = "stable_baselines3.common.callbacks"
+MINIMAL = {"n_timesteps": 100, "policy": "MlpPolicy"}
+
+
+def complaint(tmp_path, entry, algo="ddpg", env_id="TorcsLite-v0"):
+    """What is said about an entry."""
+    place = zoo.Place(tmp_path / "x.yml", "here")
+    with pytest.raises(ZooConfigError) as caught:
+        zoo.check_entry({**MINIMAL, **entry}, algo, env_id, place)
+    assert str(caught.value).startswith(f"{tmp_path}/x.yml, entry 'here': ")
+    return str(caught.value).partition("entry 'here': ")[2]
+
+
+def accepted(entry, algo="ddpg"):
+    zoo.check_entry({**MINIMAL, **entry}, algo, "TorcsLite-v0", zoo.Place(zoo.Path("x"), "here"))
+
+
+def test_a_file_is_shipped_for_ddpg():
+    assert "ddpg" in [path.stem for path in SHIPPED]
+
+
+@pytest.mark.parametrize(("path", "name"), ENTRIES, ids=lambda part: getattr(part, "stem", part))
+def test_everything_in_the_shipped_files_is_read_by_something(path, name):
+    """A key that nothing reads, a class that does not import, an argument that is not there."""
+    env_id = name if name in gym.registry else "TorcsLite-v0"
+    zoo.check_entry(zoo.read_entry(path, name), path.stem, env_id, zoo.Place(path, name))
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+def test_each_shipped_file_has_an_entry_for_both_environments(path):
+    """Other entries are named in words, so that they cannot be taken for an id."""
+    names = set(zoo.read_config(path))
+    assert names >= {"TorcsLite-v0", "Torcs-v0"}
+    assert [name for name in names - {"TorcsLite-v0", "Torcs-v0"} if "-v" in name] == []
+
+
+@pytest.mark.parametrize(("path", "name"), ENTRIES, ids=lambda part: getattr(part, "stem", part))
+def test_the_shipped_files_have_no_code_in_strings(path, name):
+    """The zoo evaluates these as Python if they are strings."""
+    entry = zoo.read_entry(path, name)
+    for key in ("policy_kwargs", "env_kwargs", "monitor_kwargs", "normalize"):
+        assert not isinstance(entry.get(key), str)
+
+
+def test_reading_an_entry_does_not_share_it_with_its_aliases():
+    entry = zoo.read_entry(zoo.config_file("ddpg"), "TorcsLite-v0")
+    entry["env_kwargs"]["track"] = "changed"
+    again = zoo.read_entry(zoo.config_file("ddpg"), "Torcs-v0")
+    assert again["env_kwargs"]["track"] != "changed"
+
+
+def test_a_file_of_ones_own_is_taken_instead_of_the_shipped_one(tmp_path):
+    path = tmp_path / "own.yml"
+    path.write_text(yaml.safe_dump({"TorcsLite-v0": MINIMAL}))
+    assert zoo.config_file("ddpg", path) == path
+    assert zoo.read_entry(path, "TorcsLite-v0") == MINIMAL
+
+
+def test_the_entry_called_default_is_for_every_environment(tmp_path):
+    path = tmp_path / "own.yml"
+    path.write_text(yaml.safe_dump({"default": MINIMAL}))
+    assert zoo.read_entry(path, "TorcsLite-v0") == MINIMAL
+
+
+def test_an_algorithm_without_a_file_is_told_what_to_do():
+    with pytest.raises(ZooConfigError, match=r"'dddpg'; did you mean 'ddpg'\? .*--conf-file"):
+        zoo.config_file("dddpg")
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(ZooConfigError, match=r"no hyperparameter file '.*none\.yml'"):
+        zoo.config_file("ddpg", tmp_path / "none.yml")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a: [1\nb: 2\n", r"x\.yml, line 2: not YAML"),
+        ("- 1\n", r"x\.yml: expected entries"),
+        ("", r"x\.yml: expected entries"),
+        ("a: 1\n", r"x\.yml, entry 'a': expected a mapping, got 1"),
+    ],
+)
+def test_a_broken_file_is_named_with_its_line(tmp_path, text, message):
+    path = tmp_path / "x.yml"
+    path.write_text(text)
+    with pytest.raises(ZooConfigError, match=message):
+        zoo.read_config(path)
+
+
+def test_an_entry_that_is_not_there_is_told_the_near_miss():
+    with pytest.raises(ZooConfigError, match=r"no entry 'TorcsLight-v0'; did you mean 'TorcsLite"):
+        zoo.read_entry(zoo.config_file("ddpg"), "TorcsLight-v0")
+
+
+def test_an_unknown_key_is_told_the_near_miss(tmp_path):
+    said = complaint(tmp_path, {"learning_rat": 0.1})
+    assert said == "unknown key 'learning_rat'; did you mean 'learning_rate'?"
+
+
+def test_a_key_of_another_algorithm_is_unknown(tmp_path):
+    assert complaint(tmp_path, {"clip_range": 0.1}).startswith("unknown key 'clip_range'")
+    accepted({"clip_range": 0.1}, algo="ppo")
+
+
+def test_what_the_zoo_passes_itself_may_not_stand_in_an_entry(tmp_path):
+    assert complaint(tmp_path, {"seed": 1}).startswith("unknown key 'seed'")
+
+
+@pytest.mark.parametrize("key", ["n_timesteps", "policy"])
+def test_a_missing_key_is_named(key):
+    entry = {name: value for name, value in MINIMAL.items() if name != key}
+    with pytest.raises(ZooConfigError, match=f"key '{key}' is missing"):
+        zoo.check_entry(entry, "ddpg", "TorcsLite-v0", zoo.Place(zoo.Path("x"), "here"))
+
+
+def test_an_unknown_algorithm_is_told_the_near_miss():
+    with pytest.raises(ZooConfigError, match=r"no algorithm 'td33'; did you mean 'td3'\?"):
+        accepted({}, algo="td33")
+
+
+def test_an_unknown_policy_is_told_the_near_miss(tmp_path):
+    said = complaint(tmp_path, {"policy": "MlpPolice"})
+    assert said.startswith("unknown policy 'MlpPolice'; did you mean 'MlpPolicy'?")
+
+
+def test_an_argument_of_the_policy_that_it_does_not_have_is_unknown(tmp_path):
+    """Also where the policy hands what it does not know to its base class."""
+    said = complaint(tmp_path, {"policy_kwargs": {"net_arc": [1]}})
+    assert said == "unknown policy_kwargs: argument 'net_arc'; did you mean 'net_arch'?"
+    ours = {"policy": "sb3_torcs.policies.SplitHeadPolicy"}
+    said = complaint(tmp_path, {**ours, "policy_kwargs": {"head_bia": [0.0]}})
+    assert said == "unknown policy_kwargs: argument 'head_bia'; did you mean 'head_bias'?"
+    accepted({**ours, "policy_kwargs": {"head_bias": [0, 0, -1], "net_arch": [3, 6]}})
+
+
+def test_a_callback_that_does_not_import_is_told_why(tmp_path):
+    said = complaint(tmp_path, {"callback": "nowhere.Callback"})
+    assert said == "callback 'nowhere.Callback' does not import: No module named 'nowhere'"
+
+
+def test_a_callback_that_is_not_in_its_module_is_told_the_near_miss(tmp_path):
+    said = complaint(tmp_path, {"callback": [f"{MODULE}.CheckpointCallbak"]})
+    assert said.endswith("has no 'CheckpointCallbak'; did you mean 'CheckpointCallback'?")
+
+
+def test_an_argument_of_a_callback_that_it_does_not_have_is_unknown(tmp_path):
+    path = f"{MODULE}.CheckpointCallback"
+    said = complaint(tmp_path, {"callback": {path: {"save_frequ": 1}}})
+    assert said == f"unknown callback {path}: argument 'save_frequ'; did you mean 'save_freq'?"
+    accepted({"callback": [{path: {"save_freq": 1, "save_path": "x"}}]})
+
+
+def test_a_callback_with_a_slip_of_indentation_is_told_so(tmp_path):
+    said = complaint(tmp_path, {"callback": [{f"{MODULE}.CheckpointCallback": None, "a": 1}]})
+    assert "check the indentation" in said
+
+
+def test_an_argument_of_the_environment_that_it_does_not_have_is_unknown(tmp_path):
+    said = complaint(tmp_path, {"env_kwargs": {"trak": "aalborg"}})
+    assert said == "unknown env_kwargs: argument 'trak'; did you mean 'track'?"
+    accepted({"env_kwargs": {"track": "aalborg"}})
+
+
+def test_monitor_gets_both_of_its_lists_or_none(tmp_path):
+    """Monitor adds the two together, and a tuple is its default: it would fail later."""
+    said = complaint(tmp_path, {"monitor_kwargs": {"info_keywords": ["laps"]}})
+    assert said.endswith("add the other one as []")
+    accepted({"monitor_kwargs": {"info_keywords": ["laps"], "reset_keywords": []}})
+    said = complaint(tmp_path, {"monitor_kwargs": {"info_keyword": []}})
+    assert said == "unknown monitor_kwargs: argument 'info_keyword'; did you mean 'info_keywords'?"
+
+
+def test_an_argument_of_the_normalization_that_it_does_not_have_is_unknown(tmp_path):
+    said = complaint(tmp_path, {"normalize": {"norm_ob": True}})
+    assert said == "unknown normalize: argument 'norm_ob'; did you mean 'norm_obs'?"
+    accepted({"normalize": {"norm_obs": True, "norm_reward": False}})
+    accepted({"normalize": True})
