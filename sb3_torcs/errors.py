@@ -14,6 +14,7 @@ __all__ = [
     "InvalidAction",
     "InvalidOption",
     "ModelMismatch",
+    "NoiseNotBound",
     "OutputNotWritable",
     "Sb3TorcsError",
     "TrackFileError",
@@ -57,6 +58,10 @@ class BackendUnavailable(Sb3TorcsError, RuntimeError):
 
 class ModelMismatch(Sb3TorcsError, ValueError):
     """A saved model does not fit the environment it is asked to drive."""
+
+
+class NoiseNotBound(Sb3TorcsError, RuntimeError):
+    """A noise that depends on the policy's action was not told which policy it perturbs."""
 
 
 class OutputNotWritable(Sb3TorcsError, OSError):

@@ -1,0 +1,136 @@
+"""An opt-in that lets PyTorch use another matrix multiplication on the CPU, guarded by a probe.
+
+PyTorch's oneDNN kernels are much faster than its default ones on some processors. The setting
+that selects them also permits 16-bit products, which some processors really use. So it is kept
+only where a measurement on this machine finds it both accurate and faster.
+"""
+
+from __future__ import annotations
+
+import functools
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+import torch as th
+from torch.nn import functional
+
+__all__ = ["Probe", "disable", "enable", "probe"]
+
+TOLERANCE = 1e-5
+"""[-] Largest error relative to the largest value. Single precision has about 1e-6, 16 bit 1e-3."""
+
+MIN_SPEEDUP = 1.05
+"""[-] Less is within the noise of the measurement, and not worth another rounding."""
+
+REPEATS = 15
+"""Measurements per kernel; the fastest counts."""
+
+
+class Probe(NamedTuple):
+    """What the probe found on this machine."""
+
+    ok: bool  # accurate and faster
+    reason: str  # a sentence for people
+    error: float  # [-] largest error of output and gradients, relative to the largest value
+    speedup: float  # [-] time of the default kernel divided by the time of the other
+
+
+def enable(batch_size: int = 64, units: tuple[int, int] = (300, 600)) -> Probe:
+    """
+    Select the other kernel for this process if it is accurate and faster, else change nothing.
+
+    :param batch_size: rows of the products that matter
+    :param units: their other two sizes
+    :return: what was found; ``ok`` says whether the setting is now on
+    """
+    found = probe(batch_size, units)
+    if found.ok:
+        _matmul().fp32_precision = "bf16"
+    return found
+
+
+def disable() -> None:
+    """Go back to the default kernel."""
+    if _has_setting():
+        _matmul().fp32_precision = "none"
+
+
+@functools.cache
+def probe(batch_size: int = 64, units: tuple[int, int] = (300, 600)) -> Probe:
+    """
+    Compare both kernels with double precision and with each other. The setting is left as it was.
+
+    :param batch_size: rows of the products that matter
+    :param units: their other two sizes
+    :return: what was found; the same again for the same sizes
+    """
+    if not _has_setting():
+        return Probe(False, "this PyTorch has no oneDNN matmul setting", 0.0, 1.0)
+    generator = th.Generator().manual_seed(0)
+    n_in, n_out = units
+    sizes = ((batch_size, n_in), (n_out, n_in), (batch_size, n_out))
+    tensors = [th.randn(size, generator=generator) for size in sizes]
+    with _setting("none"):
+        _linear(*tensors)
+    with _setting("bf16"):
+        error = _relative_error(tensors)
+    speedup = _speedup(tensors)
+    ok = error < TOLERANCE and speedup >= MIN_SPEEDUP
+    if error >= TOLERANCE:
+        reason = f"left off: its error of {error:.1e} is above {TOLERANCE:.0e}"
+    elif not ok:
+        reason = f"left off: {speedup:.2f} times the default speed, below {MIN_SPEEDUP}"
+    else:
+        reason = f"on: {speedup:.2f} times the default speed, error {error:.1e}"
+    return Probe(ok, reason, error, speedup)
+
+
+def _matmul() -> Any:
+    # Older PyTorch has no such module, and the types of the present one do not know it.
+    return getattr(th.backends.mkldnn, "matmul", None)
+
+
+def _has_setting() -> bool:
+    return th.backends.mkldnn.is_available() and hasattr(_matmul(), "fp32_precision")
+
+
+@contextmanager
+def _setting(value: str) -> Iterator[None]:
+    matmul = _matmul()
+    before = matmul.fp32_precision
+    matmul.fp32_precision = value
+    try:
+        yield
+    finally:
+        matmul.fp32_precision = before
+
+
+def _linear(x: th.Tensor, weight: th.Tensor, slope: th.Tensor) -> tuple[th.Tensor, ...]:
+    # Forward and backward of a layer, the three products of training.
+    x, weight = x.detach().requires_grad_(), weight.detach().requires_grad_()
+    y = functional.linear(x, weight)
+    return (y.detach(), *th.autograd.grad(y, (x, weight), slope))
+
+
+def _relative_error(tensors: list[th.Tensor]) -> float:
+    exact = _linear(*(tensor.double() for tensor in tensors))
+    found = _linear(*tensors)
+    return max(
+        float((single - double).abs().max() / double.abs().max())
+        for single, double in zip(found, exact, strict=True)
+    )
+
+
+def _speedup(tensors: list[th.Tensor]) -> float:
+    # Interleaved, so that a change of the processor's clock meets both; the best of each counts.
+    best = {"none": float("inf"), "bf16": float("inf")}
+    for _ in range(REPEATS):
+        for value in best:
+            with _setting(value):
+                begin = time.process_time()
+                for _ in range(4):
+                    _linear(*tensors)
+                best[value] = min(best[value], time.process_time() - begin)
+    return best["none"] / best["bf16"]

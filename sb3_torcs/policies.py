@@ -1,0 +1,268 @@
+"""A policy for the stock DDPG and TD3 with one output function per actuator.
+
+The networks are those of the original post: an actor of 300 and 600 ReLU units whose heads start
+near zero, and a critic that the action joins at the second hidden layer. Importing this module
+makes ``DDPG("SplitHeadPolicy", ...)`` and ``TD3("SplitHeadPolicy", ...)`` work; a hyperparameter
+file can name ``sb3_torcs.policies.SplitHeadPolicy`` without an import.
+"""
+
+from __future__ import annotations
+
+import copy
+import os
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import DDPG, TD3
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
+from stable_baselines3.common.preprocessing import get_action_dim, preprocess_obs
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.td3.policies import Actor, TD3Policy
+from torch import nn
+
+from sb3_torcs import fast_matmul as matmul
+from sb3_torcs.errors import InvalidOption, ModelMismatch, OutputNotWritable
+from sb3_torcs.networks import HEAD_GAINS, LateActionCritic, SplitHeadActor
+from sb3_torcs.optimizers import LeanAdam, with_lr_scale
+
+__all__ = ["SplitHeadPolicy", "export_actor"]
+
+NET_ARCH = (300, 600)
+"""Hidden units of both networks in the original post."""
+
+HEADS = ("tanh", "sigmoid", "sigmoid")
+"""Output functions of steering, throttle and brake."""
+
+OWN_KERNEL = frozenset({"fused", "foreach", "capturable", "differentiable"})
+"""Options of Adam with which somebody chooses its kernel; then it stays as chosen."""
+
+
+class SplitHeadPolicy(TD3Policy):
+    """
+    The networks of the original post for the stock ``DDPG`` and ``TD3``.
+
+    Of the keyword arguments of SB3's ``TD3Policy``, ``net_arch`` is by default ``[300, 600]`` (the
+    critic takes two numbers), and an Adam gets ``fused=True`` unless ``optimizer_kwargs`` choose
+    its kernel themselves, e.g. by ``{"fused": False}``.
+
+    :param observation_space: as in ``TD3Policy``
+    :param action_space: as in ``TD3Policy``
+    :param lr_schedule: as in ``TD3Policy``
+    :param heads: output function of each action, ``"tanh"`` or ``"sigmoid"``
+    :param head_bias: initial value before each output function, by default 0. A sigmoid of 0 is
+        half throttle and half brake; ``(0, 0, -2)`` starts with 12 % brake
+    :param init_std: standard deviation of the heads' initial weights
+    :param layer_norm: normalise the hidden layers of both networks
+    :param critic_lr_scale: learning rate of the critic divided by that of the actor
+    :param fast_matmul: allow another kernel for speed, see :mod:`sb3_torcs.fast_matmul`; what its
+        probe found is in ``policy.fast_matmul_found``
+    :param kwargs: the other arguments of ``TD3Policy``
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        *,
+        heads: Sequence[str] = HEADS,
+        head_bias: Sequence[float] | None = None,
+        init_std: float = 1e-4,
+        layer_norm: bool = False,
+        critic_lr_scale: float = 1.0,
+        fast_matmul: bool = False,
+        **kwargs: Any,
+    ) -> None:
+        net_arch = kwargs.pop("net_arch", None)
+        net_arch = list(NET_ARCH) if net_arch is None else net_arch
+        bias = (0.0,) * len(heads) if head_bias is None else tuple(head_bias)
+        _check_heads(heads, bias, get_action_dim(action_space))
+        _check_net_arch(net_arch)
+        self.own_kwargs: dict[str, Any] = {
+            "heads": tuple(heads),
+            "head_bias": bias,
+            "init_std": _positive("init_std", init_std),
+            "layer_norm": layer_norm,
+            "critic_lr_scale": _positive("critic_lr_scale", critic_lr_scale),
+            "fast_matmul": fast_matmul,
+        }
+        self.fast_matmul_found = matmul.enable() if fast_matmul else None
+        super().__init__(
+            observation_space,
+            action_space,
+            lr_schedule,
+            net_arch=net_arch,
+            **_fast_optimizer(kwargs),
+        )
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        super()._build(lr_schedule)
+        scale = self.own_kwargs["critic_lr_scale"]
+        if scale == 1.0:
+            return
+        self.critic.optimizer = with_lr_scale(self.optimizer_class)(
+            [{"params": list(self.critic.parameters()), "lr_scale": scale}],
+            lr=lr_schedule(1),  # type: ignore[call-arg]
+            **self.optimizer_kwargs,
+        )
+
+    def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
+        """
+        Make an actor. Called by ``TD3Policy`` for the actor and for its target.
+
+        :param features_extractor: the one to share, or ``None`` for one of its own
+        :return: the actor, on the policy's device
+        """
+        kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)
+        own = {
+            key: self.own_kwargs[key] for key in ("heads", "head_bias", "init_std", "layer_norm")
+        }
+        return SplitHeadActor(**own, **kwargs).to(self.device)
+
+    def make_critic(
+        self, features_extractor: BaseFeaturesExtractor | None = None
+    ) -> ContinuousCritic:
+        """
+        Make a critic. Called by ``TD3Policy`` for the critic and for its target.
+
+        :param features_extractor: the one to share, or ``None`` for one of its own
+        :return: the critic, on the policy's device
+        """
+        kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
+        own = {"layer_norm": self.own_kwargs["layer_norm"]}
+        return LateActionCritic(**own, **kwargs).to(self.device)
+
+    def set_training_mode(self, mode: bool) -> None:
+        """
+        Switch between training and prediction, without a walk over the modules if nothing changes.
+
+        :param mode: ``True`` to train
+        """
+        if mode != self.training:
+            super().set_training_mode(mode)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return {**super()._get_constructor_parameters(), **self.own_kwargs}
+
+
+def _check_heads(heads: Sequence[str], bias: Sequence[float], n_actions: int) -> None:
+    allowed = " or ".join(repr(name) for name in HEAD_GAINS)
+    unknown = [head for head in heads if head not in HEAD_GAINS]
+    if isinstance(heads, str) or unknown:
+        raise InvalidOption(
+            f"heads={heads!r}: each head is {allowed}; "
+            f"pass policy_kwargs=dict(heads={HEADS[:n_actions]!r})"
+        )
+    if len(heads) != n_actions:
+        raise InvalidOption(
+            f"heads={tuple(heads)!r} has {len(heads)} entries, but the action space has "
+            f"{n_actions} actions; pass policy_kwargs=dict(heads=...) with {n_actions} "
+            f"entries, each {allowed}"
+        )
+    if len(bias) != n_actions:
+        raise InvalidOption(
+            f"head_bias={tuple(bias)!r} has {len(bias)} entries, but the action space has "
+            f"{n_actions} actions; pass one number per action, e.g. {(0.0,) * n_actions}"
+        )
+
+
+def _check_net_arch(net_arch: Any) -> None:
+    critic = net_arch.get("qf") if isinstance(net_arch, dict) else net_arch
+    actor = net_arch.get("pi") if isinstance(net_arch, dict) else net_arch
+    if not actor or not critic or len(critic) != 2:
+        raise InvalidOption(
+            f"net_arch={net_arch!r}: the critic has two layer sizes (the action joins at the "
+            "second) and the actor at least one; pass net_arch=[300, 600], or "
+            "net_arch=dict(pi=[300, 600], qf=[300, 600])"
+        )
+
+
+def _positive(name: str, value: float) -> float:
+    if not 0.0 < value < float("inf"):
+        raise InvalidOption(f"{name}={value!r}: pass a number above 0, e.g. {name}=1.0")
+    return float(value)
+
+
+def _fast_optimizer(kwargs: dict[str, Any]) -> dict[str, Any]:
+    optimizer_class = kwargs.get("optimizer_class", th.optim.Adam)
+    options = dict(kwargs.get("optimizer_kwargs") or {})
+    if issubclass(optimizer_class, th.optim.Adam) and not OWN_KERNEL & options.keys():
+        options["fused"] = True
+        optimizer_class = LeanAdam if optimizer_class is th.optim.Adam else optimizer_class
+    return {**kwargs, "optimizer_class": optimizer_class, "optimizer_kwargs": options}
+
+
+class _EnvUnitActor(nn.Module):
+    """Raw observations to actions in the environment's own units, for export."""
+
+    low: th.Tensor
+    span: th.Tensor
+
+    def __init__(self, actor: Actor) -> None:
+        super().__init__()
+        assert isinstance(actor.action_space, spaces.Box)
+        self.observation_space = actor.observation_space
+        self.normalize_images = actor.normalize_images
+        # Copies of the parts: the actor itself carries its optimizer and the hooks of a noise.
+        self.features_extractor = copy.deepcopy(actor.features_extractor)
+        self.mu = copy.deepcopy(actor.mu)
+        low = th.as_tensor(actor.action_space.low)
+        self.register_buffer("low", low)
+        self.register_buffer("span", th.as_tensor(actor.action_space.high) - low)
+
+    def forward(self, observation: th.Tensor) -> th.Tensor:
+        prepared = preprocess_obs(observation, self.observation_space, self.normalize_images)
+        # The order of operations is that of BasePolicy.unscale_action: same bits.
+        return self.low + 0.5 * (self.mu(self.features_extractor(prepared)) + 1.0) * self.span
+
+
+def export_actor(
+    model: BaseAlgorithm, path: str | os.PathLike[str] | None = None
+) -> th.jit.ScriptModule:
+    """
+    Export the driver as TorchScript, which runs without SB3 and without this package.
+
+    It equals ``model.predict(observation, deterministic=True)``; a model trained behind
+    ``VecNormalize`` expects normalised observations from both.
+
+    :param model: a trained ``DDPG`` or ``TD3``
+    :param path: file to save it in, if it shall be saved
+    :return: a module from observations (n, 29) float32 to actions (n, 3) in the environment's
+        units: steering in [-1, 1], throttle and brake in [0, 1]
+    """
+    actor = getattr(model.policy, "actor", None)
+    if not isinstance(actor, Actor):
+        raise ModelMismatch(
+            f"{type(model).__name__} with {type(model.policy).__name__} has no deterministic "
+            "actor to export; pass a DDPG or TD3 model"
+        )
+    module = _EnvUnitActor(actor).cpu().eval().requires_grad_(False)
+    example = th.as_tensor(model.observation_space.sample())[None]
+    with th.no_grad(), warnings.catch_warnings():
+        # PyTorch deprecates TorchScript, and has nothing else yet that C++ alone can run.
+        warnings.filterwarnings("ignore", "`torch.jit", FutureWarning)
+        script = th.jit.trace(module, example)
+    if path is not None:
+        try:
+            script.save(os.fspath(path))
+        except RuntimeError as error:
+            raise OutputNotWritable(
+                f"{os.fspath(path)!r} cannot be written; pass a file in an existing folder that "
+                "you may write to"
+            ) from error
+    return script
+
+
+def _register(*algorithms: type[BaseAlgorithm]) -> None:
+    for algorithm in algorithms:
+        # SB3's classes share one dictionary: each gets a copy of its own.
+        aliases: dict[str, type[BasePolicy]] = {**algorithm.policy_aliases}
+        algorithm.policy_aliases = {**aliases, "SplitHeadPolicy": SplitHeadPolicy}
+
+
+_register(DDPG, TD3)

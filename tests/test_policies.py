@@ -1,0 +1,412 @@
+"""The policy: its networks, that its shortcuts change no bit, and that it survives a file."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import DDPG, PPO, TD3
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.vec_env import DummyVecEnv
+from torch import nn
+from toy import ToyRace
+
+from sb3_torcs import fast_matmul
+from sb3_torcs.bench_policy import PlainSplitHeadPolicy, measure, updater
+from sb3_torcs.errors import InvalidOption, ModelMismatch, OutputNotWritable
+from sb3_torcs.optimizers import LeanAdam
+from sb3_torcs.policies import SplitHeadPolicy, export_actor
+
+SMALL = [16, 24]
+OBSERVATIONS = np.random.default_rng(0).uniform(-1, 1, (5, 29)).astype(np.float32)
+
+
+def make_model(algorithm=DDPG, policy="SplitHeadPolicy", **kwargs):
+    policy_kwargs = {"net_arch": SMALL, **kwargs}
+    env = DummyVecEnv([ToyRace])
+    model = algorithm(
+        policy, env, policy_kwargs=policy_kwargs, learning_starts=5, batch_size=8,
+        buffer_size=500, seed=0, device="cpu",
+    )  # fmt: skip
+    model.set_logger(Logger(None, []))
+    return model
+
+
+def trained(policy, updates: int = 10, **policy_kwargs) -> list[th.Tensor]:
+    """Parameters of all four networks after some updates, from the same start and data."""
+    model = updater(policy, 32, **{"net_arch": SMALL, **policy_kwargs})
+    model.train(updates, 32)
+    return [parameter.detach() for parameter in model.policy.parameters()]
+
+
+def assert_same(one: list[th.Tensor], two: list[th.Tensor]) -> None:
+    for a, b in zip(one, two, strict=True):
+        assert th.equal(a, b)
+
+
+# ------------------------------------------------------------------------------- networks
+
+
+def test_the_networks_are_those_of_the_post():
+    """300 and 600 units: 191,403 parameters, and 554,403 less the critic's two extra outputs."""
+    policy = make_model(net_arch=None).policy
+    assert sum(p.numel() for p in policy.actor.parameters()) == 191_403
+    assert sum(p.numel() for p in policy.critic.parameters()) == 554_403 - 2 * 601
+
+
+def test_an_untrained_driver_holds_the_wheel_straight_with_half_of_both_pedals():
+    """Heads of N(0, 1e-4) and no bias: tanh(0) and sigmoid(0)."""
+    actions, _ = make_model().predict(OBSERVATIONS)
+    np.testing.assert_allclose(actions, [[0.0, 0.5, 0.5]] * 5, atol=1e-3)
+
+
+def test_a_head_bias_starts_without_half_brake():
+    """sigmoid(-2) = 0.1192."""
+    actions, _ = make_model(head_bias=(0, 0, -2)).predict(OBSERVATIONS)
+    np.testing.assert_allclose(actions, [[0.0, 0.5, 1 / (1 + np.exp(2))]] * 5, atol=1e-3)
+
+
+@pytest.mark.parametrize("heads", [("tanh", "sigmoid", "sigmoid"), ("sigmoid", "tanh", "tanh")])
+def test_the_heads_are_tanh_and_sigmoid_in_environment_units(heads):
+    """tanh(z) or 2 sigmoid(z) - 1, then scaled by SB3; within float32."""
+    model = make_model(heads=heads, init_std=1.0)
+    mu = model.actor.mu
+    with th.no_grad():
+        z = th.as_tensor(OBSERVATIONS)
+        for layer in mu.hidden:
+            z = th.relu(nn.functional.linear(z, layer.weight, layer.bias))
+        z = nn.functional.linear(z, mu.heads.weight, mu.heads.bias).double()
+    function = {"tanh": th.tanh, "sigmoid": lambda x: 2 * th.sigmoid(x) - 1}
+    scaled = th.stack([function[head](z[:, i]) for i, head in enumerate(heads)], dim=1)
+    expected = model.policy.unscale_action(scaled.numpy())
+    np.testing.assert_allclose(model.predict(OBSERVATIONS)[0], expected, atol=1e-6)
+
+
+def test_the_heads_start_from_the_given_deviation():
+    """N(0, init_std); four standard errors of 1800 weights."""
+    weights = make_model(net_arch=None, init_std=0.5).actor.mu.heads.weight
+    assert weights.std().item() == pytest.approx(0.5, rel=4 / np.sqrt(2 * 1800))
+    assert not make_model().actor.mu.heads.bias.any()
+
+
+def test_the_action_joins_the_critic_at_the_second_layer():
+    """relu(W3 (W2 relu(W1 s) + Wa a)), written out."""
+    network = make_model().critic.q_networks[0]
+    state, action = th.rand(7, 29), th.rand(7, 3)
+
+    def lin(layer, x):
+        return x @ layer.weight.t() + layer.bias
+
+    joint = lin(network.state2, th.relu(lin(network.state1, state))) + lin(network.action2, action)
+    expected = lin(network.value, th.relu(lin(network.joint3, joint)))
+    th.testing.assert_close(network(state, action), expected)
+    assert expected.shape == (7, 1)
+
+
+@pytest.mark.parametrize(("algorithm", "kwargs", "n_critics"), [
+    (DDPG, {}, 1), (DDPG, {"n_critics": 2}, 2), (TD3, {}, 2),
+])  # fmt: skip
+def test_the_number_of_critics_is_respected(algorithm, kwargs, n_critics):
+    """DDPG has one, TD3 two, and two on request."""
+    model = make_model(algorithm, **kwargs)
+    assert len(model.critic(th.rand(4, 29), th.rand(4, 3))) == n_critics
+    model.learn(20)
+    assert model._n_updates > 0
+
+
+@pytest.mark.parametrize("kwargs", [
+    {"layer_norm": True}, {"net_arch": {"pi": [8, 8, 8], "qf": [8, 4]}},
+    {"activation_fn": nn.ELU}, {"share_features_extractor": True},
+    {"optimizer_class": th.optim.SGD}, {"optimizer_class": th.optim.AdamW},
+    {"optimizer_kwargs": {"weight_decay": 1e-4}},
+])  # fmt: skip
+def test_the_policy_trains_with_other_parts(kwargs):
+    """Each changes the parameters and keeps them finite."""
+    model = make_model(**kwargs)
+    before = [parameter.clone() for parameter in model.actor.parameters()]
+    model.learn(20)
+    after = list(model.actor.parameters())
+    assert all(parameter.isfinite().all() for parameter in after)
+    assert any(not th.equal(a, b) for a, b in zip(before, after, strict=True))
+
+
+def test_layer_norm_is_in_the_hidden_layers_of_both_networks():
+    """Two in the actor, and in the critic the first and the third layer."""
+    policy = make_model(layer_norm=True).policy
+    for network in (policy.actor, policy.critic):
+        assert sum(isinstance(module, nn.LayerNorm) for module in network.modules()) == 2
+
+
+def test_other_numbers_of_actions_take_other_heads():
+    """Heads are configurable per action dimension."""
+    env = DummyVecEnv([ToyRace])
+    env.action_space = spaces.Box(-1, 1, (2,))
+    model = DDPG("SplitHeadPolicy", env, policy_kwargs={"heads": ("tanh",) * 2}, buffer_size=10)
+    assert model.predict(OBSERVATIONS)[0].shape == (5, 2)
+
+
+@pytest.mark.parametrize(("kwargs", "message"), [
+    ({"heads": ("tanh", "relu", "sigmoid")}, "each head is 'tanh' or 'sigmoid'"),
+    ({"heads": "tanh"}, "each head is 'tanh' or 'sigmoid'"),
+    ({"heads": ("tanh",)}, "has 1 entries, but the action space has 3 actions"),
+    ({"head_bias": (0, 1)}, "has 2 entries, but the action space has 3 actions"),
+    ({"net_arch": [300]}, "the critic has two layer sizes"),
+    ({"net_arch": {"pi": [8]}}, "the critic has two layer sizes"),
+    ({"critic_lr_scale": 0.0}, "pass a number above 0"),
+    ({"init_std": -1.0}, "pass a number above 0"),
+])  # fmt: skip
+def test_a_wrong_option_is_named_with_what_is_allowed(kwargs, message):
+    """Before any network is built."""
+    with pytest.raises(InvalidOption, match=message):
+        make_model(**kwargs)
+
+
+# ------------------------------------------------------------------------------ shortcuts
+
+
+@pytest.mark.parametrize("kwargs", [{}, {"n_critics": 2}, {"critic_lr_scale": 10.0}])
+def test_the_shortcuts_change_no_bit_with_the_same_kernel_of_adam(kwargs):
+    """Against the plain networks: stock gradients, and each kernel of Adam against itself."""
+    for fused in (False, True):
+        plain = trained(PlainSplitHeadPolicy, optimizer_kwargs={"fused": fused}, **kwargs)
+        options = {} if fused else {"optimizer_kwargs": {"fused": False}}
+        assert_same(plain, trained(SplitHeadPolicy, **options, **kwargs))
+
+
+def test_the_fused_kernel_differs_by_rounding_only():
+    """One Adam step moves a weight by about 1e-3; ten steps of other rounding by far less."""
+    for one, two in zip(trained(PlainSplitHeadPolicy), trained(SplitHeadPolicy), strict=True):
+        th.testing.assert_close(one, two, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("layer_norm", [False, True])
+def test_the_actors_loss_gives_the_critic_no_gradient_and_the_action_the_same(layer_norm):
+    """What stock DDPG computes and then throws away."""
+    critic = make_model(layer_norm=layer_norm).critic
+    state = th.rand(7, 29)
+    actions = th.rand(7, 3)
+    one, two = actions.clone().requires_grad_(), actions.clone().requires_grad_()
+    value, expected = critic.q1_forward(state, one), critic(state, two)[0]
+    assert th.equal(value, expected)
+    (gradient,) = th.autograd.grad(value.sum(), one)
+    assert th.equal(gradient, th.autograd.grad(expected.sum(), two)[0])
+    parameters = list(critic.parameters())
+    again = critic.q1_forward(state, th.rand(7, 3).requires_grad_()).sum()
+    assert th.autograd.grad(again, parameters, allow_unused=True) == (None,) * len(parameters)
+
+
+def test_adam_is_fused_unless_somebody_chose_its_kernel():
+    """The default can be overridden, and other optimizers stay what they are."""
+    assert make_model().actor.optimizer.defaults["fused"] is True
+    assert not make_model(optimizer_kwargs={"fused": False}).actor.optimizer.defaults["fused"]
+    assert not make_model(optimizer_kwargs={"foreach": True}).actor.optimizer.defaults["fused"]
+    assert type(make_model(optimizer_class=th.optim.SGD).actor.optimizer) is th.optim.SGD
+    weight_decay = {"weight_decay": 0.1}
+    assert make_model(optimizer_kwargs=weight_decay).actor.optimizer.defaults["weight_decay"] == 0.1
+    assert weight_decay == {"weight_decay": 0.1}
+
+
+@pytest.mark.parametrize("options", [{}, {"amsgrad": True}, {"weight_decay": 0.1, "lr": 0.1}])
+def test_lean_adam_is_the_fused_adam_bit_for_bit(options):
+    """Also over its own saved state, and for parameters without a gradient."""
+
+    def run(optimizer_class, **more):
+        used, unused = th.linspace(-1, 1, 50).requires_grad_(), th.ones(3).requires_grad_()
+        optimizer = optimizer_class([used, unused], **options, **more)
+        for step in range(6):
+            optimizer.zero_grad(set_to_none=step != 3)
+            ((used - 2) ** 4).sum().backward()
+            optimizer.step()
+            optimizer.load_state_dict(optimizer.state_dict())
+        return used.detach()
+
+    assert th.equal(run(LeanAdam), run(th.optim.Adam, fused=True))
+
+
+def test_lean_adam_obeys_a_closure():
+    """The interface of every optimizer."""
+    weight = th.ones(1, requires_grad=True)
+    assert LeanAdam([weight]).step(lambda: 7.0) == 7.0
+
+
+def test_the_critic_learns_at_its_own_rate():
+    """Adam's first step is the learning rate: ten times the actor's, whatever the schedule."""
+    model = make_model(critic_lr_scale=10.0)
+    nets = model.actor, model.critic
+    before = [[p.detach().clone() for p in net.parameters()] for net in nets]
+    model.learn(6)
+    assert model._n_updates == 1
+    steps = [
+        max((p - q).abs().max().item() for p, q in zip(old, net.parameters(), strict=True))
+        for old, net in zip(before, nets, strict=True)
+    ]
+    assert steps == pytest.approx([1e-3, 1e-2], rel=1e-3)
+    assert model.critic.optimizer.param_groups[0]["lr"] == 1e-3
+
+
+def test_switching_the_mode_reaches_every_module():
+    """The short cut must not leave a module behind."""
+    policy = make_model().policy
+    for mode in (True, True, False, False, True):
+        policy.set_training_mode(mode)
+        assert {module.training for module in policy.actor.modules()} == {mode}
+        assert {module.training for module in policy.critic.modules()} == {mode}
+    assert {module.training for module in policy.actor_target.modules()} == {False}
+
+
+# ------------------------------------------------------------------------------ files
+
+
+@pytest.mark.parametrize("algorithm", [DDPG, TD3])
+def test_a_loaded_model_goes_on_like_the_saved_one(tmp_path, algorithm):
+    """Parameters, optimizer and its two rates: ten more updates end in the same bits."""
+    kwargs = {"critic_lr_scale": 5.0, "layer_norm": True, "head_bias": (0, 0, -2)}
+    model = make_model(algorithm, **kwargs)
+    model.learn(20)
+    model.save(tmp_path / "model")
+    loaded = algorithm.load(tmp_path / "model", device="cpu")
+    loaded.set_logger(Logger(None, []))
+    loaded.replay_buffer = model.replay_buffer
+    for one in (model, loaded):
+        one.set_random_seed(3)
+        one.train(10, 8)
+    assert_same(list(model.policy.parameters()), list(loaded.policy.parameters()))
+
+
+def test_a_fresh_process_loads_it_without_importing_the_plugin(tmp_path):
+    """The file names the class; nobody has to know the alias."""
+    model = make_model()
+    model.save(tmp_path / "model")
+    np.save(tmp_path / "observations.npy", OBSERVATIONS)
+    code = (
+        "import sys, numpy as np; from stable_baselines3 import DDPG;"
+        "model = DDPG.load(sys.argv[1] + '/model', device='cpu');"
+        "np.save(sys.argv[1] + '/actions.npy', "
+        "model.predict(np.load(sys.argv[1] + '/observations.npy'))[0])"
+    )
+    subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=True)
+    expected = model.predict(OBSERVATIONS)[0]
+    np.testing.assert_array_equal(np.load(tmp_path / "actions.npy"), expected)
+
+
+def test_the_policy_alone_can_be_saved_and_loaded(tmp_path):
+    """``policy.save`` and ``actor.save``, as for SB3's own."""
+    policy = make_model(critic_lr_scale=2.0, head_bias=(0, 0, -1)).policy
+    for part in (policy, policy.actor):
+        part.save(str(tmp_path / "part"))
+        loaded = type(part).load(str(tmp_path / "part"), device="cpu")
+        expected = policy.predict(OBSERVATIONS)[0]
+        np.testing.assert_array_equal(loaded.predict(OBSERVATIONS)[0], expected)
+
+
+def test_the_alias_belongs_to_ddpg_and_td3_only():
+    """SB3's classes share a dictionary; ours must not leak into the others."""
+    assert DDPG.policy_aliases["SplitHeadPolicy"] is SplitHeadPolicy
+    assert TD3.policy_aliases["SplitHeadPolicy"] is SplitHeadPolicy
+    assert "SplitHeadPolicy" not in PPO.policy_aliases
+
+
+@pytest.mark.parametrize("algorithm", [DDPG, TD3])
+def test_the_export_is_the_driver(tmp_path, algorithm):
+    """From raw observations to environment units, equal to predict; any number of rows."""
+    model = make_model(algorithm, init_std=0.5, layer_norm=True)
+    model.learn(20)
+    script = export_actor(model, tmp_path / "driver.pt")
+    code = "import sys, torch; print(torch.jit.load(sys.argv[1])(torch.zeros(2, 29)).tolist())"
+    output = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", code, str(tmp_path / "driver.pt")],
+        check=True, capture_output=True, text=True,
+    )  # fmt: skip
+    zeros = np.zeros((2, 29), np.float32)
+    for observations in (OBSERVATIONS, OBSERVATIONS[:1], zeros):
+        expected, _ = model.predict(observations, deterministic=True)
+        np.testing.assert_array_equal(script(th.as_tensor(observations)).numpy(), expected)
+    assert output.stdout.strip() == str(expected.tolist())
+
+
+def test_the_export_is_a_copy():
+    """Further training must not change a driver that was handed out."""
+    model = make_model()
+    script = export_actor(model)
+    before = script(th.as_tensor(OBSERVATIONS))
+    model.learn(30)
+    assert th.equal(script(th.as_tensor(OBSERVATIONS)), before)
+
+
+def test_an_export_that_cannot_be_is_an_error(tmp_path):
+    """A folder that is not there, and a model without a deterministic actor."""
+    with pytest.raises(OutputNotWritable, match="existing folder"):
+        export_actor(make_model(), tmp_path / "nowhere" / "driver.pt")
+    with pytest.raises(ModelMismatch, match="pass a DDPG or TD3 model"):
+        export_actor(PPO("MlpPolicy", DummyVecEnv([ToyRace]), device="cpu"))
+
+
+# ------------------------------------------------------------------------- other kernels
+
+
+@pytest.fixture
+def kernel(monkeypatch):
+    """Give back the process's setting and forget what the probe has found."""
+    fast_matmul.probe.cache_clear()
+    yield monkeypatch
+    fast_matmul.probe.cache_clear()
+    fast_matmul.disable()
+
+
+def setting() -> str:
+    return th.backends.mkldnn.matmul.fp32_precision
+
+
+def test_the_probe_leaves_the_setting_as_it_was(kernel):
+    """Measuring is not choosing."""
+    before = setting()
+    found = fast_matmul.probe(8, (16, 16))
+    assert setting() == before
+    assert found.reason
+
+
+@pytest.mark.parametrize(("error", "speedup", "on"), [
+    (1e-7, 1.8, True), (1e-3, 1.8, False), (1e-7, 1.0, False),
+])  # fmt: skip
+def test_the_kernel_is_taken_only_if_accurate_and_faster(kernel, error, speedup, on):
+    """The reason says which of the two it was."""
+    kernel.setattr(fast_matmul, "_relative_error", lambda tensors: error)
+    kernel.setattr(fast_matmul, "_speedup", lambda tensors: speedup)
+    found = make_model(fast_matmul=True).policy.fast_matmul_found
+    assert found.ok is on
+    assert setting() == ("bf16" if on else "none")
+    assert found.reason.startswith("on" if on else "left off")
+
+
+def test_the_error_of_the_default_kernel_is_that_of_single_precision(kernel):
+    """The probe's own yardstick: about 1e-6 here, about 1e-3 for 16 bit."""
+    tensors = [th.rand(8, 16), th.rand(24, 16), th.rand(8, 24)]
+    assert 0 < fast_matmul._relative_error(tensors) < fast_matmul.TOLERANCE
+
+
+def test_a_policy_does_not_touch_the_kernel_unasked(kernel):
+    """The setting belongs to the whole process."""
+    kernel.setattr(fast_matmul, "enable", lambda: pytest.fail("not asked for"))
+    assert make_model().policy.fast_matmul_found is None
+
+
+def test_the_measurement_gives_three_rates(kernel):
+    """The fast one is None where the probe says no; threads and setting are given back."""
+    kernel.setattr(fast_matmul, "_speedup", lambda tensors: 1.0)
+    threads = th.get_num_threads()
+    rates = measure(batch_size=8, seconds=0.2)
+    assert rates["policy_fast_updates_per_s"] is None
+    assert rates["policy_updates_per_s"] > 0
+    assert rates["policy_plain_updates_per_s"] > 0
+    assert (th.get_num_threads(), setting()) == (threads, "none")
+
+
+@pytest.mark.slow
+def test_the_policy_is_faster_than_the_plain_one():
+    """1.4 times is the aim on an idle machine; the test allows for a busy one."""
+    rates = measure(batch_size=64, seconds=6.0)
+    assert rates["policy_updates_per_s"] > 1.2 * rates["policy_plain_updates_per_s"]
