@@ -75,9 +75,7 @@ class NoiseCallback(BaseCallback):
     ) -> None:
         super().__init__(verbose)
         if kind not in KINDS:
-            raise InvalidOption(
-                f"kind={kind!r}: pass 'set_point' or 'ou'{near_miss(kind, KINDS)}"
-            )
+            raise InvalidOption(f"kind={kind!r}: pass 'set_point' or 'ou'{near_miss(kind, KINDS)}")
         self.kind = kind
         self.parameters = tuple(OUParameters.of(value) for value in (steering, throttle, brake))
         self.dt = checked_dt(dt)
@@ -93,9 +91,7 @@ class NoiseCallback(BaseCallback):
         if len(saved) != self.model.n_envs or type(saved[0]) is not KINDS[self.kind]:
             noise = self._continued(saved[0]) if saved else self._new()
             n_envs = self.model.n_envs
-            self.model.action_noise = (
-                noise if n_envs == 1 else VectorizedActionNoise(noise, n_envs)
-            )
+            self.model.action_noise = noise if n_envs == 1 else VectorizedActionNoise(noise, n_envs)
         for noise in bind(self.model):
             noise.parameters = self.parameters
             if isinstance(noise, OUNoise):
@@ -201,9 +197,7 @@ class StochasticBrakeCallback(_NoiseUser):
     ) -> None:
         super().__init__(verbose)
         if not 0.0 <= probability <= 1.0:
-            raise InvalidOption(
-                f"probability={probability!r}: pass a share of the steps in [0, 1]"
-            )
+            raise InvalidOption(f"probability={probability!r}: pass a share of the steps in [0, 1]")
         self.brake = StochasticBrake(probability, OUParameters.of((mu, theta, sigma)))
 
     def _apply(self) -> None:

@@ -1,0 +1,335 @@
+"""The callbacks on a toy race: installed noise, its decay and brake, reward and start."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from stable_baselines3 import DDPG, PPO, SAC
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNoise
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+from toy import ToyRace
+
+from sb3_torcs.callbacks import (
+    NoiseCallback,
+    NoiseDecayCallback,
+    RandomStartCallback,
+    RewardCallback,
+    StochasticBrakeCallback,
+)
+from sb3_torcs.errors import InvalidOption, NoiseNotBound
+from sb3_torcs.noise import ActuatorNoise, OUNoise, SetPointNoise, noises_of
+
+SET_POINT = {"steering": [0, 1, 0], "throttle": [0.5, 1, 0], "brake": [-0.1, 1, 0]}
+
+
+class Spy(BaseCallback):
+    """Notes the noise's scale, the actions, the infos and the logged values of every step."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.scales: list[float] = []
+        self.actions: list[np.ndarray] = []
+        self.rewards: list[float] = []
+        self.starts: list[str] = []
+        self.logged: dict[str, float] = {}
+        self.settings: list[tuple[str, str]] = []
+
+    def _on_step(self) -> bool:
+        self.scales += [noise.scale for noise in noises_of(self.model)[:1]]
+        self.actions += [*self.locals["actions"]]
+        self.rewards += [*self.locals["rewards"]]
+        self.starts += [info["start"] for info in self.locals["infos"]]
+        self.logged = dict(self.logger.name_to_value)
+        self.settings = self.training_env.env_method("settings")
+        return True
+
+
+def make_model(n_envs: int = 1, vec_env_cls=DummyVecEnv, algorithm=DDPG, **kwargs):
+    env = make_vec_env(ToyRace, n_envs=n_envs, vec_env_cls=vec_env_cls, seed=0)
+    options = {"learning_starts": 0, "gradient_steps": 0, "buffer_size": 1000, "seed": 0}
+    model = algorithm(
+        "MlpPolicy", env, policy_kwargs={"net_arch": [8]}, device="cpu", **{**options, **kwargs}
+    )
+    model.set_logger(Logger(None, []))
+    return model
+
+
+def learn(model, steps: int, *callbacks: BaseCallback) -> Spy:
+    spy = Spy()
+    model.learn(steps, callback=[*callbacks, spy], log_interval=10_000)
+    return spy
+
+
+# ---------------------------------------------------------------------------------- noise
+
+
+@pytest.mark.parametrize("n_envs", [1, 3])
+@pytest.mark.parametrize(("kind", "cls"), [("set_point", SetPointNoise), ("ou", OUNoise)])
+def test_noise_callback_installs_one_noise_per_environment(kind, cls, n_envs):
+    """YAML of stock rl_zoo3 cannot name a noise; the callback brings it."""
+    model = make_model(n_envs)
+    learn(model, 12, NoiseCallback(kind=kind))
+    assert [type(noise) for noise in noises_of(model)] == [cls] * n_envs
+    assert isinstance(model.action_noise, VectorizedActionNoise) is (n_envs > 1)
+    assert [noise.frames for noise in noises_of(model)] == [12] * n_envs
+
+
+@pytest.mark.parametrize("n_envs", [1, 3])
+def test_full_set_point_noise_drives_the_car_by_the_table(n_envs):
+    """At scale 1, theta 1 and no chance the executed action is mu, clipped, in every world."""
+    spy = learn(make_model(n_envs), 30, NoiseCallback(**SET_POINT))
+    np.testing.assert_allclose(spy.actions, [[0.0, 0.5, 0.0]] * len(spy.actions), atol=1e-6)
+
+
+def test_the_buffer_holds_the_action_that_was_executed():
+    """SB3's scaled action: 0.5 on the throttle is 0 there, no brake is -1."""
+    model = make_model()
+    learn(model, 10, NoiseCallback(**SET_POINT))
+    np.testing.assert_allclose(model.replay_buffer.actions[:10, 0], [[0, 0, -1]] * 10, atol=1e-6)
+
+
+def test_evaluation_in_between_does_not_disturb_the_set_point():
+    """EvalCallback uses the same actor, on other observations."""
+    model = make_model(train_freq=1, gradient_steps=1, batch_size=4)
+    env = DummyVecEnv([ToyRace])
+    evaluation = EvalCallback(env, eval_freq=3, n_eval_episodes=1, verbose=0, warn=False)
+    spy = learn(model, 20, NoiseCallback(**SET_POINT), evaluation)
+    np.testing.assert_allclose(spy.actions, [[0.0, 0.5, 0.0]] * 20, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["set_point", "ou"])
+def test_same_seed_same_training(kind):
+    """The noise's seed is the model's if none is given."""
+    one, two = (learn(make_model(2), 20, NoiseCallback(kind=kind)) for _ in range(2))
+    np.testing.assert_array_equal(one.actions, two.actions)
+
+
+def test_the_seed_of_the_callback_comes_first():
+    """Another seed, another noise."""
+    one = learn(make_model(), 5, NoiseCallback(kind="ou", seed=1))
+    two = learn(make_model(), 5, NoiseCallback(kind="ou", seed=2))
+    assert not np.array_equal(one.actions, two.actions)
+
+
+def test_nothing_is_added_during_the_warm_up():
+    """Before learning_starts SB3 samples; the set point must not pull those actions."""
+    model = make_model(learning_starts=8)
+    spy = learn(model, 10, NoiseCallback(**SET_POINT))
+    assert np.ptp(np.array(spy.actions)[:8], axis=0).min() > 0.3
+    np.testing.assert_allclose(spy.actions[8:], [[0.0, 0.5, 0.0]] * 2, atol=1e-6)
+
+
+@pytest.mark.parametrize(("before", "after"), [(1, 1), (4, 4), (1, 4), (4, 1), (4, 2)])
+@pytest.mark.parametrize("kind", ["set_point", "ou"])
+def test_a_resumed_model_goes_on_with_its_noise(tmp_path, kind, before, after):
+    """Frames and scale survive save and load, also with another number of environments."""
+    callbacks = [NoiseCallback(kind=kind), NoiseDecayCallback(frames=100)]
+    model = make_model(before)
+    learn(model, 40, *callbacks)
+    model.save(tmp_path / "model")
+    env = make_vec_env(ToyRace, n_envs=after, seed=0)
+    resumed = DDPG.load(tmp_path / "model", env=env, device="cpu")
+    resumed.set_logger(Logger(None, []))
+    spy = learn(resumed, 20, *callbacks)
+    assert [noise.frames for noise in noises_of(resumed)] == [60] * after
+    assert spy.scales[0] == 1.0 - (40 + after) / 100
+    streams = {noise._rng.random() for noise in noises_of(resumed)}
+    assert len(streams) == after
+
+
+def test_a_resumed_noise_takes_the_new_parameters():
+    """The hyperparameter file of the second run is what counts."""
+    model = make_model()
+    learn(model, 5, NoiseCallback(kind="ou", steering=[0, 1, 0.1], dt=0.5))
+    noise = model.action_noise
+    learn(model, 5, NoiseCallback(kind="ou", steering=[0, 1, 0.9], dt=0.2))
+    assert model.action_noise is noise
+    assert (noise.parameters[0].sigma, noise.dt, noise.frames) == (0.9, 0.2, 10)
+
+
+def test_another_kind_continues_the_count_of_frames():
+    """The decay goes on; no hook of the old noise stays on the actor."""
+    model = make_model()
+    learn(model, 5, NoiseCallback(kind="set_point"))
+    learn(model, 5, NoiseCallback(kind="ou"))
+    assert type(model.action_noise) is OUNoise
+    assert model.action_noise.frames == 10
+    assert len(model.actor._forward_hooks) == 1
+
+
+def test_a_foreign_noise_is_replaced():
+    """Whoever lists the callback wants its noise."""
+    model = make_model(action_noise=NormalActionNoise(np.zeros(3), np.ones(3)))
+    learn(model, 3, NoiseCallback(kind="ou"))
+    assert isinstance(model.action_noise, OUNoise)
+
+
+def test_noise_works_with_sac_too():
+    """Its actor is stochastic; the set point takes what it has drawn."""
+    spy = learn(make_model(algorithm=SAC), 10, NoiseCallback(**SET_POINT))
+    np.testing.assert_allclose(spy.actions, [[0.0, 0.5, 0.0]] * 10, atol=1e-6)
+
+
+def test_an_algorithm_without_action_noise_is_refused():
+    """PPO explores by its own distribution."""
+    model = PPO("MlpPolicy", DummyVecEnv([ToyRace]), n_steps=8, batch_size=8, device="cpu")
+    with pytest.raises(InvalidOption, match="PPO takes no action noise"):
+        model.learn(8, callback=NoiseCallback())
+
+
+def test_an_unknown_kind_shows_the_near_one():
+    """With what is allowed."""
+    with pytest.raises(InvalidOption, match="did you mean 'set_point'"):
+        NoiseCallback(kind="setpoint")
+
+
+def test_set_point_noise_without_the_callback_says_so():
+    """Stock DDPG knows nothing of bindings."""
+    with pytest.raises(NoiseNotBound, match="NoiseCallback"):
+        learn(make_model(action_noise=SetPointNoise()), 2)
+
+
+# ----------------------------------------------------------------------- decay and brake
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_decay_is_linear_down_to_the_floor(n_envs):
+    """1 - 0.8 k/20 after k frames, then 0.2 for ever; every environment counts."""
+    decay = NoiseDecayCallback(frames=20, floor=0.2)
+    spy = learn(make_model(n_envs), 30, decay, NoiseCallback(kind="ou"))
+    frames = np.arange(n_envs, 31, n_envs)
+    expected = [1.0 - (1.0 - 0.2) * min(k / 20, 1.0) for k in frames]
+    np.testing.assert_array_equal(spy.scales, expected)
+    assert spy.logged["noise/scale"] == pytest.approx(0.2)
+    assert spy.logged["noise/frames"] == 30
+
+
+def test_decay_counts_for_a_noise_that_came_with_the_model():
+    """Without NoiseCallback: SB3 copies the noise for two environments, frames count double."""
+    model = make_model(2, action_noise=OUNoise(seed=0))
+    learn(model, 20, NoiseDecayCallback(frames=40))
+    assert [noise.frames for noise in noises_of(model)] == [20, 20]
+    assert [noise.scale for noise in noises_of(model)] == [0.5, 0.5]
+
+
+@pytest.mark.parametrize("callback", [NoiseDecayCallback, StochasticBrakeCallback])
+def test_steering_a_noise_that_is_not_there_is_an_error(callback):
+    """It names the callback that is missing."""
+    with pytest.raises(InvalidOption, match="add NoiseCallback"):
+        learn(make_model(), 2, callback())
+
+
+@pytest.mark.parametrize("bad", [{"frames": 0}, {"floor": -0.1}, {"floor": 1.1}])
+def test_a_decay_that_is_none_is_refused(bad):
+    """Values that would divide by zero or grow."""
+    with pytest.raises(InvalidOption, match="floor"):
+        NoiseDecayCallback(**bad)
+
+
+@pytest.mark.parametrize("kind", ["set_point", "ou"])
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_stochastic_brake_overrides_its_share_of_the_steps(kind, n_envs):
+    """With probability 1 each step pulls to its mu; afterwards the noise is as before."""
+    brake = [0, 1, 0]
+    noise = NoiseCallback(kind=kind, brake=brake)
+    always = StochasticBrakeCallback(probability=1.0, mu=0.9, theta=1.0, sigma=0.0)
+    model = make_model(n_envs)
+    spy = learn(model, 10, always, noise)
+    assert np.array(spy.actions)[:, 2].min() > 0.8
+    assert all(noise.stochastic_brake is None for noise in noises_of(model))
+
+
+def test_the_brake_of_the_post_brakes_in_every_tenth_step():
+    """mu 0.2 +- 0.1 in 10 % of the steps: above 5 % brake in 9.3 %, else in hardly any."""
+    model = make_model()
+    spy = learn(model, 1500, NoiseCallback(seed=3), StochasticBrakeCallback())
+    brake = np.array(spy.actions)[:, 2]
+    share = (brake > 0.05).mean()
+    # 10 % times P(N > -1.5) = 93 %, and 0.13 % of the other steps; four standard errors.
+    assert share == pytest.approx(0.0945, abs=4 * np.sqrt(0.0945 * 0.9055 / 1500))
+
+
+def test_a_share_that_is_none_is_refused():
+    """Ten per cent is 0.1, not 10."""
+    with pytest.raises(InvalidOption, match=r"share of the steps in \[0, 1\]"):
+        StochasticBrakeCallback(probability=10)
+
+
+# ----------------------------------------------------------------------- reward and start
+
+
+@pytest.mark.parametrize(
+    ("n_envs", "vec_env_cls"), [(1, DummyVecEnv), (2, DummyVecEnv), (2, SubprocVecEnv)]
+)
+def test_reward_and_start_are_switched_and_given_back(n_envs, vec_env_cls):
+    """Through Monitor, in one process and in several; each environment gets back its own."""
+    model = make_model(n_envs, vec_env_cls)
+    env = model.get_env()
+    env.env_method("set_reward", "ab", indices=[0])
+    before = env.env_method("settings")
+    spy = learn(model, 40, RewardCallback(reward="blog"), RandomStartCallback())
+    assert spy.settings == [("blog", "random")] * n_envs
+    assert spy.rewards == [4.0] * 40
+    assert set(spy.starts) == {"random"}
+    assert model.replay_buffer.rewards[: 40 // n_envs].tolist() == [[4.0] * n_envs] * (40 // n_envs)
+    assert model.ep_info_buffer[-1]["r"] == 40.0
+    assert env.env_method("settings") == before
+    env.close()
+
+
+def test_the_mean_of_each_reward_term_is_logged():
+    """Under reward/, for TensorBoard."""
+    spy = learn(make_model(), 10, RewardCallback(reward="abcde"))
+    assert spy.logged["reward/speed"] == 4.0
+    assert spy.logged["reward/crash"] == 1.0
+
+
+@pytest.mark.parametrize(("also_eval", "expected"), [(False, "progress"), (True, "blog")])
+def test_evaluation_keeps_its_reward_unless_asked(also_eval, expected):
+    """Also when the EvalCallback sits deep in a list; afterwards all is as before."""
+    seen = []
+
+    class Look(BaseCallback):
+        def _on_step(self) -> bool:
+            seen.extend(evaluation.eval_env.env_method("settings"))
+            return True
+
+    evaluation = EvalCallback(DummyVecEnv([ToyRace]), eval_freq=5, warn=False, verbose=0)
+    nested = CallbackList([CallbackList([evaluation])])
+    learn(make_model(), 5, RewardCallback(reward="blog", also_eval=also_eval), nested, Look())
+    assert seen == [(expected, "grid")] * 5
+    assert evaluation.eval_env.env_method("settings") == [("progress", "grid")]
+
+
+@pytest.mark.parametrize("callback", [RewardCallback(reward="blog"), RandomStartCallback()])
+def test_an_environment_without_the_setting_is_named(callback):
+    """A worker process would die of the missing method, without a word."""
+    model = DDPG("MlpPolicy", "Pendulum-v1", buffer_size=10, device="cpu")
+    with pytest.raises(InvalidOption, match=r"has no set_(reward|start)\(\)"):
+        model.learn(1, callback=callback)
+
+
+@pytest.mark.parametrize(
+    "callback",
+    [
+        NoiseCallback,
+        NoiseDecayCallback,
+        StochasticBrakeCallback,
+        RandomStartCallback,
+        lambda *args: RewardCallback(*args, reward="blog"),
+    ],
+)
+def test_arguments_are_by_name_only(callback):
+    """A number without a name in a YAML file says nothing."""
+    callback()
+    with pytest.raises(TypeError, match="positional"):
+        callback(0.1)
+
+
+def test_the_noise_base_is_abstract():
+    """A noise of one's own derives from it and says how it draws."""
+    with pytest.raises(TypeError, match="abstract"):
+        ActuatorNoise()
