@@ -100,7 +100,9 @@ def test_random_starts_are_on_the_road_and_follow_the_seed(oval):
 
     assert starts(1) == starts(1)
     assert starts(1) != starts(2)
-    for start in starts(1):
+    moving = [start for start in starts(1) if start is not None]
+    assert 30 < len(moving) < 51  # some are on the grid
+    for start in moving:
         assert 0.0 <= start.distance < oval.length
         assert abs(start.track_position) < 1.0
         assert start.speed >= 0.0
@@ -110,7 +112,9 @@ def test_setting_the_start_returns_the_one_before(oval):
     env = RacingEnv(ScriptedBackend(oval))
     assert env.set_start("random") == "grid"
     env.reset(seed=0)
-    assert env.backend.calls[-1][1] is not None
+    for _ in range(5):
+        env.reset()
+    assert any(call[1] is not None for call in env.backend.calls)
 
 
 @pytest.mark.parametrize(
