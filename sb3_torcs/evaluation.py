@@ -97,7 +97,7 @@ def evaluate(
                 laps=info["laps"],
                 lap_times=lap_times,
                 distance=info["distance"],
-                end=info.get("end", "time_limit"),
+                end=info["end"] or "time_limit",
                 damage=info["damage"],
                 episode_return=total,
             )

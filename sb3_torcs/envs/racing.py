@@ -17,6 +17,7 @@ from sb3_torcs.car import CONTROL_TICK, CarState, Controls, Start
 from sb3_torcs.errors import EnvClosed, InvalidOption
 from sb3_torcs.rewards import Reward
 from sb3_torcs.sensors import OBSERVATION_HIGH, OBSERVATION_LOW, encode
+from sb3_torcs.tracks import Track
 
 __all__ = ["RacingEnv", "RacingInfo"]
 
@@ -39,7 +40,7 @@ RESET_OPTIONS = ("distance", "track_position", "heading_error", "speed")
 
 
 class RacingInfo(TypedDict, total=False):
-    """What ``info`` holds. ``lap_time`` and ``end`` are there only when there is one."""
+    """What ``info`` holds. ``lap_time`` is there only when a lap was just completed."""
 
     laps: int  # whole laps driven in this episode
     lap_time: float  # [s] of the lap that was just completed
@@ -49,7 +50,7 @@ class RacingInfo(TypedDict, total=False):
     damage: float  # [points]
     reward_terms: dict[str, float]  # they sum to the reward exactly
     car: CarState  # everything else
-    end: str  # why the episode ended
+    end: str | None  # why the episode ended; stays None when a time limit cut it
 
 
 class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
@@ -106,6 +107,11 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         self._controls = Controls(0.0, 0.0, 0.0)
         self._viewer: Any = None
         self._closed = False
+
+    @property
+    def track(self) -> Track:
+        """The track of the present episode."""
+        return self.backend.track
 
     def set_reward(self, reward: str | Mapping[str, float]) -> str | Mapping[str, float] | None:
         """
@@ -228,7 +234,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         return "stuck" if self._standing > self._patience else None
 
     def _info(self, car: CarState, terms: dict[str, float], end: str | None) -> RacingInfo:
-        info = RacingInfo(
+        return RacingInfo(
             laps=car.laps,
             best_lap_time=car.best_lap_time or None,
             distance=car.distance_raced,
@@ -236,10 +242,8 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
             damage=car.damage,
             reward_terms=terms,
             car=car,
+            end=end,
         )
-        if end is not None:
-            info["end"] = end
-        return info
 
     def _draw_start(self) -> Start | None:
         if self._start == "grid":

@@ -1,0 +1,143 @@
+"""Every example runs as it stands, with a budget of seconds; the demo keeps its promises."""
+
+import importlib.util
+import json
+import runpy
+import shlex
+import sys
+from pathlib import Path
+
+import pytest
+
+from sb3_torcs.errors import OutputNotWritable
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+
+
+def run(monkeypatch, name, *words):
+    monkeypatch.setattr(sys, "argv", [name, *words])
+    return runpy.run_path(str(EXAMPLES / name), run_name="__main__")
+
+
+@pytest.fixture
+def demo():
+    """A fresh copy of the demo's module."""
+    spec = importlib.util.spec_from_file_location("demo", EXAMPLES / "demo.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_train_saves_a_model_that_evaluate_drives(monkeypatch, capsys, tmp_path):
+    run(monkeypatch, "train.py", "--timesteps", "60", "--folder", str(tmp_path))
+    assert f"{tmp_path}/model.zip" in capsys.readouterr().out
+    run(monkeypatch, "evaluate.py", str(tmp_path / "model"), "--laps", "1")
+    assert capsys.readouterr().out.startswith("episode 1: no whole lap;")
+
+
+def test_own_reward_learns_from_it(monkeypatch, capsys):
+    run(monkeypatch, "own_reward.py", "--timesteps", "120")
+    assert "the best return by this reward was" in capsys.readouterr().out
+
+
+def test_the_scripted_driver_laps_a_track(monkeypatch, capsys):
+    run(monkeypatch, "scripted_driver.py", "--track", "g-track-1")
+    out = capsys.readouterr().out
+    assert out.startswith("g-track-1: ")
+    assert out.endswith("ended by laps\n")
+
+
+@pytest.mark.parametrize(
+    ("words", "wanted", "done", "plan"),
+    [
+        ("", None, 0, "fresh"),
+        ("--continue", None, 0, "fresh"),
+        ("--fresh", 100, 50, "fresh"),
+        ("--continue", 100, 50, "continue"),
+        ("", 100, 50, "continue"),
+        ("", 100, 100, "show"),
+        ("--timesteps 200", 100, 100, "continue"),
+    ],
+)
+def test_without_a_terminal_the_demo_goes_on_or_shows(demo, words, wanted, done, plan):
+    """pytest's standard input is no terminal, as in CI."""
+    assert demo.choose(demo.parse(words.split()), wanted, done) == plan
+
+
+@pytest.mark.parametrize(
+    ("done", "answer", "plan"),
+    [(50, "", "continue"), (50, "f", "fresh"), (100, "", "show"), (100, "fresh", "fresh")],
+)
+def test_on_a_terminal_the_demo_asks(demo, monkeypatch, done, answer, plan):
+    monkeypatch.setattr(sys.stdin, "isatty", lambda: True, raising=False)
+    monkeypatch.setattr("builtins.input", lambda question: answer)
+    assert demo.choose(demo.parse([]), 100, done) == plan
+
+
+def test_a_fresh_start_removes_nothing_that_is_not_the_demos(demo, tmp_path):
+    """Somebody's own model.zip is not ours to throw away."""
+    (tmp_path / "model.zip").write_text("theirs")
+    with pytest.raises(OutputNotWritable, match="--folder"):
+        demo.clear(tmp_path)
+    assert (tmp_path / "model.zip").read_text() == "theirs"
+
+
+def test_a_fresh_start_leaves_other_files_alone(demo, tmp_path):
+    (tmp_path / demo.STATE).write_text("{}")
+    (tmp_path / "notes.txt").write_text("mine")
+    demo.clear(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+
+
+def test_one_failed_part_of_the_show_does_not_lose_the_others(demo, monkeypatch, capsys, tmp_path):
+    def broken(folder):
+        raise RuntimeError("no encoder")
+
+    monkeypatch.setattr(demo, "runs", lambda folder: [folder])
+    monkeypatch.setattr(demo, "keep_models", lambda folder: "models kept")
+    monkeypatch.setattr(demo, "draw", broken)
+    monkeypatch.setattr(demo, "film", lambda folder: "filmed")
+    assert demo.show(tmp_path, interrupted=False)
+    out = capsys.readouterr().out
+    assert out.splitlines() == [
+        "models kept",
+        "the picture: failed: RuntimeError: no encoder",
+        "filmed",
+    ]
+
+
+def test_ctrl_c_during_the_training_still_shows_and_says_how_to_go_on(
+    demo, monkeypatch, capsys, tmp_path
+):
+    def stopped(options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(demo, "train_run", stopped)
+    assert demo.main(["--timesteps", "300", "--folder", str(tmp_path)]) == 130
+    assert "Nothing was learned yet" in capsys.readouterr().out
+    assert json.loads((tmp_path / demo.STATE).read_text())["timesteps"] == 300
+
+
+@pytest.mark.slow
+def test_the_demo_learns_shows_goes_on_and_shows_again(demo, capsys, tmp_path):
+    """What `make demo` promises, in small."""
+    folder = tmp_path / "demo"
+    words = ["--timesteps", "400", "--folder", str(folder)]
+    assert demo.main(words) == 0
+    for name in ("model.zip", "last_model.zip", "lap.mp4", "line.png", "tensorboard"):
+        assert (folder / name).exists(), name
+    out = capsys.readouterr().out
+    assert "Learned from 400 of 400 decisions." in out
+    assert f"evaluate {folder / 'model.zip'}" in out
+    assert "Loading replay buffer" not in (folder / "training.log").read_text()
+
+    assert demo.main(["--continue", "--timesteps", "600", "--folder", str(folder)]) == 0
+    assert "Learned from 600 of 600 decisions." in capsys.readouterr().out
+    assert "Loading replay buffer" in (folder / "training.log").read_text()
+    assert len(list(folder.rglob("replay_buffer.pkl"))) == 1
+
+    assert demo.main(["--folder", str(folder)]) == 0  # shows again, learns nothing
+    out = capsys.readouterr().out
+    assert "finished training" in out
+    assert shlex.quote(f"--fresh --folder {folder}") in out
+    assert len(demo.runs(folder)) == 2

@@ -1,0 +1,96 @@
+"""``TorcsLite-v0`` as people make it: names, tracks, refusals."""
+
+from __future__ import annotations
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import sb3_torcs  # noqa: F401
+from sb3_torcs.errors import InvalidOption, TrackFileError, TrackNotFound, UnknownRewardTerm
+
+
+def track_of(env):
+    return env.unwrapped.backend.track
+
+
+@pytest.mark.parametrize("name", ["aalborg", "road/aalborg", "alpine-1", "road/alpine-1"])
+def test_a_track_has_a_short_and_a_full_name(name):
+    assert track_of(gym.make("TorcsLite-v0", track=name)).name == name.rpartition("/")[2]
+
+
+def test_a_random_track_is_drawn_from_the_seed_for_every_episode():
+    def lengths(seed):
+        env = gym.make("TorcsLite-v0", track="random")
+        env.reset(seed=seed)
+        drawn = [track_of(env).length]
+        for _ in range(3):
+            env.reset()
+            drawn.append(track_of(env).length)
+        return drawn
+
+    assert lengths(1) == lengths(1)
+    assert len(set(lengths(1))) == 4
+    assert lengths(1) != lengths(2)
+
+
+def test_a_start_can_be_chosen_to_the_metre():
+    env = gym.make("TorcsLite-v0")
+    options = {"distance": 1000.0, "track_position": -0.5, "heading_error": 0.1, "speed": 25.0}
+    _, info = env.reset(seed=0, options=options)
+    car = info["car"]
+    assert car.distance_from_start == pytest.approx(1000.0, abs=1e-6)
+    assert car.track_position == pytest.approx(-0.5, abs=1e-9)
+    assert car.heading_error == pytest.approx(0.1, abs=1e-9)
+    assert car.speed_x == pytest.approx(25.0, abs=1e-9)
+
+
+def test_the_grid_is_behind_the_line_standing():
+    _, info = gym.make("TorcsLite-v0").reset(seed=0)
+    car = info["car"]
+    assert car.speed_x == 0.0
+    assert car.distance_from_start > 2500.0
+    assert car.gear == 1
+
+
+def test_the_narrow_range_finders_see_further_ahead():
+    scr, narrow = (
+        gym.make("TorcsLite-v0", range_finders=choice).reset(seed=0)[1]["car"].range_finders
+        for choice in ("scr", "narrow")
+    )
+    assert narrow.min() > scr.min()
+    assert narrow[9] == scr[9]  # straight ahead is straight ahead
+
+
+def test_the_time_limit_is_the_registrations():
+    assert gym.spec("TorcsLite-v0").max_episode_steps == sb3_torcs.MAX_EPISODE_STEPS
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"track": "alborg"}, TrackNotFound, "no track 'alborg'; did you mean 'aalborg'?"),
+        ({"track": "nowhere.xml"}, TrackNotFound, "no track file"),
+        ({"reward": "speed"}, UnknownRewardTerm, "no reward 'speed'"),
+        ({"range_finders": "wide"}, InvalidOption, "range_finders is 'wide'"),
+        ({"car": "ferrari"}, InvalidOption, "car is 'ferrari'"),
+    ],
+)
+def test_what_does_not_exist_is_refused_with_what_does(options, error, message):
+    with pytest.raises(error, match=message):
+        gym.make("TorcsLite-v0", **options)
+
+
+def test_broken_xml_names_file_and_line(tmp_path):
+    path = tmp_path / "broken.xml"
+    path.write_text('<params name="x">\n<section name="Header">\n</params>\n')
+    with pytest.raises(TrackFileError, match=r"broken\.xml, line 3"):
+        gym.make("TorcsLite-v0", track=str(path))
+
+
+def test_a_second_of_full_throttle_moves_the_car_forward():
+    env = gym.make("TorcsLite-v0")
+    env.reset(seed=0)
+    for _ in range(10):
+        *_, info = env.step(np.array([0.0, 1.0, 0.0], np.float32))
+    assert 1.0 < info["distance"] < 5.0
