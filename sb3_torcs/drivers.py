@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sb3_torcs.errors import InvalidOption
-from sb3_torcs.sensors import RANGE_FINDERS, SENSORS, feature_slices
+from sb3_torcs.sensors import OBSERVATION_SIZE, RANGE_FINDERS, SENSORS, feature_slices
 
 __all__ = ["ScriptedDriver"]
 
@@ -54,12 +54,12 @@ class ScriptedDriver:
         :return: the action, (3,) or (n, 3), and no state
         """
         del state, episode_start, deterministic
-        observation = np.asarray(observation, dtype=np.float64)
-        if observation.shape[-1] != 29 or observation.ndim > 2:
-            raise InvalidOption(f"observation has shape {observation.shape}; expected (29,) or (n, 29)")
-        if observation.ndim == 1:
-            return self._drive(observation), None
-        return np.stack([self._drive(row) for row in observation]), None
+        rows = np.asarray(observation, dtype=np.float64)
+        if rows.shape[-1] != OBSERVATION_SIZE or rows.ndim > 2:
+            raise InvalidOption(f"observation has shape {rows.shape}; expected (29,) or (n, 29)")
+        if rows.ndim == 1:
+            return self._drive(rows), None
+        return np.stack([self._drive(row) for row in rows]), None
 
     def _drive(self, observation: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
         def read(name: str) -> npt.NDArray[np.float64]:

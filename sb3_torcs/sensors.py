@@ -127,7 +127,7 @@ RANGE_FINDERS: dict[str, tuple[float, ...]] = {
         -45, -19, -12, -7, -4, -2.5, -1.7, -1, -0.5, 0, 0.5, 1, 1.7, 2.5, 4, 7, 12, 19, 45,
     ),
 }  # fmt: skip
-"""[deg] left to right: the SCR server's default, and the set that the original DDPG code asks for."""
+"""[deg] left to right: the SCR server's default, and what the original DDPG code asks for."""
 
 
 def range_finder_angles(choice: str | Sequence[float]) -> FloatArray:

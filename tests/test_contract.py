@@ -97,7 +97,7 @@ def test_the_same_seed_gives_the_same_bytes_in_another_process(world):
     namespace = {}
     argv, sys.argv = sys.argv, ["", world]
     try:
-        exec(ROLLOUT.replace("print(", "result = ("), namespace)  # noqa: S102
+        exec(ROLLOUT.replace("print(", "result = ("), namespace)
     finally:
         sys.argv = argv
     assert digest("1").strip() == digest("2").strip() == namespace["result"]
@@ -232,7 +232,8 @@ def test_nothing_graphical_loads_before_the_first_picture(world):
         "env.reset(seed=0); env.step(env.action_space.sample())\n"
         "print([m for m in ('pygame', 'matplotlib', 'highway_env', 'torch') if m in sys.modules])"
     )
-    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    python = [sys.executable, "-c", code]
+    answer = subprocess.run(python, capture_output=True, text=True, check=True)
     assert answer.stdout.strip() == "[]"
 
 

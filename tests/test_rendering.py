@@ -254,7 +254,8 @@ def test_a_window_that_nobody_can_see_says_what_to_do_and_draws_on():
     run_python(
         PRELUDE + "import logging\n"
         "said = []\n"
-        "logging.getLogger('sb3_torcs.rendering').addFilter(lambda r: said.append(r.getMessage()))\n"
+        "logger = logging.getLogger('sb3_torcs.rendering')\n"
+        "logger.addFilter(lambda record: said.append(record.getMessage()))\n"
         "viewer = Viewer(mode='human', fps=1000)\n"
         "viewer.frame(track, car, COASTING, ANGLES)\n"
         "viewer.close()\n"

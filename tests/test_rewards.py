@@ -63,9 +63,9 @@ def test_a_preset_uses_known_terms(preset):
 
 
 def test_an_unknown_name_offers_the_near_miss():
-    with pytest.raises(UnknownRewardTerm, match="no reward 'progres'; did you mean 'progress'?"):
+    with pytest.raises(UnknownRewardTerm, match=r"no reward 'progres'; did you mean 'progress'\?"):
         Reward("progres")
-    with pytest.raises(UnknownRewardTerm, match="'speed_alon'; did you mean 'speed_along'?"):
+    with pytest.raises(UnknownRewardTerm, match=r"'speed_alon'; did you mean 'speed_along'\?"):
         Reward({"speed_alon": 1.0})
 
 

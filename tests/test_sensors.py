@@ -67,7 +67,8 @@ def test_the_bounds_are_finite_and_ordered():
 
 
 def test_the_usual_range_finders_look_every_ten_degrees_from_left_to_right():
-    np.testing.assert_array_equal(range_finder_angles("scr"), np.radians(np.arange(-90.0, 91.0, 10)))
+    usual = np.radians(np.arange(-90.0, 91.0, 10.0))
+    np.testing.assert_array_equal(range_finder_angles("scr"), usual)
     narrow = np.degrees(range_finder_angles("narrow"))
     assert narrow[0] == pytest.approx(-45.0)
     assert np.all(np.diff(narrow) > 0.0)

@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-import sb3_torcs  # noqa: F401
+import sb3_torcs
 from sb3_torcs.errors import InvalidOption, TrackFileError, TrackNotFound, UnknownRewardTerm
 
 

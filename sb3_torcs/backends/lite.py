@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from sb3_torcs.backends import lite_physics as physics
-from sb3_torcs.backends.lite_rays import Edges, cast, road_edges
+from sb3_torcs.backends.lite_rays import RANGE, Edges, road_edges
+from sb3_torcs.backends.lite_road import road_width
 from sb3_torcs.car import CarState, Controls, FloatArray, Start
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.sensors import range_finder_angles
@@ -61,7 +62,7 @@ class LiteBackend:
             offset = track.grid.offset
         else:
             segment, along = track.find(start.distance)
-            width = physics.road_width(self._table, segment, along)
+            width = road_width(self._table, segment, along)
             offset = 0.5 * start.track_position * width
         x, y, heading = track.pose(start.distance, offset)
         segment, _ = track.find(start.distance)
@@ -88,16 +89,14 @@ class LiteBackend:
         """Nothing to give back: the world is two arrays."""
 
     def _read(self) -> CarState:
-        scalars, wheels, beams, opponents = (
-            np.empty(physics.SCALARS),
-            np.empty(4),
-            np.empty(19),
-            np.full(36, 200.0),
+        scalars, wheels, beams = np.empty(physics.SCALARS), np.empty(4), np.empty(19)
+        opponents = np.full(36, RANGE)  # nobody else is here
+        physics.read(
+            self._state, self._table, *self._edges, self.range_finder_angles, scalars, wheels, beams
         )
-        physics.read(self._state, self._table, *self._edges, self.range_finder_angles, scalars, wheels, beams)
         for array in (wheels, beams, opponents):
             array.flags.writeable = False
         values = scalars.tolist()
         values[physics.GEAR_FIELD] = int(values[physics.GEAR_FIELD])
         values[physics.LAPS_FIELD] = int(values[physics.LAPS_FIELD])
-        return CarState(*values, 1, wheels, beams, opponents)
+        return CarState._make((*values, 1, wheels, beams, opponents))

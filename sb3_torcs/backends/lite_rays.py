@@ -7,6 +7,7 @@ finders, which take each segment's starting width, these see the road as it is d
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import NamedTuple
 
@@ -75,7 +76,7 @@ def _edge(track: Track, index: int, side: int) -> list[list[float]]:
             track.pose_on(index, segment.length * i / parts, begin + (end - begin) * i / parts)[:2]
             for i in range(parts + 1)
         ]
-        shapes.extend(_line(a, b) for a, b in zip(points, points[1:], strict=False))
+        shapes.extend(_line(a, b) for a, b in itertools.pairwise(points))
     if end != onward:
         shapes.append(_line(tip, track.pose_on(after, 0.0, onward)[:2]))
     return shapes

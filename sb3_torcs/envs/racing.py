@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, ClassVar, TypedDict
+from typing import Any, TypedDict
 
 import gymnasium as gym
 import numpy as np
@@ -66,10 +66,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
     :raises InvalidOption: if an option has a value that is not allowed
     """
 
-    metadata: ClassVar[dict[str, Any]] = {
-        "render_modes": ["rgb_array", "human"],
-        "render_fps": 10,
-    }
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": 10}  # noqa: RUF012
 
     def __init__(
         self,
@@ -187,7 +184,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         terminated = end is not None and end != "laps"
         return encode(after), sum(terms.values()), terminated, end == "laps", dict(info)
 
-    def render(self) -> npt.NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> npt.NDArray[np.uint8] | None:
         """
         Draw the road and the car from above.
 

@@ -1,0 +1,124 @@
+"""``car1-trb1`` in figures, its engine and its tyres, for the fallback world.
+
+The figures are those of ``cars/car1-trb1/car1-trb1.xml`` of torcs-data 1.3.7; the formulas follow
+TORCS's simulation, ``simuv2``.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+GRAVITY = 9.80665  # [m/s²]
+
+# Body
+FUEL = 94.0  # [l] a full tank, 1 kg per litre in TORCS
+MASS = 1150.0 + FUEL  # [kg]
+LENGTH = 4.52  # [m]
+WIDTH = 1.94  # [m]
+CG_HEIGHT = 0.25  # [m]
+FRONT_WEIGHT = 0.52  # share of the weight on the front axle
+INERTIA_ARM = 0.62**2 * LENGTH**2 + WIDTH**2  # [m²] "mass repartition coefficient" 0.62
+YAW_INERTIA = MASS * INERTIA_ARM / 12.0  # [kg m²]
+MAX_YAW_RATE = 9.0  # [rad/s] the limit of simuv2
+AXLE_FRONT, AXLE_REAR = 1.22, -1.42  # [m] in the car file's frame
+CG_X = FRONT_WEIGHT * AXLE_FRONT + (1.0 - FRONT_WEIGHT) * AXLE_REAR  # [m]
+WHEELBASE = AXLE_FRONT - AXLE_REAR  # [m]
+TRACK_FRONT, TRACK_REAR = 1.68, 1.60  # [m] between the wheels of an axle
+# Per wheel: front right, front left, rear right, rear left
+WHEEL_X = np.array([AXLE_FRONT, AXLE_FRONT, AXLE_REAR, AXLE_REAR]) - CG_X  # [m]
+WHEEL_Y = 0.5 * np.array([-TRACK_FRONT, TRACK_FRONT, -TRACK_REAR, TRACK_REAR])  # [m]
+_RATED_FRONT = 1.2 * 0.5 * FRONT_WEIGHT * MASS * GRAVITY  # simuv2's "operating load": 1.2 × at rest
+_RATED_REAR = 1.2 * 0.5 * (1.0 - FRONT_WEIGHT) * MASS * GRAVITY
+RATED_LOAD = np.array([_RATED_FRONT, _RATED_FRONT, _RATED_REAR, _RATED_REAR])  # [N]
+LOAD_LAG = 0.05  # [s] stands for the suspension: how late loads follow accelerations
+
+# Steering
+STEER_LOCK = math.radians(21.0)  # [rad]
+STEER_RATE = math.radians(360.0)  # [rad/s]
+
+# Tyres
+RADIUS = np.array([0.3306, 0.3306, 0.3276, 0.3276])  # [m] per wheel
+TYRE_MU = 1.6  # [-] "mu"
+TYRE_C = 2.0 - math.asin(0.8) * 2.0 / math.pi  # "dynamic friction" 80 %
+TYRE_B = 20.0 / TYRE_C  # "stiffness" 20
+TYRE_E = 0.7  # "elasticity factor", the default
+LOAD_FACTOR_MIN, LOAD_FACTOR_MAX = 0.8, 1.6
+LOAD_FACTOR_K = math.log((1.0 - LOAD_FACTOR_MIN) / (LOAD_FACTOR_MAX - LOAD_FACTOR_MIN))
+SKID_FACTOR = 0.3  # extra grip of a sliding tyre for a driver of the level "semi-pro"
+MAX_SLIP = 1.5
+SLIP_SPEED = 3.0  # [m/s] below it slip is measured against this speed, so that a stop is stable
+_CAMBER_FRONT = 1.0 + 0.05 * math.sin(18.0 * math.radians(4.0))
+_CAMBER_REAR = 1.0 + 0.05 * math.sin(18.0 * math.radians(3.0))
+CAMBER = np.array([_CAMBER_FRONT, _CAMBER_FRONT, _CAMBER_REAR, _CAMBER_REAR])  # grip factor
+WHEEL_INERTIA_FRONT = 1.22 + 0.1241  # [kg m²] wheel and brake disk
+WHEEL_INERTIA_REAR = 1.22 + 0.0714
+
+# Brakes: torque per wheel at full pedal = pressure × share × disk radius × piston area × mu
+_BRAKE_FRONT = 29.0e6 * 0.54 * 0.190 * 50.0e-4 * 0.4
+_BRAKE_REAR = 29.0e6 * 0.46 * 0.165 * 25.0e-4 * 0.4
+BRAKE = np.array([_BRAKE_FRONT, _BRAKE_FRONT, _BRAKE_REAR, _BRAKE_REAR])  # [N m]
+
+# Engine and gearbox
+RPM = 2.0 * math.pi / 60.0  # [rad/s] per rpm
+TICKOVER = 900.0 * RPM
+LIMITER = 9152.0 * RPM
+REVS_MAX = 10000.0 * RPM
+ENGINE_INERTIA = 0.2423  # [kg m²] simuv2's default
+ENGINE_BRAKE = 0.33  # simuv2's default
+TORQUE_STEP = 1000.0 * RPM  # [rad/s] between the points of the torque curve
+TORQUE = np.array([100, 160, 190, 280, 350, 405, 443, 465, 483, 415, 360, 360], float)  # [N m]
+FINAL_DRIVE = 4.5
+GEARS = np.array([-4.0, 0.0, 3.0, 1.9, 1.4, 1.1, 0.9, 0.77])  # reverse, neutral, 1 to 6
+EFFICIENCY = np.array([0.957, 1.0, 0.955, 0.957, 0.95, 0.983, 0.948, 0.94]) * 0.9625
+TOP_GEAR = 6
+SHIFT_TIME = 0.15  # [s] the clutch is open after a change of gear
+DIFFERENTIAL = 300.0  # [N m s/rad] locking torque per difference of wheel speed
+DIFFERENTIAL_MAX = 1500.0  # [N m]
+
+# Air
+DRAG = 0.645 * 0.35 * 1.92  # [N s²/m²] Cx 0.35, front area 1.92 m²
+WING_FRONT = 1.23 * 0.25 * math.sin(math.radians(6.0))
+WING_REAR = 1.23 * 0.70 * math.sin(math.radians(14.0))
+WING_LIFT = 4.0  # downforce per drag of a wing
+GROUND_EFFECT = 1.5  # simuv2's 2 exp(-3 h⁴) at the car's usual ride height
+LIFT_FRONT, LIFT_REAR = 0.69 * GROUND_EFFECT, 0.70 * GROUND_EFFECT
+
+# Damage
+MAX_DAMAGE = 10000.0  # [points] TORCS takes the car out of the race
+
+
+@njit(cache=True)
+def engine_torque(engine_speed: float, throttle: float) -> float:
+    """
+    Torque [N m] of the engine, braking when the throttle is closed.
+
+    :param engine_speed: [rad/s]
+    :param throttle: [-] in [0, 1]
+    """
+    if engine_speed > LIMITER:
+        return 0.0
+    i = min(int(engine_speed / TORQUE_STEP), TORQUE.shape[0] - 2)
+    full = TORQUE[i] + (TORQUE[i + 1] - TORQUE[i]) * (engine_speed / TORQUE_STEP - i)
+    braking = ENGINE_BRAKE * (engine_speed - TICKOVER) / (REVS_MAX - TICKOVER)
+    return full * (throttle * (1.0 + braking) - braking)
+
+
+@njit(cache=True)
+def tyre_grip(slip: float, load: float, rated_load: float) -> float:
+    """
+    Force per slip direction [N] of a tyre on ground of friction 1 (magic formula of simuv2).
+
+    :param slip: [-] length of the combined slip vector
+    :param load: [N] pressing the tyre to the ground
+    :param rated_load: [N] load at which the load factor is 1
+    """
+    slip = min(slip, MAX_SLIP)
+    bx = TYRE_B * slip
+    shape = math.sin(TYRE_C * math.atan(bx * (1.0 - TYRE_E) + TYRE_E * math.atan(bx)))
+    load_factor = LOAD_FACTOR_MIN + (LOAD_FACTOR_MAX - LOAD_FACTOR_MIN) * math.exp(
+        LOAD_FACTOR_K * load / rated_load
+    )
+    return shape * (1.0 + SKID_FACTOR * slip) * TYRE_MU * load_factor * load
