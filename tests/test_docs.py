@@ -1,0 +1,399 @@
+"""The documentation says what the code does: tables are generated, snippets and commands run.
+
+``python tests/test_docs.py`` writes the generated tables anew.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import json
+import re
+import shlex
+from pathlib import Path
+
+import gymnasium as gym
+import pytest
+from gymnasium.utils.env_checker import check_env as check_gymnasium
+from stable_baselines3.common.vec_env import VecEnv
+
+import sb3_torcs  # noqa: F401  registers the environments
+from sb3_torcs import cli, rewards, zoo
+from sb3_torcs.driving_metrics import DrivingMetricsCallback
+from sb3_torcs.envs.torcs_lite import TorcsLiteEnv
+from sb3_torcs.noise import BLOG
+from sb3_torcs.sensors import RANGE_FINDERS, sensor_table
+from sb3_torcs.tracks import BUNDLED_FOLDER, load_track
+
+ROOT = Path(__file__).parent.parent
+PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
+PACKAGE = ROOT / "sb3_torcs"
+TINY = "TIMESTEPS = 150"  # decisions of a training in a snippet
+
+
+# ------------------------------------------------------------------------------ generated tables
+
+
+def markdown(headers, rows):
+    """A table; ``|`` inside a cell would end it."""
+    lines = [headers, ["---"] * len(headers), *rows]
+    return "\n".join(f"| {' | '.join(c.replace('|', '&#124;') for c in row)} |" for row in lines)
+
+
+def one_line(text):
+    """Text in one line, with Markdown's code instead of reStructuredText's."""
+    return " ".join(text.split()).replace("``", "`")
+
+
+def arguments_table():
+    parameters = inspect.signature(TorcsLiteEnv.__init__).parameters
+    said = dict(re.findall(r":param (\w+): (.*?)(?=\n\s*:|\Z)", TorcsLiteEnv.__doc__, re.DOTALL))
+    rows = []
+    for name, parameter in parameters.items():
+        if name == "self":
+            continue
+        default = json.dumps(parameter.default).replace("null", "None")
+        rows.append([f"`{name}`", f"`{default}`", one_line(said[name])])
+    return markdown(["argument", "default", ""], rows)
+
+
+def range_finders_table():
+    rows = [
+        [f'`"{name}"`', ", ".join(f"{angle:g}" for angle in angles)]
+        for name, angles in RANGE_FINDERS.items()
+    ]
+    return markdown(["set", "angles"], rows)
+
+
+def terms_table():
+    rows = [[f"`{name}`", one_line(term.__doc__)] for name, term in rewards.TERMS.items()]
+    return markdown(["term", "what it measures"], rows)
+
+
+def presets_table():
+    names = list(dict.fromkeys(key for preset in rewards.PRESETS.values() for key in preset))
+    rows = [
+        [f'`"{preset}"`', *(f"{weights[key]:g}" if key in weights else "" for key in names)]
+        for preset, weights in rewards.PRESETS.items()
+    ]
+    return markdown(["preset", *(f"`{name}`" for name in names)], rows)
+
+
+def tracks_table():
+    rows = []
+    for path in sorted(BUNDLED_FOLDER.glob("*/*.csv")):
+        s = load_track(path.stem).summary()
+        origin = path.read_text(encoding="utf-8").splitlines()[:2]
+        rows.append(
+            [
+                f"`{s.category}/{s.name}`",
+                f"{s.length_m:.1f}",
+                f"{s.width_m:.1f}",
+                f"{s.tightest_radius_m:.1f}",
+                " ".join(line.lstrip("# ") for line in origin),
+            ]
+        )
+    return markdown(["track", "length m", "width m", "tightest radius m", "source"], rows)
+
+
+def noise_table():
+    actuators = ("steering", "throttle", "brake")
+    rows = [[name, *(f"{value:g}" for value in p)] for name, p in zip(actuators, BLOG, strict=True)]
+    return markdown(["actuator", "μ", "θ", "σ"], rows)
+
+
+def tags_table():
+    """The table in the callback's docstring, whose columns begin where their rules do."""
+    lines = inspect.cleandoc(DrivingMetricsCallback.__doc__).splitlines()
+    rules = [number for number, line in enumerate(lines) if line.startswith("====")]
+    starts = [match.start() for match in re.finditer("=+", lines[rules[0]])]
+    spans = list(zip(starts, [*starts[1:], None], strict=True))
+    rows = [
+        [one_line(line[first:last]) for first, last in spans]
+        for line in lines[rules[0] + 1 : rules[2]]
+        if not line.startswith("=")
+    ]
+    return markdown(rows[0], rows[1:])
+
+
+def verbs_table():
+    """What ``sb3-torcs --help`` says of its verbs."""
+
+    class Collector:
+        def __init__(self):
+            self.rows = []
+
+        def add_parser(self, name, *, help, **kwargs):
+            import argparse
+
+            self.rows.append([f"`sb3-torcs {name}`", help])
+            return argparse.ArgumentParser(add_help=False)
+
+    collector = Collector()
+    for verb in cli.VERBS:
+        verb.add_parser(collector)
+    return markdown(["verb", "does"], collector.rows)
+
+
+GENERATED = {
+    "README.md": {"verbs": verbs_table},
+    "docs/environments.md": {
+        "arguments": arguments_table,
+        "sensors": sensor_table,
+        "range-finders": range_finders_table,
+        "terms": terms_table,
+        "presets": presets_table,
+    },
+    "docs/tracks.md": {"tracks": tracks_table},
+    "docs/training.md": {"noise": noise_table, "tags": tags_table},
+}
+TABLES = [(page, name) for page, tables in GENERATED.items() for name in tables]
+
+
+def block_of(name):
+    return re.compile(rf"(<!-- {name} -->\n)(.*?)(<!-- /{name} -->)", re.DOTALL)
+
+
+@pytest.mark.parametrize(("page", "name"), TABLES)
+def test_a_generated_table_has_not_drifted(page, name):
+    found = block_of(name).search((ROOT / page).read_text(encoding="utf-8"))
+    assert found, f"{page} has no block <!-- {name} -->"
+    remedy = "the code has changed; type: python tests/test_docs.py"
+    assert found[2].strip() == GENERATED[page][name](), remedy
+
+
+def test_every_block_is_generated():
+    """A marker that nothing fills would look as if something did."""
+    found = {
+        (str(page.relative_to(ROOT)), name)
+        for page in PAGES
+        for name in re.findall(r"<!-- /([\w-]+) -->", page.read_text(encoding="utf-8"))
+    }
+    assert found == set(TABLES)
+
+
+def write_tables():
+    for page, tables in GENERATED.items():
+        path = ROOT / page
+        text = path.read_text(encoding="utf-8")
+        for name, table in tables.items():
+            text = block_of(name).sub(lambda m, t=table: f"{m[1]}{t()}\n{m[3]}", text)
+        path.write_text(text, encoding="utf-8")
+
+
+# ------------------------------------------------------------------------------ snippets
+
+
+def fenced(page, language):
+    """Code blocks of a page in one language."""
+    return re.findall(rf"^```{language}\n(.*?)^```$", page.read_text("utf-8"), re.DOTALL | re.M)
+
+
+WITH_PYTHON = [page for page in PAGES if fenced(page, "python")]
+
+
+@pytest.mark.parametrize("page", WITH_PYTHON, ids=lambda page: page.stem)
+def test_the_snippets_of_a_page_run_one_after_the_other(page, tmp_path, monkeypatch, capsys):
+    """Trainings are cut to a budget of seconds; nothing else is changed."""
+    monkeypatch.chdir(tmp_path)
+    names = {"__name__": f"snippets_{page.stem}"}
+    for number, code in enumerate(fenced(page, "python"), 1):
+        code = re.sub(r"^TIMESTEPS = .*$", TINY, code, flags=re.M)
+        exec(compile(code, f"{page.name}, snippet {number}", "exec"), names)
+    for value in names.values():
+        if isinstance(value, gym.Env | VecEnv):
+            value.close()
+    assert "Error" not in capsys.readouterr().out
+
+
+def test_the_page_on_architecture_has_a_world_in_forty_lines(capsys):
+    world, drive = fenced(ROOT / "docs" / "architecture.md", "python")
+    assert len([line for line in world.splitlines() if line.strip()]) <= 40
+    names = {}
+    exec(world + drive, names)
+    assert capsys.readouterr().out.startswith("laps 20")  # metres of g-track-1: a whole lap
+    check_gymnasium(names["env"], skip_render_check=True)
+    names["env"].close()
+
+
+def test_the_documented_json_is_what_evaluate_prints(capsys):
+    (example,) = fenced(ROOT / "docs" / "evaluation.md", "json")
+    words = "evaluate scripted --track g-track-1 --laps 1 --json"
+    assert cli.main(words.split()) == 0
+    assert shape(json.loads(example)) == shape(json.loads(capsys.readouterr().out))
+
+
+def shape(value):
+    """Keys and types."""
+    if isinstance(value, dict):
+        return {key: shape(item) for key, item in value.items()}
+    return [shape(item) for item in value] if isinstance(value, list) else type(value)
+
+
+# ------------------------------------------------------------------------------ commands
+
+
+def commands(page):
+    """Command lines in the shell blocks of a page, continuation lines joined."""
+    for block in fenced(page, "sh"):
+        yield from (line for line in block.replace("\\\n", " ").splitlines() if line.strip())
+
+
+def inline(page):
+    """Commands in running text. Blocks are cut out first: their fences are backticks, too."""
+    text = re.sub(r"^```.*?^```$", "", page.read_text("utf-8"), flags=re.DOTALL | re.M)
+    return re.findall(r"`((?:sb3-torcs|make) [^`…]+)`", text)
+
+
+SHOWN = [(page.stem, line) for page in PAGES for line in commands(page)]
+MENTIONED = [(page.stem, line) for page in PAGES for line in inline(page)]
+TARGETS = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text("utf-8"), re.M))
+
+
+@pytest.fixture
+def parsed(monkeypatch):
+    """Reads a command line of ours as the command does, and returns what it found."""
+    found = []
+    for verb in cli.VERBS:
+        monkeypatch.setattr(verb, "run", lambda args: found.append(args) or 0)
+
+    def read(words):
+        try:
+            cli.main(words)
+        except SystemExit:
+            pytest.fail(f"sb3-torcs {shlex.join(words)} does not parse")
+        return found[-1]
+
+    return read
+
+
+def parsed_by_the_zoo(words, monkeypatch):
+    """Reads a command line of the zoo's training up to where it would begin."""
+    import sys
+
+    import rl_zoo3.train as train
+
+    class Parsed(Exception):
+        pass
+
+    def stop(args, *rest, **options):
+        raise Parsed(args)
+
+    monkeypatch.setattr(train, "ExperimentManager", stop)
+    monkeypatch.setattr(train, "set_random_seed", lambda seed: None)
+    monkeypatch.setattr(train.th, "set_num_threads", lambda threads: None)
+    monkeypatch.setattr(sys, "argv", ["train", *words])
+    with pytest.raises(Parsed) as caught:
+        train.train()
+    return caught.value.args[0]
+
+
+@pytest.mark.parametrize(("page", "line"), SHOWN)
+def test_a_command_in_the_docs_parses_and_names_what_exists(page, line, parsed, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    match shlex.split(line, comments=True):
+        case ["sb3-torcs", *words]:
+            check(parsed(words), monkeypatch)
+        case ["python", "-m", "rl_zoo3.train", *words]:
+            check_zoo(parsed_by_the_zoo(words, monkeypatch))
+        case ["make", target, *_]:
+            assert target in TARGETS
+        case ["sudo", "apt", "install", *packages]:
+            assert set(packages) <= {"git", "make", "g++", "python3-venv", "torcs-data"}
+        case other:
+            pytest.fail(f"{other} is nothing that a test knows")
+
+
+@pytest.mark.parametrize(("page", "line"), MENTIONED)
+def test_a_command_in_the_text_parses(page, line, parsed):
+    match shlex.split(line):
+        case ["sb3-torcs", *words] if words[0] != "evaluate" or len(words) > 1:
+            parsed(words)
+        case ["make", target, *_]:
+            assert target in TARGETS
+
+
+def check(args, monkeypatch):
+    """Look up what a command of ours names."""
+    import numpy as np
+
+    for name in [args.track] if getattr(args, "track", None) else getattr(args, "names", ()):
+        load_track(name, np.random.default_rng(0))
+    if args.verb == "train":
+        entry = zoo.read_entry(zoo.config_file(args.algo, args.conf_file), args.entry or args.env)
+        assert args.env in gym.registry
+        words = ["--algo", args.algo, "--env", args.env, *args.zoo_args]
+        changed = parsed_by_the_zoo(["--gym-packages", "sb3_torcs", *words], monkeypatch)
+        assert set(changed.hyperparams or ()) <= set(entry)
+    if args.verb == "evaluate":
+        run = re.fullmatch(r"logs/(\w+)/TorcsLite-v0_1(/best_model\.zip)?", args.model)
+        assert args.model == "scripted" or zoo.config_file(run[1])
+
+
+def check_zoo(args):
+    """Look up what a command of the zoo names."""
+    allowed = inspect.signature(TorcsLiteEnv.__init__).parameters
+    zoo.read_entry(Path(args.conf_file), args.env)
+    assert Path(args.conf_file).stem == args.algo
+    for keywords in (args.env_kwargs or {}, args.eval_env_kwargs or {}):
+        assert keywords.keys() <= allowed.keys()
+        load_track(keywords.get("track", "aalborg"))
+
+
+# ------------------------------------------------------------------------------ links, docstrings
+
+
+def slug(heading):
+    """The anchor that GitHub gives to a heading."""
+    kept = re.sub(r"[^\w\- ]", "", heading.strip().lower())
+    return kept.replace(" ", "-")
+
+
+LINKS = [
+    (page, target)
+    for page in PAGES
+    for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text("utf-8"))
+    if not target.startswith(("http://", "https://"))
+]
+
+
+@pytest.mark.parametrize(("page", "target"), LINKS, ids=lambda part: getattr(part, "stem", part))
+def test_a_local_link_leads_somewhere(page, target):
+    name, _, anchor = target.partition("#")
+    path = (page.parent / name) if name else page
+    assert path.exists()
+    if anchor:
+        headings = re.findall(r"^#+ (.*)$", path.read_text("utf-8"), re.M)
+        assert anchor in map(slug, headings)
+
+
+def test_the_pictures_are_small_enough_for_a_first_look():
+    pictures = list((ROOT / "docs" / "images").iterdir())
+    assert {picture.suffix for picture in pictures} == {".png"}
+    assert [picture for picture in pictures if picture.stat().st_size > 200_000] == []
+
+
+def undocumented(node, where):
+    """Public definitions below a module or class that have no docstring."""
+    definitions = (ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+    for child in node.body:
+        if not isinstance(child, definitions) or child.name.startswith("_"):
+            continue
+        if ast.get_docstring(child) is None:
+            yield f"{where}.{child.name}"
+        if isinstance(child, ast.ClassDef):
+            yield from undocumented(child, f"{where}.{child.name}")
+
+
+@pytest.mark.parametrize(
+    "path", sorted(PACKAGE.rglob("*.py")), ids=lambda path: str(path.relative_to(PACKAGE))
+)
+def test_everything_public_has_a_docstring(path):
+    tree = ast.parse(path.read_text("utf-8"))
+    if tree.body:
+        assert ast.get_docstring(tree), f"{path} has no docstring"
+    assert list(undocumented(tree, path.stem)) == []
+
+
+if __name__ == "__main__":
+    write_tables()
