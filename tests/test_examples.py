@@ -7,6 +7,7 @@ import shlex
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from sb3_torcs.errors import OutputNotWritable
@@ -141,3 +142,18 @@ def test_the_demo_learns_shows_goes_on_and_shows_again(demo, capsys, tmp_path):
     assert "finished training" in out
     assert shlex.quote(f"--fresh --folder {folder}") in out
     assert len(demo.runs(folder)) == 2
+
+
+def test_evaluations_are_drawn(monkeypatch, capsys, tmp_path):
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        np.savez(
+            tmp_path / name / "evaluations.npz",
+            timesteps=np.array([100, 200]),
+            results=np.array([[1.0], [2.0]]),
+        )
+    picture = tmp_path / "curves.png"
+    runs = [str(tmp_path / "one"), str(tmp_path / "two")]
+    run(monkeypatch, "plot_evaluations.py", *runs, "--out", str(picture))
+    assert picture.stat().st_size > 1000
+    assert str(picture) in capsys.readouterr().out
