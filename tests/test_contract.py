@@ -186,11 +186,17 @@ def test_a_closed_environment_can_be_closed_again(world):
     env.close()
 
 
-def test_an_environment_survives_pickling(world):
-    env = gym.make(world)
+def test_a_pickled_environment_goes_on_where_it_was(world):
+    env = gym.make(world, render_mode="rgb_array", start="random").unwrapped
     env.reset(seed=0)
-    copy = pickle.loads(pickle.dumps(env.unwrapped))
-    assert_equal([copy.reset(seed=1)], [env.unwrapped.reset(seed=1)])
+    action = np.array([0.02, 0.6, 0.0], np.float32)
+    for _ in range(5):
+        env.step(action)
+    env.render()
+    copy = pickle.loads(pickle.dumps(env))
+    assert_equal([copy.step(action) for _ in range(5)], [env.step(action) for _ in range(5)])
+    assert_equal([copy.reset()], [env.reset()])
+    env.close()
 
 
 def test_action_repeat_holds_the_controls(world):

@@ -105,6 +105,9 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         self._viewer: Any = None
         self._closed = False
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_viewer": None}  # surfaces cannot be pickled; a copy draws anew
+
     @property
     def track(self) -> Track:
         """The track of the present episode."""
