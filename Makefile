@@ -56,7 +56,7 @@ commit-checks: format lint type ## what to run before a commit
 
 ci: check-codestyle lint type test ## everything
 
-clean: ## remove what was built and trained here
-	rm -rf build dist *.egg-info demo logs $(VENV)
+clean: ## remove .venv/ and what was built; trainings stay
+	rm -rf build dist *.egg-info $(VENV)
 
 .PHONY: help install demo test pytest bench format check-codestyle lint type commit-checks ci clean
