@@ -376,6 +376,7 @@ def test_the_same_seed_trains_the_same_model(tmp_path):
 
 @pytest.mark.slow
 def test_an_interrupted_training_keeps_what_it_learned_and_says_how_to_go_on(capsys, tmp_path):
+    handler = signal.getsignal(signal.SIGINT)  # a job in the background has another
     callback = {f"{__name__}.InterruptingCallback": {"at": 40}}
     conf_file = write_config(tmp_path, callback=[callback])
     words = ["--conf-file", conf_file, "--folder", str(tmp_path / "logs"), "--no-progress"]
@@ -391,7 +392,7 @@ def test_an_interrupted_training_keeps_what_it_learned_and_says_how_to_go_on(cap
     assert (status, "learned from 20 of 20" in out) == (0, True)
     config = models._read_plain(folder / "TorcsLite-v0" / "config.yml")
     assert config["learning_starts"] == 0  # it has its memory, so it needs no new warm-up
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert signal.getsignal(signal.SIGINT) is handler
 
 
 @pytest.mark.slow
