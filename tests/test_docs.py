@@ -326,7 +326,7 @@ def check(args, monkeypatch):
         changed = parsed_by_the_zoo(["--gym-packages", "sb3_torcs", *words], monkeypatch)
         assert set(changed.hyperparams or ()) <= set(entry)
     if args.verb == "evaluate":
-        run = re.fullmatch(r"logs/(?:seed\d/)?(\w+)/TorcsLite-v0_1(/best_model\.zip)?", args.model)
+        run = re.fullmatch(r"logs/(?:\w+/)?(\w+)/TorcsLite-v0_1(/best_model\.zip)?", args.model)
         assert args.model == "scripted" or zoo.config_file(run[1])
 
 
