@@ -94,6 +94,14 @@ def test_combined_slip_takes_braking_from_cornering(world):
     assert both.yaw_rate < cornering.yaw_rate
 
 
+def test_downforce_presses_the_body_into_its_springs(world):
+    cars = drive(world, GAS, 150, Start(20.0, 0.0, 0.0, 30.0))
+    assert cars[-1].height < cars[0].height < figures.CG_HEIGHT
+    assert cars[-1].speed_z < 0.0
+    sunk = figures.CG_HEIGHT - cars[-1].height
+    assert sunk == pytest.approx(0.001, abs=0.001)  # [m] stiff springs: a millimetre
+
+
 def test_the_gearbox_shifts_up_through_all_gears_and_pauses_the_drive(oval):
     straight = Track("drag", "road", (segment(5000.0), segment(5000.0)), grid=Grid(10.0, 0.0))
     cars = drive(LiteBackend(straight), GAS, 2000)

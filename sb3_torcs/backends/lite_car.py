@@ -34,6 +34,7 @@ _RATED_FRONT = 1.2 * 0.5 * FRONT_WEIGHT * MASS * GRAVITY  # simuv2's "operating 
 _RATED_REAR = 1.2 * 0.5 * (1.0 - FRONT_WEIGHT) * MASS * GRAVITY
 RATED_LOAD = np.array([_RATED_FRONT, _RATED_FRONT, _RATED_REAR, _RATED_REAR])  # [N]
 LOAD_LAG = 0.05  # [s] stands for the suspension: how late loads follow accelerations
+HEAVE_STIFFNESS = 4 * 5500.0 * 175.127 * 1.1**2  # [N/m] four springs of 5500 lbs/in, bellcrank 1.1
 
 # Steering
 STEER_LOCK = math.radians(21.0)  # [rad]

@@ -35,8 +35,9 @@ DAMAGE_FACTOR = 0.8  # for a driver of the level "semi-pro"
     STEPS, X, Y, YAW, VX, VY, YAW_RATE, ACC_X, ACC_Y, STEER,
     SPIN_FR, SPIN_FL, SPIN_RR, SPIN_RL, ENGINE, GEAR, SHIFT, DAMAGE,
     SEGMENT, ALONG, OFFSET, TANGENT, RACED, CROSSINGS, LAPS, LAP_START, LAST_LAP, BEST_LAP,
-) = range(28)  # fmt: skip
-STATE_SIZE = 28
+    SINK, SINK_RATE,
+) = range(30)  # fmt: skip
+STATE_SIZE = 30
 AUTOMATIC = -99  # stands for "no gear asked for" in the compiled code
 
 
@@ -245,6 +246,8 @@ def _substep(state: Floats, track: Floats, steering: float, throttle: float, bra
     inertias = (car.WHEEL_INERTIA_FRONT, car.WHEEL_INERTIA_FRONT, inertia, inertia)
     drag, down_front, down_rear = _air(vx, vy, state[DAMAGE])
     loads = _loads(state, down_front, down_rear)
+    state[SINK_RATE] = ((down_front + down_rear) / car.HEAVE_STIFFNESS - state[SINK]) / car.LOAD_LAG
+    state[SINK] += state[SINK_RATE] * DT
     segment, along, offset = int(state[SEGMENT]), state[ALONG], state[OFFSET]
     skew = yaw - state[TANGENT]
     cos_skew, sin_skew = math.cos(skew), math.sin(skew)
@@ -391,8 +394,8 @@ def read(
     scalars[4] = state[YAW_RATE]
     scalars[5] = state[VX] * cos_yaw + state[VY] * sin_yaw
     scalars[6] = state[VY] * cos_yaw - state[VX] * sin_yaw
-    scalars[7] = 0.0  # the plane has no vertical speed
-    scalars[8] = car.CG_HEIGHT
+    scalars[7] = -state[SINK_RATE]  # the road is flat, but downforce presses the springs
+    scalars[8] = car.CG_HEIGHT - state[SINK]
     scalars[9] = wrap(state[TANGENT] - yaw)
     scalars[10] = state[OFFSET]
     scalars[11] = width
