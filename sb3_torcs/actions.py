@@ -45,7 +45,12 @@ def controls_from_action(action: npt.NDArray[np.floating]) -> Controls:
             f"action has shape {shape}, expected (3,): steering, throttle, brake; "
             "take it from env.action_space.sample() or model.predict(observation)"
         )
-    steering, throttle, brake = (float(value) for value in action)
+    try:
+        steering, throttle, brake = (float(value) for value in action)
+    except (TypeError, ValueError):
+        raise InvalidAction(
+            f"action is {action!r}; expected three numbers: steering, throttle, brake"
+        ) from None
     if not math.isfinite(steering + throttle + brake):
         for name, value in zip(ACTUATORS, (steering, throttle, brake), strict=True):
             if math.isnan(value):

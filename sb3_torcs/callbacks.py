@@ -5,20 +5,18 @@ They go by their dotted path, e.g. ``sb3_torcs.callbacks.NoiseCallback: {kind: o
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from stable_baselines3.common.callbacks import (
     BaseCallback,
-    CallbackList,
     EvalCallback,
-    EventCallback,
 )
 from stable_baselines3.common.noise import VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_torcs.driving_metrics import DrivingMetricsCallback
+from sb3_torcs.driving_metrics import DrivingMetricsCallback, callbacks_in
 from sb3_torcs.errors import InvalidOption, near_miss
 from sb3_torcs.noise import (
     BLOG,
@@ -75,7 +73,9 @@ class NoiseCallback(BaseCallback):
     ) -> None:
         super().__init__(verbose)
         if kind not in KINDS:
-            raise InvalidOption(f"kind={kind!r}: pass 'set_point' or 'ou'{near_miss(kind, KINDS)}")
+            raise InvalidOption(
+                f"kind is {kind!r}{near_miss(kind, KINDS)} pass 'set_point' or 'ou'"
+            )
         self.kind = kind
         self.parameters = tuple(OUParameters.of(value) for value in (steering, throttle, brake))
         self.dt = checked_dt(dt)
@@ -230,7 +230,8 @@ class RewardCallback(BaseCallback):
     def _on_training_start(self) -> None:
         envs = [self.training_env]
         if self.also_eval:
-            envs += [callback.eval_env for callback in _eval_callbacks(self.locals["callback"])]
+            others = callbacks_in(self.locals["callback"])
+            envs += [other.eval_env for other in others if isinstance(other, EvalCallback)]
         self._switches = [_Switch(env, "set_reward", self.reward) for env in envs]
 
     def _on_step(self) -> bool:
@@ -289,13 +290,3 @@ class _Switch:
         for index, value in enumerate(self.previous):
             self.env.env_method(self.setter, value, indices=[index])
         self.previous = []
-
-
-def _eval_callbacks(callback: BaseCallback | None) -> Iterator[EvalCallback]:
-    if isinstance(callback, EvalCallback):
-        yield callback
-    if isinstance(callback, CallbackList):
-        for child in callback.callbacks:
-            yield from _eval_callbacks(child)
-    elif isinstance(callback, EventCallback):
-        yield from _eval_callbacks(callback.callback)

@@ -5,17 +5,37 @@ SI units and radians throughout. Left is positive for steering, lateral position
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import math
+from numbers import Integral, Real
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["CONTROL_TICK", "CarState", "Controls", "FloatArray", "Start"]
+__all__ = [
+    "CONTROL_TICK",
+    "CarState",
+    "Controls",
+    "FloatArray",
+    "Start",
+    "is_count",
+    "is_number",
+]
 
 FloatArray = npt.NDArray[np.float64]
 
 CONTROL_TICK = 0.02
 """[s] The interval at which TORCS calls its robots; one decision lasts a whole number of them."""
+
+
+def is_number(value: Any) -> bool:
+    """Whether a value is a finite real number, NumPy's included; a bool is none."""
+    return not isinstance(value, bool) and isinstance(value, Real) and math.isfinite(value)
+
+
+def is_count(value: Any) -> bool:
+    """Whether a value is a whole number of at least 1, NumPy's included; a bool is none."""
+    return not isinstance(value, bool) and isinstance(value, Integral) and int(value) >= 1
 
 
 class Controls(NamedTuple):

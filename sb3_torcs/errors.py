@@ -78,7 +78,7 @@ def near_miss(name: str, known: Iterable[str]) -> str:
 
     :param name: what was typed
     :param known: the names that exist
-    :return: ``"; did you mean 'x'?"``, or an empty string when nothing is close
+    :return: ``"; did you mean 'x'?"``, or ``";"`` when nothing is close; the sentence goes on
     """
     close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.6)
-    return f"; did you mean '{close[0]}'?" if close else ""
+    return f"; did you mean '{close[0]}'?" if close else ";"

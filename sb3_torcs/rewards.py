@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 
-from sb3_torcs.car import CarState, Controls
+from sb3_torcs.car import CarState, Controls, is_number
 from sb3_torcs.errors import InvalidOption, UnknownRewardTerm, near_miss
 
 __all__ = ["PRESETS", "TERMS", "Reward"]
@@ -93,7 +93,7 @@ class Reward:
         if isinstance(reward, str):
             if reward not in PRESETS:
                 raise UnknownRewardTerm(
-                    f"no reward '{reward}'{near_miss(reward, PRESETS)} Rewards: "
+                    f"no reward '{reward}'{near_miss(reward, PRESETS)} rewards: "
                     f"{', '.join(PRESETS)}, or a dict of weights over {', '.join(TERMS)}"
                 )
             weights = PRESETS[reward]
@@ -104,17 +104,18 @@ class Reward:
                 f"reward is {reward!r}; expected one of {', '.join(PRESETS)}, or a dict of weights"
             )
         for name, weight in weights.items():
-            if name not in TERMS and name not in ("scale", "crash"):
+            if not isinstance(name, str) or name not in (*TERMS, "scale", "crash"):
+                hint = near_miss(str(name), TERMS)
                 raise UnknownRewardTerm(
-                    f"no reward term '{name}'{near_miss(name, TERMS)} Terms: {', '.join(TERMS)}; "
+                    f"no reward term '{name}'{hint} terms: {', '.join(TERMS)}; "
                     "besides them 'scale' and 'crash'"
                 )
-            if not isinstance(weight, (int, float)) or not math.isfinite(weight):
+            if not is_number(weight):
                 raise InvalidOption(
                     f"weight of reward term '{name}' is {weight!r}; expected a number"
                 )
-        self.weights = dict(weights)
-        scale = weights.get("scale", 1.0)
+        self.weights = {name: float(weight) for name, weight in weights.items()}
+        scale = self.weights.get("scale", 1.0)
         self._crash = float(weights.get("crash", 0.0))
         self._terms = tuple(
             (name, TERMS[name], float(weight) * scale)

@@ -171,7 +171,7 @@ class _Parser:
         raise self._fail(
             f"needs the file data/tracks/{SHARED_SURFACES} of TORCS, which is in none of "
             f"{', '.join(str(candidate.parent) for candidate in candidates)}; copy it beside the "
-            "track, or `sb3-torcs install-torcs`"
+            "track, install TORCS (`sudo apt install torcs-data`), or set SB3_TORCS_HOME"
         )
 
     def _start(self, tag: str, attributes: dict[str, str]) -> None:

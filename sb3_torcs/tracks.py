@@ -341,6 +341,11 @@ def load_track(
     """
     if isinstance(track, Track):
         return track
+    if not isinstance(track, (str, os.PathLike)):
+        raise InvalidOption(
+            f"track is {track!r}; expected a name (`sb3-torcs tracks` lists them), a path, "
+            "'random', or a Track"
+        )
     name = os.fspath(track)
     if name == "random":
         if rng is None:
@@ -362,7 +367,7 @@ def load_track(
         if name in (candidate, candidate.rpartition("/")[2]):
             return _read(path, source)
     known = [key for full in _known_files() for key in (full.rpartition("/")[2], full)]
-    hint = near_miss(name, known) or ";"
+    hint = near_miss(name, known)
     raise TrackNotFound(f"no track '{name}'{hint} `sb3-torcs tracks` lists them")
 
 

@@ -10,6 +10,7 @@ import copy
 import importlib
 import importlib.util
 import inspect
+import re
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,7 +20,16 @@ import yaml
 
 from sb3_torcs.errors import ZooConfigError, near_miss
 
-__all__ = ["ZOO_KEYS", "Place", "check_entry", "config_file", "read_config", "read_entry"]
+__all__ = [
+    "ZOO_KEYS",
+    "Place",
+    "check_entry",
+    "check_racing",
+    "check_registered",
+    "config_file",
+    "read_config",
+    "read_entry",
+]
 
 Entry = dict[str, Any]
 
@@ -39,6 +49,8 @@ GIVEN_BY_POLICY_OWNER = ("self", "observation_space", "action_space", "lr_schedu
 """Arguments of a policy that the algorithm passes itself."""
 
 REQUIRED = ("n_timesteps", "policy")
+
+OURS = ("Torcs-v0", "TorcsLite-v0")
 
 
 class Place(NamedTuple):
@@ -145,6 +157,7 @@ def check_entry(entry: Entry, algo: str, env_id: str, place: Place) -> None:
     for key in REQUIRED:
         if key not in entry:
             raise ZooConfigError(f"{place}: key '{key}' is missing")
+    _check_numbers(entry, place)
     constructor = (_arguments(ALGOS[algo]) or set()) - set(GIVEN_BY_ZOO)
     _check_keys(entry, ZOO_KEYS | constructor, "key", place)
     policy = _policy(entry["policy"], ALGOS[algo], place)
@@ -170,6 +183,53 @@ def _check_wrappers(entry: Entry, place: Place) -> None:
             raise ZooConfigError(
                 f"{place}: monitor_kwargs needs both info_keywords and reset_keywords as lists; "
                 "add the other one as []"
+            )
+
+
+def check_registered(env_id: str) -> None:
+    """
+    Make sure that an environment exists.
+
+    :param env_id: as for ``gym.make``, without a module
+    :raises ZooConfigError: if it is not registered
+    """
+    if env_id not in gym.registry:
+        raise ZooConfigError(
+            f"no environment '{env_id}' is registered{near_miss(env_id, OURS)} "
+            f"ours: {', '.join(OURS)}"
+        )
+
+
+def check_racing(env_id: str) -> None:
+    """
+    Make sure that an environment exists and is one of racing.
+
+    :param env_id: as for ``gym.make``, without a module
+    :raises ZooConfigError: if it is not
+    """
+    from sb3_torcs.envs.racing import RacingEnv
+    from sb3_torcs.envs.torcs import TorcsEnv
+
+    check_registered(env_id)
+    built = _env_class(env_id)
+    if not (isinstance(built, type) and issubclass(built, (RacingEnv, TorcsEnv))):
+        raise ZooConfigError(f"{env_id} is no racing environment; ours: {', '.join(OURS)}")
+
+
+def _check_numbers(entry: Entry, place: Place) -> None:
+    """Check the values that the zoo turns into numbers only when the training begins."""
+    steps = entry["n_timesteps"]
+    try:
+        good = not isinstance(steps, bool) and float(steps) >= 1.0
+    except (TypeError, ValueError):
+        good = False
+    if not good:
+        raise ZooConfigError(f"{place}: n_timesteps is {steps!r}; expected a number >= 1")
+    for key in ("learning_rate", "clip_range", "clip_range_vf", "delta_std"):
+        value = entry.get(key)
+        if isinstance(value, str) and not re.fullmatch(r"(lin_)?[\d.]+(e[+-]?\d+)?", value):
+            raise ZooConfigError(
+                f"{place}: {key} is {value!r}; expected a number, or lin_NUMBER to fall to 0"
             )
 
 
@@ -229,7 +289,8 @@ def _imported(path: str, key: str, place: Place) -> Callable[..., Any]:
         raise ZooConfigError(f"{place}: {key} '{path}' does not import: {error}") from error
     if not hasattr(module, name):
         raise ZooConfigError(
-            f"{place}: {key} '{path}': {module_name} has no '{name}'{near_miss(name, vars(module))}"
+            f"{place}: {key} '{path}': {module_name} has no '{name}'"
+            f"{near_miss(name, vars(module))} correct the dotted path"
         )
     return getattr(module, name)
 
@@ -272,5 +333,7 @@ def _check_keys(mapping: Mapping[str, Any], known: Iterable[str], what: str, pla
     known = sorted(known)
     for key in mapping:
         if key not in known:
-            hint = near_miss(str(key), known) or f"; allowed: {', '.join(known)}"
+            hint = near_miss(str(key), known)
+            if hint == ";":
+                hint = f"; allowed: {', '.join(known)}"
             raise ZooConfigError(f"{place}: unknown {what} '{key}'{hint}")

@@ -459,3 +459,26 @@ def test_the_bench_as_a_table(capsys, quick_bench):
 
 def test_the_bench_needs_time(capsys):
     assert "expected more than 0" in run(capsys, "bench", "--seconds", "0")[2]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--env", "NoSuch-v0"], "no environment 'NoSuch-v0' is registered; ours: Torcs-v0"),
+        (["--env", "TorcsLit-v0"], "did you mean 'TorcsLite-v0'?"),
+        (["--env", "CartPole-v1"], "CartPole-v1 is no racing environment"),
+    ],
+)
+def test_evaluate_refuses_what_is_no_racing_environment(capsys, words, message):
+    status, out, err = run(capsys, "evaluate", "scripted", *words)
+    assert (status, out) == (2, "")
+    assert message in err
+    assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize("verb", [["train"], ["evaluate", "scripted"]])
+def test_a_negative_seed_is_refused(capsys, verb):
+    with pytest.raises(SystemExit) as caught:
+        main([*verb, "--seed", "-1"])
+    assert caught.value.code == 2
+    assert "expected a whole number >= 0" in capsys.readouterr().err

@@ -153,6 +153,15 @@ def test_a_lap_counts_from_line_to_line(oval):
     assert car.best_lap_time == min(car.last_lap_time, car.best_lap_time)
 
 
+def test_a_start_on_the_line_begins_the_lap(oval):
+    world = LiteBackend(oval)
+    world.reset(RNG, Start(0.0, 0.0, 0.0, 25.0))
+    cars = [world.step(_follow(world), 1) for _ in range(2200)]
+    first = next(car for car in cars if car.laps == 1)
+    assert first.distance_raced == pytest.approx(oval.length, abs=1.0)
+    assert first.last_lap_time == pytest.approx(first.time, abs=0.02)
+
+
 def test_crossing_the_line_back_and_forth_counts_no_lap(oval):
     world = LiteBackend(oval)
     world.reset(RNG, Start(oval.length - 2.0, 0.0, 0.0, 10.0))

@@ -90,6 +90,19 @@ def test_reset_options_place_the_car(oval):
     assert env.backend.calls[-1] == ("reset", Start(100.0, 0.5, 0.0, 20.0))
 
 
+def test_numbers_of_numpy_are_numbers(oval):
+    env = RacingEnv(ScriptedBackend(oval), action_repeat=np.int64(3), laps=np.int32(2))
+    env.reset(options={"distance": np.int64(100), "speed": np.float32(20.0)})
+    assert env.backend.calls[-1] == ("reset", Start(100.0, 0.0, 0.0, 20.0))
+
+
+def test_what_is_no_number_at_all_is_no_action(oval):
+    env = RacingEnv(ScriptedBackend(oval))
+    env.reset(seed=0)
+    with pytest.raises(InvalidAction, match="expected three numbers"):
+        env.step(np.array(["a", "b", "c"]))
+
+
 def test_random_starts_are_on_the_road_and_follow_the_seed(oval):
     def starts(seed):
         env = RacingEnv(ScriptedBackend(oval), start="random")
@@ -122,6 +135,7 @@ def test_setting_the_start_returns_the_one_before(oval):
     [
         ({"action_repeat": 0}, "action_repeat is 0; expected a whole number >= 1"),
         ({"laps": 0}, "laps is 0"),
+        ({"laps": True}, "laps is True"),
         ({"start": "pits"}, "start is 'pits'; expected 'grid' or 'random'"),
         ({"render_mode": "ansi"}, "render_mode is 'ansi'"),
     ],
@@ -136,7 +150,10 @@ def test_a_bad_option_says_what_is_allowed(oval, options, message):
     [
         ({"place": 3.0}, "unknown reset option 'place'"),
         ({"speed": math.nan}, "reset option speed is nan"),
-        ({"speed": -1.0}, "expected 0 or more"),
+        ({"speed": -1.0}, "expected 0 to 150"),
+        ({"speed": 5000.0}, "speed is 5000 m/s; expected 0 to 150"),
+        ({"heading_error": 1e300}, "expected -pi to pi"),
+        ({"speed": True}, "expected a number"),
         ({"track_position": 2.0}, "expected -1"),
     ],
 )

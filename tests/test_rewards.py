@@ -67,9 +67,11 @@ def test_an_unknown_name_offers_the_near_miss():
         Reward("progres")
     with pytest.raises(UnknownRewardTerm, match=r"'speed_alon'; did you mean 'speed_along'\?"):
         Reward({"speed_alon": 1.0})
+    with pytest.raises(UnknownRewardTerm, match="no reward term '3'; terms: speed_along"):
+        Reward({3: 1.0})
 
 
-@pytest.mark.parametrize("weight", [math.nan, math.inf, "1", None])
+@pytest.mark.parametrize("weight", [math.nan, math.inf, "1", None, True])
 def test_a_weight_must_be_a_number(weight):
     with pytest.raises(InvalidOption, match="expected a number"):
         Reward({"progress": weight})

@@ -71,6 +71,7 @@ def test_the_time_limit_is_the_registrations():
     [
         ({"track": "alborg"}, TrackNotFound, "no track 'alborg'; did you mean 'aalborg'?"),
         ({"track": "nowhere.xml"}, TrackNotFound, "no track file"),
+        ({"track": None}, InvalidOption, "track is None; expected a name"),
         ({"reward": "speed"}, UnknownRewardTerm, "no reward 'speed'"),
         ({"range_finders": "wide"}, InvalidOption, "range_finders is 'wide'"),
         ({"car": "ferrari"}, InvalidOption, "car is 'ferrari'"),

@@ -151,7 +151,7 @@ def test_a_callback_that_does_not_import_is_told_why(tmp_path):
 
 def test_a_callback_that_is_not_in_its_module_is_told_the_near_miss(tmp_path):
     said = complaint(tmp_path, {"callback": [f"{MODULE}.CheckpointCallbak"]})
-    assert said.endswith("has no 'CheckpointCallbak'; did you mean 'CheckpointCallback'?")
+    assert "has no 'CheckpointCallbak'; did you mean 'CheckpointCallback'? " in said
 
 
 def test_an_argument_of_a_callback_that_it_does_not_have_is_unknown(tmp_path):
@@ -186,3 +186,21 @@ def test_an_argument_of_the_normalization_that_it_does_not_have_is_unknown(tmp_p
     assert said == "unknown normalize: argument 'norm_ob'; did you mean 'norm_obs'?"
     accepted({"normalize": {"norm_obs": True, "norm_reward": False}})
     accepted({"normalize": True})
+
+
+@pytest.mark.parametrize("steps", ["abc", 0, -5, True, None])
+def test_the_budget_must_be_a_number(tmp_path, steps):
+    said = complaint(tmp_path, {"n_timesteps": steps})
+    assert said == f"n_timesteps is {steps!r}; expected a number >= 1"
+
+
+@pytest.mark.parametrize("steps", [100, 1e5, "1e5", "100000.0"])
+def test_the_budget_may_be_written_as_people_do(steps):
+    accepted({"n_timesteps": steps})
+
+
+def test_a_schedule_must_be_one_that_the_zoo_reads(tmp_path):
+    said = complaint(tmp_path, {"learning_rate": "abc"})
+    assert said == "learning_rate is 'abc'; expected a number, or lin_NUMBER to fall to 0"
+    accepted({"learning_rate": "lin_1e-3"})
+    accepted({"learning_rate": "0.001"})

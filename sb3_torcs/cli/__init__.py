@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 
@@ -13,6 +14,7 @@ __all__ = ["main"]
 
 USAGE_ERROR = 2
 INTERRUPTED = 130
+READER_LEFT = 141
 VERBS = (doctor, tracks, train, evaluate, bench)
 
 
@@ -32,9 +34,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.error(f"{args.verb} passes nothing on; leave out '--' and what follows it")
     try:
         status: int = args.run(args)
+        sys.stdout.flush()
     except Sb3TorcsError as error:
         print(f"sb3-torcs: {error}", file=sys.stderr)
         return USAGE_ERROR
+    except BrokenPipeError:  # the reader, e.g. `head`, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return READER_LEFT
     except KeyboardInterrupt:
         print("sb3-torcs: interrupted", file=sys.stderr)
         return INTERRUPTED

@@ -14,7 +14,15 @@ from typing import Any
 
 from sb3_torcs.errors import OutputNotWritable
 
-__all__ = ["positive", "print_json", "quiet_output", "table", "writable_file", "writable_folder"]
+__all__ = [
+    "natural",
+    "positive",
+    "print_json",
+    "quiet_output",
+    "table",
+    "writable_file",
+    "writable_folder",
+]
 
 
 def positive(text: str) -> int:
@@ -27,6 +35,19 @@ def positive(text: str) -> int:
     number = int(text) if text.strip().lstrip("-").isdigit() else 0
     if number < 1:
         raise argparse.ArgumentTypeError(f"{text!r}: expected a whole number >= 1")
+    return number
+
+
+def natural(text: str) -> int:
+    """
+    Read a whole number of at least 0, for argparse.
+
+    :param text: from the command line
+    :return: the number
+    """
+    number = int(text) if text.strip().isdigit() else -1
+    if number < 0:
+        raise argparse.ArgumentTypeError(f"{text!r}: expected a whole number >= 0")
     return number
 
 

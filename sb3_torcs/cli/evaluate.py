@@ -6,7 +6,14 @@ import argparse
 import math
 from typing import TYPE_CHECKING, Any
 
-from sb3_torcs.cli.common import positive, print_json, quiet_output, table, writable_file
+from sb3_torcs.cli.common import (
+    natural,
+    positive,
+    print_json,
+    quiet_output,
+    table,
+    writable_file,
+)
 
 if TYPE_CHECKING:
     from sb3_torcs.evaluation import Episode
@@ -50,7 +57,7 @@ def add_parser(subparsers: Any) -> None:
     add("--car", metavar="C", help="e.g. car1-trb1")
     add("--episodes", type=positive, default=1, metavar="N", help="default: 1")
     add("--laps", type=positive, default=3, metavar="L", help="laps per episode; default: 3")
-    add("--seed", type=int, default=0, metavar="S", help="of the first reset; default: 0")
+    add("--seed", type=natural, default=0, metavar="S", help="of the first reset; default: 0")
     add("--action-repeat", type=positive, metavar="N", help="control ticks of 0.02 s per decision")
     add("--range-finders", metavar="SET", help="scr or narrow")
     add("--algo", help="the model's algorithm, if it cannot be found out")
@@ -91,10 +98,12 @@ def _drive(args: argparse.Namespace) -> tuple[list[Episode], Any]:
     from sb3_torcs.cli.recording import Recorder
     from sb3_torcs.evaluation import evaluate
     from sb3_torcs.models import TrainingRecord, find_model, load_driver, training_record
+    from sb3_torcs.zoo import check_racing
 
     scripted = args.model == "scripted"
     record = TrainingRecord() if scripted else training_record(find_model(args.model))
     env_id = args.env or record.env_id or DEFAULT_ENV
+    check_racing(env_id)
     kwargs = environment_kwargs(args, record)
     recorder = Recorder(env_id, kwargs, time_limit(kwargs))
     driver = load_driver(args.model, recorder, args.algo)

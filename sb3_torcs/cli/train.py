@@ -15,7 +15,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from sb3_torcs.cli.common import positive, writable_folder
+from sb3_torcs.cli.common import natural, positive, writable_folder
 
 __all__ = ["Run", "TrainOptions", "add_parser", "run", "train", "train_run"]
 
@@ -106,7 +106,7 @@ def add_parser(subparsers: Any) -> None:
     add("--conf-file", metavar="FILE", help="hyperparameter file; default: the shipped one")
     add("--track", metavar="T", help="instead of the entry's; `sb3-torcs tracks` lists them")
     add("--timesteps", type=positive, metavar="N", help="decisions; default: what the entry says")
-    add("--seed", type=int, default=0, metavar="S", help="default: 0")
+    add("--seed", type=natural, default=0, metavar="S", help="default: 0")
     add("--folder", default="logs", help="for models and logs; default: logs")
     add("--tensorboard", metavar="DIR", help="default: FOLDER/tensorboard")
     add(
@@ -186,14 +186,8 @@ def _entry(options: TrainOptions) -> dict[str, Any]:
     import gymnasium as gym
 
     from sb3_torcs import zoo
-    from sb3_torcs.errors import ZooConfigError, near_miss
 
-    if options.env not in gym.registry:
-        ours = ("Torcs-v0", "TorcsLite-v0")
-        raise ZooConfigError(
-            f"no environment '{options.env}' is registered{near_miss(options.env, ours)} "
-            f"ours: {', '.join(ours)}"
-        )
+    zoo.check_registered(options.env)
     path = zoo.config_file(options.algo, options.conf_file)
     name = options.entry or options.env
     entry = zoo.read_entry(path, name)
@@ -231,7 +225,9 @@ def _write_entry(path: Path, env_id: str, entry: dict[str, Any]) -> Path:
 
 def _zoo_words(options: TrainOptions, wanted: int, env_kwargs: dict[str, Any]) -> list[str]:
     """Compose the zoo's command line, files and folders aside."""
-    eval_freq = options.eval_freq or max(wanted // EVALUATIONS, min(wanted, SHORTEST_EVAL_FREQ))
+    eval_freq = options.eval_freq
+    if eval_freq is None:
+        eval_freq = max(wanted // EVALUATIONS, min(wanted, SHORTEST_EVAL_FREQ))
     words = ["--gym-packages", "sb3_torcs", "--algo", options.algo, "--env", options.env]
     words += ["--n-timesteps", str(wanted), "--seed", str(options.seed)]
     words += ["--eval-freq", str(eval_freq), "--eval-episodes", str(options.eval_episodes)]

@@ -13,7 +13,7 @@ from gymnasium import spaces
 
 from sb3_torcs.actions import ACTION_HIGH, ACTION_LOW, controls_from_action
 from sb3_torcs.backends.base import Backend
-from sb3_torcs.car import CONTROL_TICK, CarState, Controls, Start
+from sb3_torcs.car import CONTROL_TICK, CarState, Controls, Start, is_count, is_number
 from sb3_torcs.errors import EnvClosed, InvalidOption
 from sb3_torcs.rewards import Reward
 from sb3_torcs.sensors import OBSERVATION_HIGH, OBSERVATION_LOW, encode
@@ -36,6 +36,7 @@ RANDOM_TRACK_POSITION = 0.6  # [-]
 RANDOM_HEADING_ERROR = 0.25  # [rad]
 RANDOM_SPEED = 40.0  # [m/s]
 STARTS = ("grid", "random")
+MAX_START_SPEED = 150.0  # [m/s] what the observation of the speed can say
 RESET_OPTIONS = ("distance", "track_position", "heading_error", "speed")
 
 
@@ -78,17 +79,17 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         laps: int | None = None,
         render_mode: str | None = None,
     ) -> None:
-        if not isinstance(action_repeat, int) or action_repeat < 1:
+        if not is_count(action_repeat):
             raise InvalidOption(f"action_repeat is {action_repeat!r}; expected a whole number >= 1")
-        if laps is not None and (not isinstance(laps, int) or laps < 1):
+        if laps is not None and not is_count(laps):
             raise InvalidOption(f"laps is {laps!r}; expected a whole number >= 1, or None")
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise InvalidOption(
                 f"render_mode is {render_mode!r}; expected None, 'rgb_array' or 'human'"
             )
         self.backend = backend
-        self.action_repeat = action_repeat
-        self.laps = laps
+        self.action_repeat = int(action_repeat)
+        self.laps = None if laps is None else int(laps)
         self.render_mode = render_mode
         self.metadata = {
             **self.metadata,
@@ -265,15 +266,21 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
                 raise InvalidOption(
                     f"unknown reset option {name!r}; allowed: {', '.join(RESET_OPTIONS)}"
                 )
-            if not isinstance(value, (int, float)) or not math.isfinite(value):
+            if not is_number(value):
                 raise InvalidOption(f"reset option {name} is {value!r}; expected a number")
         values = {name: float(options.get(name, 0.0)) for name in RESET_OPTIONS}
         if abs(values["track_position"]) > 1.0:
             raise InvalidOption(
                 f"track_position is {values['track_position']:g}; expected -1 (right edge) to 1"
             )
-        if values["speed"] < 0.0:
-            raise InvalidOption(f"speed is {values['speed']:g} m/s; expected 0 or more")
+        if not 0.0 <= values["speed"] <= MAX_START_SPEED:
+            raise InvalidOption(
+                f"speed is {values['speed']:g} m/s; expected 0 to {MAX_START_SPEED:g}"
+            )
+        if abs(values["heading_error"]) > math.pi:
+            raise InvalidOption(
+                f"heading_error is {values['heading_error']:g} rad; expected -pi to pi"
+            )
         return Start(
             values["distance"] % self.backend.track.length,
             values["track_position"],
