@@ -17,7 +17,7 @@ def test_the_environments_are_measured_in_the_same_run(monkeypatch):
     monkeypatch.setattr(bench, "RACETRACK_STEPS_PER_TURN", 2)
     figures = bench.environments(0.0001)
     assert list(figures) == ["lite_ticks_per_s", "racetrack_v1_steps_per_s"]
-    assert figures["lite_ticks_per_s"] > figures["racetrack_v1_steps_per_s"] > 0.0
+    assert min(figures.values()) > 0.0
 
 
 def test_the_measured_actions_keep_the_car_moving(monkeypatch):

@@ -403,10 +403,3 @@ def test_the_measurement_gives_three_rates(kernel):
     assert rates["policy_updates_per_s"] > 0
     assert rates["policy_plain_updates_per_s"] > 0
     assert (th.get_num_threads(), setting()) == (threads, "none")
-
-
-@pytest.mark.slow
-def test_the_policy_is_faster_than_the_plain_one():
-    """1.4 times is the aim on an idle machine; the test allows for a busy one."""
-    rates = measure(batch_size=64, seconds=6.0)
-    assert rates["policy_updates_per_s"] > 1.2 * rates["policy_plain_updates_per_s"]
