@@ -27,7 +27,7 @@ from sb3_torcs.models import find_model, load_driver, saved_steps
 
 ALGO, ENV, TRACK = "ddpg", "TorcsLite-v0", "aalborg"
 LAPS = 3  # the best of these is shown
-EVALUATIONS = 20  # of a whole training
+EVALUATIONS = 40  # of a whole training
 
 STATE, LOG, RUNS = "demo.json", "training.log", "runs"
 MODEL, LAST_MODEL, TENSORBOARD = "model.zip", "last_model.zip", "tensorboard"

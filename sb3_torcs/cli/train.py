@@ -19,7 +19,7 @@ from sb3_torcs.cli.common import natural, positive, writable_folder
 
 __all__ = ["Run", "TrainOptions", "add_parser", "run", "train", "train_run"]
 
-EVALUATIONS = 20  # of a whole training, unless --eval-freq says otherwise
+EVALUATIONS = 40  # of a whole training, unless --eval-freq says otherwise
 SHORTEST_EVAL_FREQ = 1000  # decisions
 
 PROGRESS = "sb3_torcs.progress.RacingProgressCallback"
@@ -46,7 +46,7 @@ class TrainOptions:
     :param seed: of everything
     :param folder: gets ``ALGO/ENV_1``, ``ALGO/ENV_2``, ...
     :param tensorboard: its log folder; ``None`` is ``FOLDER/tensorboard``
-    :param eval_freq: decisions between evaluations; ``None`` is a twentieth of the
+    :param eval_freq: decisions between evaluations; ``None`` is a fortieth of the
         training, and at least 1000 where it has as many
     :param eval_episodes: per evaluation
     :param resume: a saved model (.zip) or a run's folder to go on from
@@ -113,7 +113,7 @@ def add_parser(subparsers: Any) -> None:
         "--eval-freq",
         type=int,
         metavar="N",
-        help="decisions between evaluations; default: a twentieth",
+        help="decisions between evaluations; default: a fortieth",
     )
     add("--eval-episodes", type=positive, default=1, metavar="N", help="per evaluation; default: 1")
     add("--resume", metavar="MODEL", help="go on from a saved model (.zip) or a run's folder")
