@@ -328,7 +328,7 @@ def test_the_words_for_the_zoo_say_what_was_asked():
     asked = TrainOptions(eval_episodes=2, seed=7)
     words = train._zoo_words(asked, 100000, {"track": "aalborg", "start": "random", "laps": 2})
     pairs = dict(itertools.pairwise(words))
-    assert (pairs["--seed"], pairs["--eval-freq"], pairs["--eval-episodes"]) == ("7", "5000", "2")
+    assert (pairs["--seed"], pairs["--eval-freq"], pairs["--eval-episodes"]) == ("7", "2500", "2")
     assert (pairs["--num-threads"], pairs["--device"]) == ("1", "cpu")
     assert words[words.index("--eval-env-kwargs") + 1 :] == ["track:'aalborg'", "laps:2"]
 
