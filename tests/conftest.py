@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-# The first optimizer imports this, and with it triton, whose library crashed the interpreter when it
-# was loaded last, in one order of tests in a hundred. First it does no harm.
+# The first optimizer imports this, and with it triton, whose library crashed the interpreter in
+# some orders of tests, when it was loaded after everything else. Loaded first it does no harm.
 import torch._dynamo  # noqa: F401
 
 from sb3_torcs.car import CONTROL_TICK, CarState
