@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 __all__ = [
     "CONTROL_TICK",
+    "MAX_DAMAGE",
     "CarState",
     "Controls",
     "FloatArray",
@@ -26,6 +27,10 @@ FloatArray = npt.NDArray[np.float64]
 
 CONTROL_TICK = 0.02
 """[s] The interval at which TORCS calls its robots; one decision lasts a whole number of them."""
+
+
+MAX_DAMAGE = 10000.0
+"""[points] At which TORCS takes a car out of the race; its drag has doubled by then."""
 
 
 def is_number(value: Any) -> bool:

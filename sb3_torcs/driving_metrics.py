@@ -21,6 +21,7 @@ from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.logger import Image, Logger, TensorBoardOutputFormat
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_torcs.actions import ACTUATORS
 from sb3_torcs.car import CarState
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.tracks import Track
@@ -52,7 +53,6 @@ default for the first is a tuple: hence the empty list. An empty ``best_lap_time
 """
 
 ENDS = ("off_track", "backwards", "stuck", "damage", "laps", "time_limit")
-ACTUATORS = ("steering", "throttle", "brake")
 
 BRAKING = 0.05  # [-] of the pedal's way; less is a network's idea of nothing
 SATURATED = 0.01  # [-] of an actuator's range: nearer to a limit than this counts as at it

@@ -19,6 +19,7 @@ from gymnasium import spaces
 from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
+from sb3_torcs.actions import ACTION_HIGH, ACTION_LOW
 from sb3_torcs.car import FloatArray
 from sb3_torcs.errors import InvalidOption, NoiseNotBound
 
@@ -33,8 +34,7 @@ __all__ = [
     "noises_of",
 ]
 
-LOW = np.array([-1.0, 0.0, 0.0])  # [-] steering, throttle, brake
-HIGH = np.array([1.0, 1.0, 1.0])  # [-]
+LOW, HIGH = np.array(ACTION_LOW), np.array(ACTION_HIGH)  # [-] steering, throttle, brake
 GAIN = 2.0 / (HIGH - LOW)  # [-] SB3's scaled action per environment unit
 
 BRAKE = 2  # index of the actuator

@@ -87,9 +87,6 @@ WING_LIFT = 4.0  # downforce per drag of a wing
 GROUND_EFFECT = 1.5  # simuv2's 2 exp(-3 h⁴) at the car's usual ride height
 LIFT_FRONT, LIFT_REAR = 0.69 * GROUND_EFFECT, 0.70 * GROUND_EFFECT
 
-# Damage
-MAX_DAMAGE = 10000.0  # [points] TORCS takes the car out of the race
-
 
 @njit(cache=True)
 def engine_torque(engine_speed: float, throttle: float) -> float:

@@ -18,7 +18,7 @@ from sb3_torcs.actions import automatic_gear
 from sb3_torcs.backends import lite_car as car
 from sb3_torcs.backends.lite_rays import cast
 from sb3_torcs.backends.lite_road import ground, project, road_width, walls, wrap
-from sb3_torcs.car import CONTROL_TICK, CarState
+from sb3_torcs.car import CONTROL_TICK, MAX_DAMAGE, CarState
 from sb3_torcs.car import FloatArray as Floats
 
 SUBSTEPS = 10  # physics steps per control tick, as in TORCS
@@ -167,7 +167,7 @@ def _air(vx: float, vy: float, damage: float) -> tuple[float, float, float]:
     front = car.LIFT_FRONT * pressure * straight + car.WING_LIFT * car.WING_FRONT * wings
     rear = car.LIFT_REAR * pressure * straight + car.WING_LIFT * car.WING_REAR * wings
     wing_drag = (car.WING_FRONT + car.WING_REAR) * wings
-    worn = 1.0 + damage / car.MAX_DAMAGE
+    worn = 1.0 + damage / MAX_DAMAGE
     return (math.copysign(car.DRAG * pressure, vx) + wing_drag) * worn, front, rear
 
 

@@ -13,7 +13,7 @@ from gymnasium import spaces
 
 from sb3_torcs.actions import ACTION_HIGH, ACTION_LOW, controls_from_action
 from sb3_torcs.backends.base import Backend
-from sb3_torcs.car import CONTROL_TICK, CarState, Controls, Start, is_count, is_number
+from sb3_torcs.car import CONTROL_TICK, MAX_DAMAGE, CarState, Controls, Start, is_count, is_number
 from sb3_torcs.errors import EnvClosed, InvalidOption
 from sb3_torcs.rewards import Reward
 from sb3_torcs.sensors import OBSERVATION_HIGH, OBSERVATION_LOW, encode
@@ -27,7 +27,6 @@ STUCK_SPEED = 5.0 / 3.6  # [m/s] along the road; slower than walking counts as s
 STUCK_TICKS = 75  # control ticks of standing that end an episode: 1.5 s
 GRACE_TICKS = 150  # 3 s to get going after a standing start
 BACKWARDS_ANGLE = 0.5 * math.pi  # [rad] to the road from which the car faces backwards
-MAX_DAMAGE = 10000.0  # [points] at which TORCS takes a car out of the race
 
 # A random start: anywhere on the track, near the axis, roughly along it, at any moderate speed; but
 # one in ten on the grid, since an agent that never stood still does not know how to set off.
