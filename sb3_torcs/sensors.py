@@ -7,11 +7,14 @@ encoder, the documentation and the policy's view of the observation are all deri
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from operator import attrgetter
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from numba import literal_unroll, njit, types
+from numba.extending import overload
 
 from sb3_torcs.car import CarState, FloatArray
 from sb3_torcs.errors import InvalidOption
@@ -83,10 +86,52 @@ def feature_slices() -> dict[str, slice]:
     return slices
 
 
-_SLICES = tuple(
-    (sensor.name, where.start if sensor.size == 1 else where)
-    for sensor, where in zip(SENSORS, feature_slices().values(), strict=True)
-)
+_measure = attrgetter(*(sensor.name for sensor in SENSORS))
+_SIZES = tuple(sensor.size for sensor in SENSORS)
+
+
+def _numbers(value: Any) -> Any:
+    """What a sensor measures, to iterate over."""
+    return value if isinstance(value, np.ndarray) else (value,)
+
+
+@overload(_numbers)
+def _compiled_numbers(value: Any) -> Callable[[Any], Any]:
+    """The same in compiled code, which chooses by type before it runs."""
+
+    def several(value: Any) -> Any:
+        return value
+
+    def one(value: Any) -> Any:
+        return (value,)
+
+    return several if isinstance(value, types.Array) else one
+
+
+@njit(cache=True)
+def _scale(values: tuple[float | FloatArray, ...], observation: npt.NDArray[np.float32]) -> int:
+    """
+    Scale and clip. Compiled, since operations on small arrays cost more than what they compute.
+
+    :param values: one number or array per row of the table
+    :param observation: (29,) filled
+    :return: how many rows have the size that the table says, up to the first that has not
+    """
+    row = i = 0
+    for value in literal_unroll(values):
+        numbers = _numbers(value)
+        if len(numbers) != _SIZES[row]:
+            return row
+        row += 1
+        for number in numbers:
+            scaled = number * _SCALE[i]
+            if scaled <= _LOW[i]:
+                scaled = _LOW[i]
+            elif scaled >= _HIGH[i]:
+                scaled = _HIGH[i]
+            observation[i] = scaled
+            i += 1
+    return row
 
 
 def encode(car: CarState) -> npt.NDArray[np.float32]:
@@ -95,14 +140,14 @@ def encode(car: CarState) -> npt.NDArray[np.float32]:
 
     :param car: any state
     :return: (29,) numbers within ``OBSERVATION_LOW`` and ``OBSERVATION_HIGH``
+    :raises ValueError: if a sensor has not the size that the table says
     """
-    values = np.empty(OBSERVATION_SIZE)
-    for name, where in _SLICES:
-        values[where] = getattr(car, name)
-    values *= _SCALE
-    np.maximum(values, _LOW, out=values)
-    np.minimum(values, _HIGH, out=values)
-    return values.astype(np.float32)
+    observation = np.empty(OBSERVATION_SIZE, np.float32)
+    done = _scale(_measure(car), observation)
+    if done < len(SENSORS):
+        name, size = SENSORS[done].name, SENSORS[done].size
+        raise ValueError(f"{name} has {np.size(getattr(car, name))} numbers, expected {size}")
+    return observation
 
 
 def sensor_table() -> str:

@@ -42,6 +42,57 @@ def test_a_known_car_gives_known_numbers():
     np.testing.assert_allclose(encode(car), np.array(expected, np.float32), rtol=1e-7)
 
 
+def plainly(car):
+    """Encode sensor by sensor, as the table's docstring says it."""
+    columns = [
+        np.clip(np.asarray(getattr(car, s.name)) * s.scale, s.low * s.scale, s.high * s.scale)
+        for s in SENSORS
+    ]
+    return np.hstack(columns).astype(np.float32)
+
+
+def test_the_compiled_encoder_equals_the_plain_one_to_the_bit():
+    rng = np.random.default_rng(0)
+    for spread in (1.0, 1.0, 30.0, 1000.0):
+        for _ in range(100):
+            car = car_state(
+                heading_error=rng.normal(0.0, spread),
+                range_finders=rng.normal(50.0, spread, 19),
+                distance_from_axis=rng.normal(0.0, spread),
+                speed_x=rng.normal(20.0, spread),
+                speed_y=rng.normal(0.0, spread),
+                speed_z=rng.normal(0.0, spread),
+                wheel_speeds=rng.normal(60.0, spread, 4),
+                engine_speed=rng.normal(500.0, spread),
+            )
+            assert encode(car).tobytes() == plainly(car).tobytes(), car
+
+
+def test_an_observation_is_a_new_array_each_time():
+    car = car_state()
+    first = encode(car)
+    assert first.dtype == np.float32
+    assert first.flags.writeable
+    assert not np.shares_memory(first, encode(car))
+
+
+def test_nan_is_not_hidden_by_clipping():
+    observation = encode(car_state(speed_x=math.nan, wheel_speeds=np.full(4, math.nan)))
+    assert np.flatnonzero(np.isnan(observation)).tolist() == [21, 24, 25, 26, 27]
+
+
+def test_whole_numbers_and_single_precision_are_numbers_too():
+    car = car_state(speed_x=30, range_finders=np.arange(19), wheel_speeds=np.ones(4, np.float32))
+    assert encode(car).tobytes() == plainly(car).tobytes()
+
+
+@pytest.mark.parametrize(("name", "size"), [("range_finders", 18), ("wheel_speeds", 5)])
+def test_a_sensor_of_another_size_is_refused(name, size):
+    """The compiled encoder would otherwise write beside the observation."""
+    with pytest.raises(ValueError, match=f"{name} has {size} numbers, expected"):
+        encode(car_state(**{name: np.zeros(size)}))
+
+
 def test_what_lies_outside_the_bounds_is_clipped_to_them():
     wild = encode(car_state(speed_x=1e6, speed_y=-1e6, distance_from_axis=1e6))
     assert np.all(wild >= OBSERVATION_LOW)

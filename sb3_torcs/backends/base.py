@@ -17,7 +17,13 @@ __all__ = ["Backend"]
 
 
 class Backend(Protocol):
-    """One car in one world."""
+    """
+    One car in one world.
+
+    A world may also have a method ``encode(car)`` that does for the state which it has just
+    returned what :func:`sb3_torcs.sensors.encode` does for any, to the bit, but faster: then the
+    environment calls that.
+    """
 
     track: Track
     """The track of the present episode."""

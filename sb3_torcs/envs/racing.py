@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, TypedDict
 
 import gymnasium as gym
@@ -87,6 +87,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
                 f"render_mode is {render_mode!r}; expected None, 'rgb_array' or 'human'"
             )
         self.backend = backend
+        self._encode: Callable[[CarState], Observation] = getattr(backend, "encode", encode)
         self.action_repeat = int(action_repeat)
         self.laps = None if laps is None else int(laps)
         self.render_mode = render_mode
@@ -159,7 +160,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         self._standing = 0
         if self.render_mode == "human":
             self.render()
-        return encode(self.car), dict(self._info(self.car, {}, None))
+        return self._encode(self.car), self._info(self.car, {}, None)
 
     def step(
         self, action: npt.NDArray[np.float32]
@@ -175,17 +176,19 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
             when = "close" if self._closed else "reset"
             remedy = "make a new environment" if self._closed else "call reset first"
             raise EnvClosed(f"step {'after' if self._closed else 'before'} {when}; {remedy}")
-        before, self._controls = self.car, controls_from_action(action)
-        self.car = after = self.backend.step(self._controls, self.action_repeat)
+        before = self.car
+        self._controls = controls = controls_from_action(action)
+        self.car = after = self.backend.step(controls, self.action_repeat)
         end = self._end(after)
-        terms = self._reward(before, after, self._controls, end)
+        terms = self._reward(before, after, controls, end)
         info = self._info(after, terms, end)
         if after.laps > before.laps:
             info["lap_time"] = after.last_lap_time
         if self.render_mode == "human":
             self.render()
-        terminated = end is not None and end != "laps"
-        return encode(after), sum(terms.values()), terminated, end == "laps", dict(info)
+        truncated = end == "laps"
+        terminated = end is not None and not truncated
+        return self._encode(after), sum(terms.values()), terminated, truncated, info
 
     def render(self) -> npt.NDArray[np.uint8] | None:
         """
@@ -233,17 +236,18 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         self._standing += self.action_repeat
         return "stuck" if self._standing > self._patience else None
 
-    def _info(self, car: CarState, terms: dict[str, float], end: str | None) -> RacingInfo:
-        return RacingInfo(
-            laps=car.laps,
-            best_lap_time=car.best_lap_time or None,
-            distance=car.distance_raced,
-            off_track=car.off_track,
-            damage=car.damage,
-            reward_terms=terms,
-            car=car,
-            end=end,
-        )
+    def _info(self, car: CarState, terms: dict[str, float], end: str | None) -> dict[str, Any]:
+        info: RacingInfo = {
+            "laps": car.laps,
+            "best_lap_time": car.best_lap_time or None,
+            "distance": car.distance_raced,
+            "off_track": car.off_track,
+            "damage": car.damage,
+            "reward_terms": terms,
+            "car": car,
+            "end": end,
+        }
+        return info  # type: ignore[return-value]  # Gymnasium says dict, and it is one
 
     def _draw_start(self) -> Start | None:
         if self._start == "grid":

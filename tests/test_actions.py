@@ -1,0 +1,76 @@
+"""Actions: what an agent may hand over, and what the car is told."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from sb3_torcs.actions import controls_from_action
+from sb3_torcs.car import Controls
+from sb3_torcs.errors import InvalidAction
+
+
+@pytest.mark.parametrize(
+    "action",
+    [
+        np.array([0.5, 0.25, 0.0], np.float32),
+        np.array([0.5, 0.25, 0.0], np.float64),
+        np.array([0.5, 0.25, 0.0], np.float16),
+        np.array([0.5, 0.25, 0.0], np.longdouble),
+        np.array([0.5, 0.25, 0.0], object),
+        np.array([[0.5, 9.0], [0.25, 9.0], [0.0, 9.0]])[:, 0],
+        [0.5, 0.25, 0],
+        (np.float32(0.5), 0.25, 0),
+    ],
+    ids=lambda action: f"{type(action).__name__}-{getattr(action, 'dtype', '')}",
+)
+def test_three_numbers_of_any_kind_are_an_action(action):
+    controls = controls_from_action(action)
+    assert controls == Controls(0.5, 0.25, 0.0)
+    assert type(controls) is Controls
+    assert controls.gear is None
+    assert [type(value) for value in controls[:3]] == [float] * 3
+
+
+def test_whole_numbers_become_floats():
+    """The compiled worlds would be compiled anew for them."""
+    controls = controls_from_action(np.array([-1, 1, 0]))
+    assert [type(value) for value in controls[:3]] == [float] * 3
+
+
+@pytest.mark.parametrize(
+    ("action", "controls"),
+    [
+        ([9.0, 5.0, -3.0], Controls(1.0, 1.0, 0.0)),
+        ([-9.0, -5.0, 3.0], Controls(-1.0, 0.0, 1.0)),
+        ([math.inf, math.inf, -math.inf], Controls(1.0, 1.0, 0.0)),
+        ([1.0000001, 1.0, 1.0], Controls(1.0, 1.0, 1.0)),
+    ],
+)
+def test_what_lies_outside_is_clipped(action, controls):
+    assert controls_from_action(np.array(action)) == controls
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64, object])
+@pytest.mark.parametrize(("place", "name"), [*enumerate(["steering", "throttle", "brake"])])
+def test_nan_is_refused_by_name(place, name, dtype):
+    action = np.zeros(3, dtype)
+    action[place] = math.nan
+    with pytest.raises(InvalidAction, match=f"{name} is nan, expected a number in its range"):
+        controls_from_action(action)
+
+
+@pytest.mark.parametrize(
+    "action", [np.zeros(2), np.zeros((1, 3)), np.float32(0.0), [], [0.0] * 4, None, 3]
+)
+def test_another_shape_is_refused(action):
+    with pytest.raises(InvalidAction, match=r"expected \(3,\): steering, throttle, brake"):
+        controls_from_action(action)
+
+
+@pytest.mark.parametrize("action", [["a", "b", "c"], [None] * 3, np.array(["a", "b", "c"])])
+def test_what_is_no_number_is_refused(action):
+    with pytest.raises(InvalidAction, match="expected three numbers: steering, throttle, brake"):
+        controls_from_action(action)
