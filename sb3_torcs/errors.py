@@ -10,16 +10,28 @@ from collections.abc import Iterable
 
 __all__ = [
     "BackendUnavailable",
+    "CarFileError",
+    "EngineBusy",
+    "EngineForked",
     "EnvClosed",
+    "GameFailed",
+    "GameIncomplete",
+    "GameNotFound",
+    "GameTimeout",
+    "InstallFailed",
     "InvalidAction",
     "InvalidOption",
+    "LayoutMismatch",
     "ModelMismatch",
     "NoiseNotBound",
     "OutputNotWritable",
+    "RobotUnavailable",
     "Sb3TorcsError",
     "TrackFileError",
     "TrackNotFound",
+    "UnknownCar",
     "UnknownRewardTerm",
+    "UnknownRobot",
     "ZooConfigError",
 ]
 
@@ -54,6 +66,54 @@ class EnvClosed(Sb3TorcsError, RuntimeError):
 
 class BackendUnavailable(Sb3TorcsError, RuntimeError):
     """The simulator behind an environment is not installed."""
+
+
+class GameNotFound(BackendUnavailable):
+    """TORCS is installed nowhere."""
+
+
+class GameIncomplete(BackendUnavailable):
+    """TORCS is installed in part: the message names what is missing or broken."""
+
+
+class LayoutMismatch(BackendUnavailable):
+    """The installed game lays out its data otherwise than the version that is known."""
+
+
+class RobotUnavailable(BackendUnavailable):
+    """A robot's module does not load, or its set-up does not fit its car."""
+
+
+class EngineBusy(Sb3TorcsError, RuntimeError):
+    """Two threads drive one engine."""
+
+
+class EngineForked(Sb3TorcsError, RuntimeError):
+    """An engine is used in a child process that was forked after it was made."""
+
+
+class GameFailed(Sb3TorcsError, RuntimeError):
+    """The game ran and ended without results; the message holds its last words."""
+
+
+class GameTimeout(Sb3TorcsError, TimeoutError):
+    """The game did not come to an end in the time it was given."""
+
+
+class InstallFailed(Sb3TorcsError, RuntimeError):
+    """TORCS cannot be installed here; the message says why and what to do."""
+
+
+class UnknownCar(Sb3TorcsError, LookupError):
+    """The installed game has no car of this name."""
+
+
+class CarFileError(Sb3TorcsError, ValueError):
+    """A car's file cannot be read, or describes no car that can drive."""
+
+
+class UnknownRobot(Sb3TorcsError, LookupError):
+    """The installed game has no robot of this name, or none with this index."""
 
 
 class ModelMismatch(Sb3TorcsError, ValueError):

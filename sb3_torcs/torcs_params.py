@@ -12,7 +12,7 @@ from pathlib import Path
 from xml.parsers import expat
 
 from sb3_torcs.errors import TrackFileError
-from sb3_torcs.tracks import torcs_folders
+from sb3_torcs.game import torcs_folders
 
 __all__ = ["Section", "read_params"]
 
@@ -171,7 +171,7 @@ class _Parser:
         raise self._fail(
             f"needs the file data/tracks/{SHARED_SURFACES} of TORCS, which is in none of "
             f"{', '.join(str(candidate.parent) for candidate in candidates)}; copy it beside the "
-            "track, install TORCS (`sudo apt install torcs-data`), or set SB3_TORCS_HOME"
+            "track, install TORCS (`sb3-torcs install-torcs`), or set SB3_TORCS_HOME"
         )
 
     def _start(self, tag: str, attributes: dict[str, str]) -> None:

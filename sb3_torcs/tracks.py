@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import math
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -19,6 +19,7 @@ import numpy as np
 
 from sb3_torcs.car import FloatArray
 from sb3_torcs.errors import InvalidOption, TrackFileError, TrackNotFound, near_miss
+from sb3_torcs.game import torcs_folders, track_files
 
 __all__ = [
     "Grid",
@@ -383,32 +384,15 @@ def available_tracks() -> list[TrackSummary]:
     )
 
 
-def torcs_folders() -> list[Path]:
-    """Return the folders of installed TORCS data that exist, the preferred one first."""
-    home = os.environ.get("SB3_TORCS_HOME")
-    roots = [Path(home).expanduser()] if home else []
-    roots += [Path("/usr"), Path("/usr/local"), Path.home() / ".local"]
-    inside = ("", "share/games/torcs", "usr/share/games/torcs", "share/torcs")
-    folders = [root / part for root in roots for part in inside]
-    return [folder for folder in folders if (folder / "tracks").is_dir()]
-
-
 def _known_files() -> dict[str, tuple[Path, str]]:
     """Map ``category/name`` to file and source: bundled tracks first, then the installed ones."""
     files: dict[str, tuple[Path, str]] = {}
     for path in sorted(BUNDLED_FOLDER.glob(f"*/*{TRACK_SUFFIX}")):
         files[f"{path.parent.name}/{path.stem}"] = (path, "bundled")
-    for path in _installed_files():
-        files.setdefault(f"{path.parent.parent.name}/{path.stem}", (path, "torcs"))
-    return files
-
-
-def _installed_files() -> Iterator[Path]:
-    """Yield the track files ``category/name/name.xml`` of the preferred installed TORCS."""
     for folder in torcs_folders()[:1]:
-        for path in sorted((folder / "tracks").glob("*/*/*.xml")):
-            if path.stem == path.parent.name:
-                yield path
+        for name, path in track_files(folder).items():
+            files.setdefault(name, (path, "torcs"))
+    return files
 
 
 def _read(path: Path, source: str) -> Track:

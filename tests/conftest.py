@@ -12,6 +12,8 @@ import pytest
 import torch._dynamo  # noqa: F401
 
 from sb3_torcs.car import CONTROL_TICK, CarState
+from sb3_torcs.errors import BackendUnavailable
+from sb3_torcs.game import find_game
 from sb3_torcs.tracks import Grid, Segment, Surface, Track
 
 ASPHALT = Surface("asphalt", 1.2, 0.001, 0.5, 10.0)
@@ -24,6 +26,15 @@ def segment(length, curvature=0.0, width=10.0, side=5.0):
     return Segment(
         length, curvature, width, width, side, side, side, side, ASPHALT, GRASS, GRASS, WALL, WALL
     )
+
+
+@pytest.fixture(scope="session")
+def game():
+    """The installed game. Tests that need it fail without it: a skip would hide a failure."""
+    try:
+        return find_game()
+    except BackendUnavailable as error:
+        pytest.fail(f"this test needs the game: {error}")
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ import pytest
 from sb3_torcs import torcs_params
 from sb3_torcs.errors import TrackFileError
 from sb3_torcs.track_xml import read_track_xml
-from sb3_torcs.tracks import BUNDLED_FOLDER, closed, closing_gap, load_track, torcs_folders
+from sb3_torcs.tracks import BUNDLED_FOLDER, closed, closing_gap, load_track
 
 HEAD = """<?xml version="1.0" encoding="UTF-8"?>
 <!DOCTYPE params SYSTEM "params.dtd" [
@@ -254,12 +254,6 @@ class TestErrors:
             read(text)
 
 
-INSTALLED = [
-    path
-    for folder in torcs_folders()[:1]
-    for path in sorted((folder / "tracks").glob("*/*/*.xml"))
-    if path.stem == path.parent.name
-]
 KNOWN_LENGTHS = {  # [m] as the game prints them
     "aalborg": 2587.54,
     "alpine-1": 6355.65,
@@ -272,11 +266,10 @@ KNOWN_LENGTHS = {  # [m] as the game prints them
 }
 
 
-@pytest.mark.skipif(not INSTALLED, reason="no TORCS is installed; SB3_TORCS_HOME names its folder")
 class TestInstalledTracks:
-    def test_all_of_them_load_and_close(self):
-        assert len(INSTALLED) >= 38
-        for path in INSTALLED:
+    def test_all_of_them_load_and_close(self, game):
+        assert len(game.tracks()) >= 38
+        for path in game.tracks().values():
             laid = read_track_xml(path)
             track = load_track(path)
             gap = closing_gap(laid.segments)
@@ -286,16 +279,16 @@ class TestInstalledTracks:
             assert track.length == pytest.approx(laid.length, rel=1e-5), path.stem
             assert track.category == path.parent.parent.name
 
-    def test_lengths_are_those_of_the_game(self):
-        for path in INSTALLED:
+    def test_lengths_are_those_of_the_game(self, game):
+        for path in game.tracks().values():
             if path.stem in KNOWN_LENGTHS:
                 # The game adds up in single precision; its own sum is a centimetre off.
                 expected = pytest.approx(KNOWN_LENGTHS[path.stem], abs=0.02)
                 assert read_track_xml(path).length == expected, path.stem
 
-    def test_the_bundled_tracks_are_these_to_the_last_bit(self):
+    def test_the_bundled_tracks_are_these_to_the_last_bit(self, game):
         bundled = {path.stem: path for path in BUNDLED_FOLDER.glob("*/*.csv")}
-        for path in INSTALLED:
+        for path in game.tracks().values():
             if path.stem in bundled:
                 laid = read_track_xml(path)
                 track = load_track(bundled[path.stem])

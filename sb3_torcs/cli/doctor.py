@@ -6,6 +6,7 @@ import argparse
 import importlib
 import importlib.metadata
 import os
+import shutil
 import sys
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -13,7 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from sb3_torcs.cli.common import print_json, quiet_output
-from sb3_torcs.errors import Sb3TorcsError
+from sb3_torcs.errors import BackendUnavailable, Sb3TorcsError
+from sb3_torcs.game import find_game, linker_knows
 
 __all__ = ["Check", "add_parser", "checks", "run"]
 
@@ -31,6 +33,12 @@ PACKAGES = {
     "torch": "torch",
 }
 """Distributions, and what is imported of them."""
+
+EXTENSION = "sb3_torcs._engine"
+BUILD = "make native (in a clone), or: pip install --force-reinstall --no-deps sb3-torcs"
+COMPILERS = ("c++", "g++", "clang++")
+DEFAULT_CAR = "car1-trb1"
+REINSTALL = "sudo apt-get install --reinstall torcs torcs-data"
 
 
 @dataclass(frozen=True)
@@ -85,8 +93,14 @@ def checks() -> list[Check]:
     :return: one result per thing
     """
     results = [_python(), *(_package(name, module) for name, module in PACKAGES.items())]
-    others = (_compile_cache, _tracks, _video, _lite, _torcs_data, _torcs)
-    return results + [_guarded(check) for check in others]
+    lite = (_compile_cache, _bundled_tracks, _video_encoder, _torcslite)
+    results += [_guarded(check) for check in (*lite, _compiler, _extension)]
+    game = _guarded(_game)
+    results.append(game)
+    for look in (_tracks, _cars, _layout):
+        missing = Check(look.__name__.strip("_"), False, "there is no game to look at", game.fix)
+        results.append(_guarded(look) if game.ok else missing)
+    return results + [_guarded(check) for check in (_torcs, _text_mode, _window)]
 
 
 def _guarded(check: Callable[[], Check]) -> Check:
@@ -94,9 +108,22 @@ def _guarded(check: Callable[[], Check]) -> Check:
     name = check.__name__.strip("_").replace("_", " ")
     try:
         return check()
+    except BackendUnavailable as error:
+        return Check(name, False, *_found_and_fix(error))
     except Exception as error:
         fix = "pip install --force-reinstall sb3-torcs"
         return Check(name, False, f"{type(error).__name__}: {error}", fix)
+
+
+def _found_and_fix(error: Sb3TorcsError) -> tuple[str, str]:
+    """
+    Split a message into what was found and what to do.
+
+    :param error: whose message ends in what to type
+    """
+    found, _, remedy = str(error).rpartition("; ")
+    typed = remedy.removeprefix("type: ")
+    return found, typed if typed == remedy else typed.strip("`")
 
 
 def _python() -> Check:
@@ -129,7 +156,7 @@ def _compile_cache() -> Check:
     return Check("compile cache", False, f"{folder} is not writable", fix)
 
 
-def _tracks() -> Check:
+def _bundled_tracks() -> Check:
     from sb3_torcs.tracks import available_tracks
 
     names = [track.name for track in available_tracks() if track.source == "bundled"]
@@ -137,7 +164,7 @@ def _tracks() -> Check:
     return Check("bundled tracks", bool(names), ", ".join(names) or "none", fix)
 
 
-def _video() -> Check:
+def _video_encoder() -> Check:
     try:
         import imageio_ffmpeg  # type: ignore[import-untyped]
 
@@ -146,7 +173,7 @@ def _video() -> Check:
         return Check("video encoder", False, str(error), "pip install 'imageio[ffmpeg]'")
 
 
-def _lite() -> Check:
+def _torcslite() -> Check:
     """Drive one decision."""
     import gymnasium as gym
 
@@ -157,14 +184,65 @@ def _lite() -> Check:
     return Check("TorcsLite-v0", True, "drives", None)
 
 
-def _torcs_data() -> Check:
-    from sb3_torcs.tracks import torcs_folders
+def _compiler() -> Check:
+    """Look for what builds the extension: once that is there, nobody misses the compiler."""
+    named = os.environ.get("CXX")
+    compilers = (named,) if named else COMPILERS
+    path = next((found for name in compilers if (found := shutil.which(name))), None)
+    if path is not None:
+        return Check("compiler", True, path, None)
+    found = f"none of {', '.join(compilers)}"
+    if _extension().ok:
+        return Check("compiler", True, f"{found}; the extension is built already", None)
+    return Check("compiler", False, found, "sudo apt install g++")
 
-    folders = torcs_folders()
-    if folders:
-        return Check("TORCS data", True, str(folders[0]), None)
-    found = "not installed; only Torcs-v0 needs it, TorcsLite-v0 does not"
-    return Check("TORCS data", False, found, "sudo apt install torcs-data")
+
+def _extension() -> Check:
+    try:
+        module = importlib.import_module(EXTENSION)
+    except ModuleNotFoundError:
+        return Check("extension", False, f"{EXTENSION} is not built", BUILD)
+    except ImportError as error:
+        return Check("extension", False, f"{EXTENSION} does not load: {error}", BUILD)
+    return Check("extension", True, str(module.__file__), None)
+
+
+def _game() -> Check:
+    game = find_game()
+    return Check("game", True, f"{game.data}, {game.libraries}", None)
+
+
+def _tracks() -> Check:
+    """Read the game's own tracks, every one."""
+    from sb3_torcs.tracks import load_track
+
+    tracks = find_game().tracks()
+    try:
+        for path in tracks.values():
+            load_track(path)
+    except Sb3TorcsError as error:
+        return Check("tracks", False, str(error), REINSTALL)
+    categories = [name.partition("/")[0] for name in tracks]
+    counts = [f"{categories.count(kind)} {kind}" for kind in sorted(set(categories))]
+    return Check("tracks", True, f"{len(tracks)}: {', '.join(counts)}", None)
+
+
+def _cars() -> Check:
+    cars = find_game().cars()
+    if DEFAULT_CAR in cars:
+        return Check("cars", True, f"{len(cars)}, {DEFAULT_CAR} among them", None)
+    return Check("cars", False, f"{len(cars)}, no {DEFAULT_CAR}", REINSTALL)
+
+
+def _layout() -> Check:
+    """Compare the game's structures with those that the extension knows."""
+    game = find_game()
+    extension = _extension()
+    if not extension.ok:
+        return Check("layout", False, "not compared: the extension is missing", extension.fix)
+    from sb3_torcs.backends.native import check_layout
+
+    return Check("layout", True, check_layout(game), None)
 
 
 def _torcs() -> Check:
@@ -175,6 +253,32 @@ def _torcs() -> Check:
         env.reset(seed=0)
         env.close()
     except Sb3TorcsError as error:
-        found, _, fix = str(error).partition("; ")
+        found, fix = _found_and_fix(error)
         return Check("Torcs-v0", False, found, fix or "use TorcsLite-v0")
     return Check("Torcs-v0", True, "drives", None)
+
+
+def _text_mode() -> Check:
+    """See whether the game's own program runs: only comparisons with it need that."""
+    from sb3_torcs.text_mode import missing_libraries
+
+    purpose = "only `sb3-torcs robots --game` needs it"
+    try:
+        game = find_game()
+    except BackendUnavailable:
+        return Check("text mode", True, f"no game; {purpose}", None)
+    if game.program is None:
+        return Check("text mode", True, f"no torcs-bin in {game.libraries}; {purpose}", None)
+    missing = missing_libraries(game)
+    if missing:
+        found = f"{game.program} would not find {', '.join(missing)}; {purpose}"
+        return Check("text mode", True, found, None)
+    return Check("text mode", True, str(game.program), None)
+
+
+def _window() -> Check:
+    """Look for OpenGL and a display: only the game's own window needs them."""
+    library = "libGL.so.1" if linker_knows("libGL.so.1") else "no libGL.so.1 (libgl1)"
+    display = os.environ.get("DISPLAY")
+    where = f"display {display}" if display else "no display"
+    return Check("window", True, f"{library}, {where}; only the game's own window needs them", None)
