@@ -1,0 +1,50 @@
+"""What comes out of a drive of robots, whoever held the clock: the game or the engine."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+__all__ = ["Lap", "RobotResult"]
+
+
+@dataclass(frozen=True)
+class Lap:
+    """
+    A lap that was driven to its end.
+
+    :param time: that it took [s]; the first one counts from the start signal
+    :param damage: of the car at its end, in all since the start [-]
+    """
+
+    time: float
+    damage: int
+
+
+@dataclass(frozen=True)
+class RobotResult:
+    """
+    What one robot did.
+
+    :param robot: name of the module
+    :param index: of the driver
+    :param car: that it drove
+    :param laps: one by one; empty where the game keeps only sums, in a race by its text mode
+    :param total_time: from the start signal to the end of the last whole lap, penalties included
+        [s]; 0 without one
+    :param rank: at the end, 1 for the winner
+    :param damage: at the end of a race, and at the end of the last whole lap of a practice [-]
+    :param out: whether it was out of the race before the end: wrecked, or out of fuel
+    :param laps_completed: number of whole laps
+    :param best_lap: of those that count by the rules: no wall touched, no corner cut [s]
+    """
+
+    robot: str
+    index: int
+    car: str
+    laps: list[Lap]
+    total_time: float
+    rank: int
+    damage: int
+    out: bool
+    laps_completed: int = field(default=0)
+    best_lap: float | None = field(default=None)
