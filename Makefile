@@ -3,6 +3,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+BUILT := $(VENV)/.built
+SOURCES := setup.py $(wildcard sb3_torcs/native/*)
 SHELL := /bin/bash
 
 # One thread per process: on few cores torch's own threads get in each other's way.
@@ -16,7 +18,7 @@ help: ## show the verbs
 
 install: $(STAMP) ## put everything into .venv/
 
-$(STAMP): setup.cfg pyproject.toml
+$(STAMP): setup.cfg pyproject.toml setup.py
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || \
 	  { echo "Python is $$($(PYTHON) --version 2>&1), 3.10 or newer is needed; try: make PYTHON=python3.12 $(MAKECMDGOALS)"; exit 1; }
 	@test -x $(BIN)/pip || $(PYTHON) -m venv $(VENV) || \
@@ -28,11 +30,33 @@ $(STAMP): setup.cfg pyproject.toml
 demo: install ## train on TorcsLite-v0 and film the best lap (15 minutes; Ctrl-C keeps what was learned)
 	$(BIN)/python examples/demo.py $(DEMO_ARGS)
 
-test: install ## run every test
+native: $(BUILT) ## build the engine in place, and fail if that cannot be done
+
+# Without this verb a machine that has no compiler installs everything but the engine.
+$(BUILT): $(STAMP) $(SOURCES)
+	SB3_TORCS_REQUIRE_NATIVE=1 $(BIN)/python -m pip install --verbose --no-deps --editable .
+	@touch $@
+
+game: install ## get TORCS, if it is not here
+	$(BIN)/sb3-torcs install-torcs
+
+# A skipped test hides a missing engine: here it has to be built.
+test pytest sanitize: export SB3_TORCS_REQUIRE_NATIVE = 1
+
+test: native game ## run every test
 	$(BIN)/python -m pytest -n 2 --durations=10
 
-pytest: install ## run the tests that do not train
+pytest: native game ## run the tests that do not train
 	$(BIN)/python -m pytest -n 2 -m 'not slow'
+
+# Python itself leaks by design and is built without the sanitizers: they are loaded before it.
+sanitize: install game ## run the engine's tests under AddressSanitizer and UBSan
+	@rm -f $(BUILT)
+	SB3_TORCS_SANITIZE=1 $(BIN)/python -m pip install --verbose --no-deps --editable .
+	LD_PRELOAD="$$($${CXX:-c++} -print-file-name=libasan.so)" \
+	  ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=halt_on_error=1:print_stacktrace=1 \
+	  $(BIN)/python -m pytest -p no:xdist tests/test_native*.py
+	@echo "the engine is built with the sanitizers now; type: make native"
 
 bench: install ## measure speeds
 	$(BIN)/sb3-torcs bench
@@ -59,4 +83,4 @@ ci: check-codestyle lint type test ## everything
 clean: ## remove .venv/ and what was built; trainings stay
 	rm -rf build dist *.egg-info $(VENV)
 
-.PHONY: help install demo test pytest bench format check-codestyle lint type commit-checks ci clean
+.PHONY: help install native game demo test pytest sanitize bench format check-codestyle lint type commit-checks ci clean

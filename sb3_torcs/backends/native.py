@@ -1,0 +1,264 @@
+"""The real TORCS behind an environment: its physics, tracks, cars and robots, in this process."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sb3_torcs.car import CarState, Controls, FloatArray, Start, is_count
+from sb3_torcs.errors import BackendUnavailable, InvalidOption
+from sb3_torcs.game import Game, find_game
+from sb3_torcs.sensors import range_finder_angles
+from sb3_torcs.tracks import Track, load_track
+
+if TYPE_CHECKING:
+    from sb3_torcs._engine import Engine
+
+__all__ = ["AGENT", "NativeBackend", "check_layout", "make_engine", "parse_robot", "step_all"]
+
+AGENT = ("", 0)
+"""The agent's entry in a starting list; robots have a name and an index."""
+
+PRACTICE = "practice"
+RACE = "quickrace"
+SESSIONS = {"practice": PRACTICE, "race": RACE}
+
+BUILD = "make native (in a clone), or: pip install --force-reinstall --no-deps sb3-torcs"
+MIN_SHIFT = 1.0  # [m] between the game's frame and the track's, from which positions are moved
+
+
+def make_engine(
+    game: Game,
+    track: str | os.PathLike[str],
+    entries: Sequence[tuple[str, int]],
+    *,
+    car: str = "car1-trb1",
+    session: str = "practice",
+    laps: int = 0,
+    angles: FloatArray | None = None,
+) -> Engine:
+    """
+    Load a race of the real game.
+
+    :param game: the installation
+    :param track: ``"aalborg"``, ``"road/aalborg"``, or the path of an XML file
+    :param entries: the starting list: robots' names and indices, and :data:`AGENT` at most once
+    :param car: the agent's
+    :param session: whose rules and grid count, ``"practice"`` or ``"race"``
+    :param laps: of the race; 0 drives on
+    :param angles: (19,) of the range finders [rad], left negative
+    :return: the engine, not yet started
+    :raises BackendUnavailable: if the extension or the game is missing, or not as expected
+    :raises TrackNotFound: if there is no such track
+    :raises TrackFileError: if the track's file is broken
+    :raises UnknownCar: if there is no such car
+    :raises CarFileError: if the car's file is broken
+    :raises UnknownRobot: if there is no such robot
+    """
+    native = _extension()
+    if session not in SESSIONS:
+        raise InvalidOption(f"session is {session!r}; expected {' or '.join(SESSIONS)}")
+    game.find_car(car)
+    for name, index in entries:
+        if (name, index) != AGENT:
+            game.find_robot(name, index)
+    path = track_path(game, track)
+    load_track(path)  # a broken file is told here, before the game's own loader stumbles on it
+    engine: Engine = native.Engine(
+        data=str(game.data),
+        libraries=str(game.libraries),
+        plib=str(game.extra_libraries or ""),
+        track=str(path),
+        session=SESSIONS[session],
+        car=car,
+        entries=list(entries),
+        laps=laps,
+        angles=(range_finder_angles("scr") if angles is None else angles).tolist(),
+    )
+    return engine
+
+
+def track_path(game: Game, track: str | os.PathLike[str]) -> Path:
+    """
+    Find a track of the game, or a file of that format.
+
+    :param game: the installation
+    :param track: a name, or the path of an XML file
+    :return: the path of its XML file, absolute
+    """
+    if not isinstance(track, (str, os.PathLike)) or track == "random":
+        raise InvalidOption(
+            f"track is {track!r}; Torcs-v0 takes the name of an installed track (`sb3-torcs "
+            "tracks` lists them) or the path of a TORCS .xml; random tracks are for TorcsLite-v0"
+        )
+    if os.fspath(track).lower().endswith(".xml"):
+        return Path(track).expanduser().absolute()
+    return game.tracks()[game.find_track(os.fspath(track))].absolute()
+
+
+def parse_robot(name: str) -> tuple[str, int]:
+    """
+    Read the name of an opponent.
+
+    :param name: ``"inferno"`` for the one that drives ``car1-trb1``, or ``"inferno:5"``
+    :return: name and index
+    """
+    robot, colon, index = name.partition(":")
+    if colon and not index.isdigit():
+        raise InvalidOption(f"opponent {name!r}: expected NAME or NAME:INDEX, e.g. 'inferno:3'")
+    if colon:
+        return robot, int(index)
+    for entry in find_game().robots().get(robot, ()):
+        if entry.car == "car1-trb1":
+            return robot, entry.index
+    return robot, 0  # whose error says which there are
+
+
+class NativeBackend:
+    """
+    One agent in the real game, alone or among its robots.
+
+    :param track: ``"aalborg"``, ``"road/aalborg"``, or the path of a TORCS XML file
+    :param car: any of the game's
+    :param range_finders: see :func:`sb3_torcs.sensors.range_finder_angles`
+    :param opponents: robots, e.g. ``("inferno", "berniw:3")``
+    :param grid_place: of the agent among them, 1 in front; ``None`` is behind them all
+    :param sensor_noise: whether sensors err as those of the SCR server's ``-noisy``
+    """
+
+    def __init__(
+        self,
+        track: str | Path = "aalborg",
+        *,
+        car: str = "car1-trb1",
+        range_finders: str | Sequence[float] = "scr",
+        opponents: Sequence[str] = (),
+        grid_place: int | None = None,
+        sensor_noise: bool = False,
+    ) -> None:
+        if isinstance(opponents, str):
+            raise InvalidOption(f"opponents is {opponents!r}; expected a list of names")
+        entries = [parse_robot(name) for name in opponents]
+        place = len(entries) + 1 if grid_place is None else grid_place
+        if not is_count(place) or place > len(entries) + 1:
+            raise InvalidOption(
+                f"grid_place is {grid_place!r}; expected 1 to {len(entries) + 1}, or None"
+            )
+        entries.insert(place - 1, AGENT)
+        game = find_game()
+        self.car = car
+        self.range_finder_angles = range_finder_angles(range_finders)
+        self._settings: dict[str, Any] = {
+            "track": track,
+            "car": car,
+            "range_finders": range_finders,
+            "opponents": tuple(opponents),
+            "grid_place": grid_place,
+            "sensor_noise": sensor_noise,
+        }
+        self.engine = make_engine(
+            game,
+            track,
+            entries,
+            car=car,
+            session="race" if opponents else "practice",
+            angles=self.range_finder_angles,
+        )
+        self.track: Track = load_track(track_path(game, track))
+        self._agent = place - 1
+        self._noise = sensor_noise
+        self._align()
+        self._drive: list[Any] = []  # since the reset, so that a copy can follow
+
+    def _align(self) -> None:
+        """Move positions into the track's frame: the game counts one track's origin otherwise."""
+        there = self.engine.track_summary()
+        x, y, _ = self.track.pose(0.0)
+        if abs(x - there["x"]) > MIN_SHIFT or abs(y - there["y"]) > MIN_SHIFT:
+            self.engine.set_origin(x - there["x"], y - there["y"])
+
+    def reset(self, rng: np.random.Generator, start: Start | None) -> CarState:
+        """Begin an episode; see :class:`~sb3_torcs.backends.base.Backend`."""
+        return self._begin(start, int(rng.integers(2**63)) if self._noise else None)
+
+    def _begin(self, start: Start | None, noise: int | None) -> CarState:
+        self._drive = [(start, noise)]
+        self.engine.set_noise(noise)
+        if start is None:
+            self.engine.start()
+        else:
+            self.engine.start_at(*start)
+        return self.engine.read(self._agent)
+
+    def step(self, controls: Controls, ticks: int) -> CarState:
+        """Drive on; see :class:`~sb3_torcs.backends.base.Backend`."""
+        self._drive.append((controls, ticks))
+        return self.engine.step(*controls, ticks)
+
+    def close(self) -> None:
+        """Give the race back to the pool of those that can be loaded again."""
+        self.engine.close()
+
+    def __getstate__(self) -> dict[str, Any]:
+        # A race is full of addresses; but it is also deterministic, so that what was done says all.
+        return {"settings": self._settings, "drive": self._drive}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(**state["settings"])  # type: ignore[misc]
+        if not state["drive"]:
+            return
+        begin, *steps = state["drive"]
+        self._begin(*begin)
+        for controls, ticks in steps:
+            self.step(controls, ticks)
+
+
+def step_all(
+    backends: Sequence[NativeBackend], controls: Sequence[Controls], ticks: int, threads: int
+) -> list[CarState]:
+    """
+    Drive several cars of several races at once.
+
+    :param backends: each begun, and each only once
+    :param controls: for each
+    :param ticks: control ticks of 0.02 s
+    :param threads: that share the work
+    :return: the cars afterwards
+    """
+    for backend, control in zip(backends, controls, strict=True):
+        backend._drive.append((control, ticks))
+    engines = [backend.engine for backend in backends]
+    states: list[CarState] = _extension().step_all(engines, list(controls), ticks, threads)
+    return states
+
+
+@lru_cache
+def check_layout(game: Game) -> str:
+    """
+    Hold the installed game to what the engine expects, with a car standing on a track.
+
+    :param game: the installation
+    :return: what was compared
+    :raises BackendUnavailable: if it is another version, or does not load
+    """
+    name = "road/aalborg" if "road/aalborg" in game.tracks() else min(game.tracks())
+    engine = make_engine(game, name, [AGENT])
+    summary = engine.track_summary()
+    engine.close()
+    return f"as TORCS 1.3.7, by {summary['name']} ({summary['segments']} segments) and car1-trb1"
+
+
+def _extension() -> Any:
+    try:
+        from sb3_torcs import _engine
+    except ImportError as error:
+        raise BackendUnavailable(
+            f"the extension sb3_torcs._engine does not load ({error}); build it with a C++17 "
+            f"compiler: {BUILD}. The same contract without it is gym.make('sb3_torcs:TorcsLite-v0')"
+        ) from error
+    return _engine

@@ -1,0 +1,53 @@
+// The heap of one race: everything its modules allocate lies in one range of memory.
+//
+// This is what makes a race a value. Copying the range (and the modules' global variables) is a
+// snapshot of cars, collision library and robots alike; copying it back continues bit for bit; and
+// closing a race gives back everything, whatever the game's code forgot to free.
+#pragma once
+
+#include <cstddef>
+#include <vector>
+
+namespace torcs {
+
+class Arena {
+public:
+    // Memory is only reserved, and used page by page.
+    explicit Arena(std::size_t reserve);
+    Arena(const Arena&) = delete;
+    Arena& operator=(const Arena&) = delete;
+
+    void* allocate(std::size_t size);
+    void release(void* memory);
+    std::size_t size_of(const void* memory) const;
+    bool owns(const void* memory) const {
+        return memory >= base_ && memory < base_ + reserve_;
+    }
+
+    // Forget everything and give the pages back; what comes next lies where it lay the first time.
+    void clear();
+
+    std::vector<char> save() const;
+    void restore(const std::vector<char>& saved);
+
+private:
+    // In the arena itself, so that a snapshot has it.
+    struct Head {
+        std::size_t used;
+        void* free[64];  // lists of released blocks, by size class
+    };
+    struct Block {
+        std::size_t size_class;
+        void* next_free;  // also keeps what follows aligned to 16 bytes
+    };
+    Head& head() const { return *reinterpret_cast<Head*>(base_); }
+    void reset_head();
+
+    char* base_;
+    std::size_t reserve_;
+};
+
+// Whether some arena owns this address: for memory that is freed when no race is being driven.
+bool in_any_arena(const void* memory);
+
+}  // namespace torcs

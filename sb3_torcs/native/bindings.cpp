@@ -1,0 +1,232 @@
+// The Python module `sb3_torcs._engine`.
+#include <pybind11/numpy.h>
+#include <pybind11/pybind11.h>
+#include <pybind11/stl.h>
+
+#include <cmath>
+#include <thread>
+
+#include "engine.h"
+#include "errors.h"
+
+namespace py = pybind11;
+using namespace py::literals;
+
+namespace torcs {
+
+namespace {
+
+template <std::size_t n>
+py::array_t<double> read_only(const std::array<double, n>& values) {
+    py::array_t<double> array(n, values.data());
+    py::detail::array_proxy(array.ptr())->flags &= ~py::detail::npy_api::NPY_ARRAY_WRITEABLE_;
+    return array;
+}
+
+// Makes the named tuple itself, which is a tuple with a class of its own.
+py::object as_state(const Reading& reading) {
+    static PyTypeObject* type = reinterpret_cast<PyTypeObject*>(
+        py::object(py::module_::import("sb3_torcs.car").attr("CarState")).release().ptr());
+    const auto state = py::reinterpret_steal<py::object>(type->tp_alloc(type, SCALARS + 3));
+    if (!state) throw py::error_already_set();
+    for (int i = 0; i < SCALARS; i++) {
+        const double value = reading.scalars[static_cast<std::size_t>(i)];
+        const bool whole = i == GEAR_SCALAR || i == LAPS_SCALAR || i == POSITION_SCALAR;
+        PyTuple_SET_ITEM(state.ptr(), i,
+                         whole ? PyLong_FromLong(std::lround(value)) : PyFloat_FromDouble(value));
+    }
+    PyTuple_SET_ITEM(state.ptr(), SCALARS, read_only(reading.wheel_speeds).release().ptr());
+    PyTuple_SET_ITEM(state.ptr(), SCALARS + 1, read_only(reading.range_finders).release().ptr());
+    PyTuple_SET_ITEM(state.ptr(), SCALARS + 2, read_only(reading.opponents).release().ptr());
+    return state;
+}
+
+Controls controls_of(double steering, double throttle, double brake, std::optional<int> gear) {
+    if (!std::isfinite(steering) || !std::isfinite(throttle) || !std::isfinite(brake))
+        throw Error("InvalidAction", "steering, throttle and brake are " + std::to_string(steering) +
+                                         ", " + std::to_string(throttle) + ", " +
+                                         std::to_string(brake) + "; expected finite numbers");
+    return {static_cast<float>(steering), static_cast<float>(throttle), static_cast<float>(brake),
+            gear.value_or(AUTOMATIC_GEAR)};
+}
+
+std::array<double, RANGE_FINDERS> angles_of(const std::vector<double>& angles) {
+    if (angles.size() != RANGE_FINDERS)
+        throw Error("InvalidOption", "range finders have " + std::to_string(angles.size()) +
+                                         " angles, expected 19");
+    std::array<double, RANGE_FINDERS> array;
+    std::copy(angles.begin(), angles.end(), array.begin());
+    return array;
+}
+
+// Drive several engines for the same number of ticks, on several threads.
+void drive_all(const std::vector<Engine*>& engines, const std::vector<Controls>& controls,
+               int ticks, int threads, std::vector<Reading>& readings) {
+    std::vector<std::exception_ptr> failures(engines.size());
+    const auto work = [&](std::size_t first, std::size_t step) {
+        for (std::size_t i = first; i < engines.size(); i += step) {
+            try {
+                Engine::Access race(*engines[i]);
+                race->drive(controls[i], ticks);
+                readings[i] = engines[i]->read(*race, race->agent());
+            } catch (...) {
+                failures[i] = std::current_exception();
+            }
+        }
+    };
+    std::vector<std::thread> others;
+    const auto number = static_cast<std::size_t>(std::max(threads, 1));
+    for (std::size_t i = 1; i < number; i++) others.emplace_back(work, i, number);
+    work(0, number);
+    for (std::thread& other : others) other.join();
+    for (const std::exception_ptr& failure : failures)
+        if (failure) std::rethrow_exception(failure);
+}
+
+}  // namespace
+
+PYBIND11_MODULE(_engine, module) {
+    module.doc() = "The real TORCS in this process; use it through sb3_torcs.backends.native.";
+
+    py::register_exception_translator([](std::exception_ptr pointer) {
+        try {
+            if (pointer) std::rethrow_exception(pointer);
+        } catch (const Error& error) {
+            const py::object type = py::module_::import("sb3_torcs.errors").attr(error.python_class);
+            PyErr_SetString(type.ptr(), error.what());
+        }
+    });
+
+    py::class_<Snapshot>(module, "Snapshot", "The whole state of a race at one moment.")
+        .def_property_readonly("size", [](const Snapshot& snapshot) {
+            return snapshot.memory.size();
+        });
+
+    py::class_<Engine>(module, "Engine", "One race of the real game.")
+        .def(py::init([](const std::string& data, const std::string& libraries,
+                         const std::string& plib, const std::string& track,
+                         const std::string& session, const std::string& car,
+                         const std::vector<std::pair<std::string, int>>& entries, int laps,
+                         const std::vector<double>& angles) {
+                 RaceOptions options{track, session, car, {}, laps};
+                 for (const auto& [name, index] : entries) options.entries.push_back({name, index});
+                 py::gil_scoped_release released;
+                 Game& game = Game::open(data, libraries, plib);
+                 return std::make_unique<Engine>(game, std::move(options), angles_of(angles));
+             }),
+             py::kw_only(), "data"_a, "libraries"_a, "plib"_a, "track"_a, "session"_a, "car"_a,
+             "entries"_a, "laps"_a, "angles"_a)
+        .def("start",
+             [](Engine& engine) {
+                 py::gil_scoped_release released;
+                 engine.start();
+             })
+        .def("start_at",
+             [](Engine& engine, double distance, double position, double error, double speed) {
+                 py::gil_scoped_release released;
+                 engine.start(Start{distance, position, error, speed});
+             })
+        .def(
+            "step",
+            [](Engine& engine, double steering, double throttle, double brake,
+               std::optional<int> gear, int ticks) {
+                const Controls controls = controls_of(steering, throttle, brake, gear);
+                Reading reading;
+                {
+                    py::gil_scoped_release released;
+                    Engine::Access race(engine);
+                    race->drive(controls, ticks);
+                    reading = engine.read(*race, race->agent());
+                }
+                return as_state(reading);
+            },
+            "Hold controls for some ticks; returns the agent's car as the fields of CarState.")
+        .def("advance",
+             [](Engine& engine, int ticks) {
+                 py::gil_scoped_release released;
+                 engine.drive(Controls{0.0f, 0.0f, 1.0f, 0}, ticks);
+             })
+        .def("read", [](Engine& engine, int car) { return as_state(engine.read(car)); })
+        .def("set_noise", &Engine::set_noise)
+        .def("set_origin", &Engine::set_origin, "Move the positions that are read by x and y [m].")
+        .def("save", &Engine::save)
+        .def("restore", &Engine::restore)
+        .def("close", &Engine::close)
+        .def("controls",
+             [](Engine& engine, int car) {
+                 const Control& control = Engine::Access(engine)->car(car).control;
+                 return py::make_tuple(control.steering, control.throttle, control.brake,
+                                       control.gear);
+             })
+        .def_property_readonly("agent",
+                               [](Engine& engine) { return Engine::Access(engine)->agent(); })
+        .def_property_readonly("ended",
+                               [](Engine& engine) { return Engine::Access(engine)->ended(); })
+        .def("car_name",
+             [](Engine& engine, int car) {
+                 return std::string(Engine::Access(engine)->car(car).info.car);
+             })
+        .def("laps",
+             [](Engine& engine, int car) {
+                 py::list laps;
+                 for (const LapRecord& lap : Engine::Access(engine)->laps(car))
+                     laps.append(py::make_tuple(lap.time, lap.damage));
+                 return laps;
+             })
+        .def("results",
+             [](Engine& engine) {
+                 py::list results;
+                 for (const Result& result : Engine::Access(engine)->results())
+                     results.append(py::make_tuple(result.entry, result.laps, result.total_time,
+                                                   result.best_lap, result.damage, result.out));
+                 return results;
+             })
+        .def("track_summary",
+             [](Engine& engine) {
+                 const Engine::Access race(engine);
+                 const TrackData& track = race->track();
+                 const Segment& first = *track.last->next;
+                 return py::dict("name"_a = track.name, "length"_a = track.length,
+                                 "width"_a = track.width, "segments"_a = track.segments_number,
+                                 "x"_a = 0.5 * (first.vertex[START_LEFT].x +
+                                                first.vertex[START_RIGHT].x),
+                                 "y"_a = 0.5 * (first.vertex[START_LEFT].y +
+                                                first.vertex[START_RIGHT].y),
+                                 "heading"_a = first.heading);
+             })
+        .def("replay",
+             [](Engine& engine, const py::array_t<double, py::array::c_style>& controls,
+                bool sensors) {
+                 const auto rows = controls.unchecked<2>();
+                 std::vector<Controls> list;
+                 for (py::ssize_t i = 0; i < rows.shape(0); i++)
+                     list.push_back(controls_of(rows(i, 0), rows(i, 1), rows(i, 2), {}));
+                 py::gil_scoped_release released;
+                 engine.replay(list, sensors);
+             })
+        .def("update_physics", [](Engine& engine, int steps) {
+            py::gil_scoped_release released;
+            engine.update_physics(steps);
+        });
+
+    module.def(
+        "step_all",
+        [](const std::vector<Engine*>& engines,
+           const std::vector<std::tuple<double, double, double, std::optional<int>>>& controls,
+           int ticks, int threads) {
+            std::vector<Controls> list;
+            for (const auto& [steering, throttle, brake, gear] : controls)
+                list.push_back(controls_of(steering, throttle, brake, gear));
+            std::vector<Reading> readings(engines.size());
+            {
+                py::gil_scoped_release released;
+                drive_all(engines, list, ticks, threads, readings);
+            }
+            py::list states;
+            for (const Reading& reading : readings) states.append(as_state(reading));
+            return states;
+        },
+        "Step several engines at once, on threads.");
+}
+
+}  // namespace torcs

@@ -1,0 +1,125 @@
+#include "checks.h"
+
+#include <fcntl.h>
+#include <unistd.h>
+
+#include <algorithm>
+#include <cmath>
+#include <cstring>
+
+#include "errors.h"
+
+namespace torcs {
+
+namespace {
+
+// Reads memory that may not be mapped: writing it into a pipe fails politely then.
+class Probe {
+public:
+    Probe() {
+        if (pipe2(ends_, O_CLOEXEC) != 0)
+            throw Error("BackendUnavailable", "no free file descriptor for a pipe");
+    }
+    ~Probe() {
+        close(ends_[0]);
+        close(ends_[1]);
+    }
+    Probe(const Probe&) = delete;
+    Probe& operator=(const Probe&) = delete;
+
+    template <typename T>
+    bool read(const void* address, T& value) const {
+        static_assert(sizeof(T) <= 4096);
+        if (write(ends_[1], address, sizeof(T)) != static_cast<ssize_t>(sizeof(T))) return false;
+        return ::read(ends_[0], static_cast<void*>(&value), sizeof(T)) ==
+               static_cast<ssize_t>(sizeof(T));
+    }
+
+    bool equals(const char* address, const std::string& text) const {
+        for (std::size_t i = 0; i <= text.size(); i++) {
+            char character;
+            if (!read(address + i, character) || character != text.c_str()[i]) return false;
+        }
+        return true;
+    }
+
+private:
+    int ends_[2];
+};
+
+[[noreturn]] void disagree(const std::string& what, const std::string& expected,
+                           const std::string& found) {
+    throw Error("LayoutMismatch",
+                "the installed game does not lay out its data as TORCS 1.3.7 does: " + what +
+                    " is " + found + ", expected " + expected +
+                    "; install that version with: sb3-torcs install-torcs");
+}
+
+void expect(const std::string& what, float expected, float found) {
+    if (!(std::fabs(found - expected) <= 1e-4f * std::max(1.0f, std::fabs(expected))))
+        disagree(what, std::to_string(expected), std::to_string(found));
+}
+
+void expect(const std::string& what, int expected, int found) {
+    if (found != expected) disagree(what, std::to_string(expected), std::to_string(found));
+}
+
+}  // namespace
+
+void check_track(const TrackData* track, const Params& file, const std::string& path) {
+    const Probe probe;
+    TrackData data;
+    if (!probe.read(track, data)) disagree("the track", "a record of 248 bytes", "not there");
+    const std::string name = file.text("Header", "name", "no name");
+    if (!probe.equals(data.name, name)) disagree("the track's name", name, "something else");
+    expect("the track's width", file.number("Main Track", "width", 15.0f), data.width);
+    expect("the track's version", static_cast<int>(file.number("Header", "version", 0.0f)),
+           data.version);
+    if (data.segments_number < 1 || !data.last)
+        throw Error("TrackFileError", path + " has no segments the game can read");
+    const Segment* address = data.last;
+    float length = 0.0f;
+    for (int i = 0; i < data.segments_number; i++) {
+        Segment segment, next;
+        if (!probe.read(address, segment) || !probe.read(segment.next, next) ||
+            next.prev != address || segment.type < RIGHT_TURN || segment.type > STRAIGHT)
+            disagree("segment " + std::to_string(i) + " of the track", "one of a ring",
+                     "none of that layout");
+        address = segment.next;
+        length += next.length;
+        if (!(std::isfinite(next.length) && next.length > 0.0f))
+            throw Error("TrackFileError", path + " has a segment that is " +
+                                              std::to_string(next.length) + " m long");
+    }
+    if (address != data.last)
+        disagree("the number of segments", "that of the ring", std::to_string(data.segments_number));
+    if (!(std::fabs(length - data.length) <= 1e-3f * length))
+        disagree("the track's length", std::to_string(length), std::to_string(data.length));
+}
+
+void check_simulation(const SimulatedCar* simulated, const CarElement* cars, int number) {
+    const Probe probe;
+    for (int i = 0; i < number; i++) {
+        const CarElement& car = cars[i];
+        SimulatedCar own;
+        if (!probe.read(simulated + i, own) || own.element != &car || own.control != &car.control)
+            disagree("the simulation's car", "a record of 3472 bytes", "none of that layout");
+        expect("its x", own.global.pos.x, car.pub.global.pos.x);
+        expect("its yaw", own.local.pos.az, car.pub.local.pos.az);
+        expect("its engine speed", own.engine_speed, car.priv.engine_speed);
+        expect("its fuel", own.fuel, car.priv.fuel);
+        expect("its gear", own.gear, car.priv.gear);
+        expect("its damage", own.damage, car.priv.damage);
+        for (int wheel = FRONT_RIGHT; wheel <= REAR_LEFT; wheel++) {
+            expect("a wheel's speed", own.wheel[wheel].spin, car.priv.wheel[wheel].spin);
+            const float radius = own.wheel[wheel].radius;
+            if (!(radius > 0.05f && radius < 1.0f))
+                disagree("a wheel's radius", "0.05 to 1 m", std::to_string(radius));
+        }
+        if (!(car.priv.fuel > 0.0f) || car.priv.gears_number < 3 ||
+            car.priv.gears_number > MAX_GEARS || !(car.priv.red_line > 100.0f))
+            disagree("a car's gearbox or engine", "fuel, 1 to 8 gears, a limiter", "none");
+    }
+}
+
+}  // namespace torcs

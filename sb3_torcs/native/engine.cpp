@@ -1,0 +1,141 @@
+#include "engine.h"
+
+#include <pthread.h>
+
+#include <cmath>
+
+#include "errors.h"
+
+namespace torcs {
+
+namespace {
+
+int forks = 0;
+
+int count_forks() {
+    static const int watching = pthread_atfork(nullptr, nullptr, [] { forks++; });
+    (void)watching;
+    return forks;
+}
+
+double wrapped(double angle) { return std::remainder(angle, 2.0 * M_PI); }
+
+}  // namespace
+
+Engine::Engine(Game& game, RaceOptions options, std::array<double, RANGE_FINDERS> angles)
+    : race_(std::make_unique<Race>(game, std::move(options))),
+      angles_(angles),
+      forks_(count_forks()) {}
+
+Engine::Access::Access(Engine& engine) : engine_(engine) {
+    if (engine.busy_.exchange(true, std::memory_order_acquire))
+        throw Error("EngineBusy",
+                    "another thread is driving this engine; make one environment per thread");
+    const char* reason = nullptr;
+    if (engine.forks_ != forks)
+        reason = "this engine belongs to the parent process; make the environment after the fork";
+    else if (!engine.race_)
+        reason = "this engine is closed; make a new environment";
+    if (reason) {
+        const bool closed = engine.forks_ == forks;
+        engine.busy_.store(false, std::memory_order_release);
+        throw Error(closed ? "EnvClosed" : "EngineForked", reason);
+    }
+}
+
+void Engine::start() { Access(*this)->start(); }
+
+void Engine::start(const Start& start) { Access(*this)->start(start); }
+
+void Engine::drive(const Controls& controls, int ticks) { Access(*this)->drive(controls, ticks); }
+
+void Engine::set_noise(std::optional<std::uint64_t> seed) {
+    Access race(*this);
+    noise_.reset();
+    if (seed) noise_.emplace(*seed);
+}
+
+void Engine::set_origin(double x, double y) {
+    Access race(*this);
+    x_ = x;
+    y_ = y;
+}
+
+Snapshot Engine::save() { return Access(*this)->save(); }
+
+void Engine::restore(const Snapshot& snapshot) {
+    Access race(*this);
+    if (snapshot.race != &*race)
+        throw Error("InvalidOption",
+                    "the snapshot was saved by another engine; restore it where it was saved");
+    race->restore(snapshot);
+}
+
+void Engine::close() {
+    if (!race_ || forks_ != forks) return;
+    Access race(*this);
+    race_.reset();
+}
+
+Reading Engine::read(int car) {
+    Access race(*this);
+    if (car < 0 || car >= race->cars_number())
+        throw Error("InvalidOption", "car is " + std::to_string(car) + "; expected 0 to " +
+                                         std::to_string(race->cars_number() - 1));
+    return read(*race, car);
+}
+
+Reading Engine::read(Race& race, int index) {
+    const CarElement& car = race.car(index);
+    const Motion& motion = car.pub.local;
+    const TrackPosition& position = car.pub.track;
+    const double length = race.track().length;
+    double from_start = std::fmod(distance_from_start(car), length);
+    if (from_start < 0.0) from_start += length;
+    if (from_start >= length) from_start = 0.0;
+    Reading reading;
+    reading.scalars = {
+        race.situation().time,
+        motion.pos.x + x_,
+        motion.pos.y + y_,
+        wrapped(motion.pos.az),
+        motion.vel.az,
+        motion.vel.x,
+        motion.vel.y,
+        motion.vel.z,
+        race.height(index),
+        heading_error(car),
+        position.to_middle,
+        position.segment->width,
+        from_start,
+        race.distance_raced(index),
+        car.priv.engine_speed,
+        static_cast<double>(car.priv.gear),
+        car.priv.fuel,
+        static_cast<double>(car.priv.damage),
+        static_cast<double>(std::max(car.race.crossings - 1, 0)),
+        car.race.lap_time,
+        car.race.last_lap_time,
+        car.race.best_lap_time,
+        static_cast<double>(car.race.position),
+    };
+    for (std::size_t i = 0; i < 4; i++) reading.wheel_speeds[i] = car.priv.wheel[i].spin;
+    range_finders(car, angles_.data(), reading.range_finders.data());
+    opponents(car, race.cars(), race.cars_number(), reading.opponents.data());
+    if (noise_) add_noise(*noise_, reading.range_finders.data(), reading.opponents.data());
+    return reading;
+}
+
+void Engine::replay(const std::vector<Controls>& controls, bool sensors) {
+    Access race(*this);
+    double sum = 0.0;
+    for (const Controls& control : controls) {
+        race->drive(control, 1);
+        if (sensors) sum += read(*race, race->agent()).range_finders[0];
+    }
+    if (!std::isfinite(sum)) throw Error("BackendUnavailable", "a sensor read no number");
+}
+
+void Engine::update_physics(int steps) { Access(*this)->update_physics(steps); }
+
+}  // namespace torcs

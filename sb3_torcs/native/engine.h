@@ -1,0 +1,71 @@
+// A race as Python holds it: guarded against what a language with threads and forks can do.
+#pragma once
+
+#include <array>
+#include <atomic>
+#include <memory>
+#include <optional>
+#include <vector>
+
+#include "race.h"
+#include "sensors.h"
+
+namespace torcs {
+
+// A car at one moment; the order of `scalars` is that of sb3_torcs.car.CarState.
+constexpr int SCALARS = 23;
+constexpr int GEAR_SCALAR = 15;
+constexpr int LAPS_SCALAR = 18;
+constexpr int POSITION_SCALAR = 22;
+
+struct Reading {
+    std::array<double, SCALARS> scalars;
+    std::array<double, 4> wheel_speeds;
+    std::array<double, RANGE_FINDERS> range_finders;
+    std::array<double, OPPONENT_SECTORS> opponents;
+};
+
+class Engine {
+public:
+    Engine(Game& game, RaceOptions options, std::array<double, RANGE_FINDERS> angles);
+
+    void start();
+    void start(const Start& start);
+    void drive(const Controls& controls, int ticks);
+    Reading read(int car);
+    void set_noise(std::optional<std::uint64_t> seed);
+    void set_origin(double x, double y);  // added to positions that are read
+    Snapshot save();
+    void restore(const Snapshot& snapshot);
+    void close();
+
+    // Drives what a list of controls says, one tick each, with or without sensors; for measuring.
+    void replay(const std::vector<Controls>& controls, bool sensors);
+    void update_physics(int steps);
+
+    // Checks, and then gives access for as long as it lives.
+    class Access {
+    public:
+        explicit Access(Engine& engine);
+        ~Access() { engine_.busy_.store(false, std::memory_order_release); }
+        Access(const Access&) = delete;
+        Access& operator=(const Access&) = delete;
+        Race* operator->() const { return engine_.race_.get(); }
+        Race& operator*() const { return *engine_.race_; }
+
+    private:
+        Engine& engine_;
+    };
+
+    Reading read(Race& race, int car);
+
+private:
+    std::unique_ptr<Race> race_;
+    std::array<double, RANGE_FINDERS> angles_;
+    std::optional<Generator> noise_;
+    double x_ = 0.0, y_ = 0.0;
+    std::atomic<bool> busy_{false};
+    int forks_;  // of the process when the engine was made
+};
+
+}  // namespace torcs

@@ -1,0 +1,15 @@
+#pragma once
+
+#include <stdexcept>
+#include <string>
+
+namespace torcs {
+
+// Becomes the exception of that name in sb3_torcs.errors.
+struct Error : std::runtime_error {
+    Error(const char* python_class, const std::string& message)
+        : std::runtime_error(message), python_class(python_class) {}
+    const char* python_class;
+};
+
+}  // namespace torcs

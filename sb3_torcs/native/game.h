@@ -1,0 +1,85 @@
+// The installed game: its shared libraries, opened once per process, and its parameter files.
+#pragma once
+
+#include <memory>
+#include <mutex>
+#include <string>
+
+#include "layout.h"
+#include "library.h"
+
+namespace torcs {
+
+class Params;
+
+class Game {
+public:
+    // `libraries` holds lib/, modules/ and drivers/; `plib` is where its PLIB lies if the system's
+    // loader does not find it, else empty. One game per process.
+    static Game& open(const std::string& data, const std::string& libraries,
+                      const std::string& plib);
+
+    const std::string data;       // each ends in a slash
+    const std::string libraries;
+
+    // Parameter files are one list for all races.
+    std::recursive_mutex mutex;
+
+    std::unique_ptr<Library> take_module(const std::string& kind, const std::string& name) const {
+        return Library::take(libraries + kind + "/" + name + ".so", libraries + "lib/");
+    }
+
+    // Of librobottools.
+    Segment* (*segment_under)(TrackPosition*);
+    float (*road_height)(TrackPosition*);
+    float (*segment_width)(Segment*, float to_start);
+    void (*to_global)(TrackPosition*, float* x, float* y, int against);
+    void (*init_pit_setup)(void* params, void* setup, bool limits_only);
+
+private:
+    Game(const std::string& data, const std::string& libraries, const std::string& plib);
+    friend class Params;
+
+    void* (*read_file_)(const char*, int);
+    void (*release_)(void*);
+    void* (*merge_)(void*, void*, int);
+    int (*check_)(void*, void*);
+    const char* (*text_)(void*, const char*, const char*, const char*);
+    float (*number_)(void*, const char*, const char*, const char*, float);
+};
+
+// One parameter file, or several merged.
+class Params {
+public:
+    static Params read(Game& game, const std::string& path);  // empty if it cannot be read
+    // A handle that belongs to somebody else.
+    static Params view(Game& game, void* handle) { return {game, handle, false}; }
+    // Takes the handle over.
+    Params(Game& game, void* handle) : Params(game, handle, true) {}
+    Params(Params&& other) noexcept
+        : game_(other.game_), handle_(other.handle_), owned_(other.owned_) {
+        other.handle_ = nullptr;
+    }
+    Params& operator=(Params&& other) noexcept;
+    ~Params();
+
+    explicit operator bool() const { return handle_ != nullptr; }
+    void* handle() const { return handle_; }
+    void* release();  // whoever calls it owns the handle
+
+    std::string text(const char* section, const char* name, const char* fallback = "") const;
+    float number(const char* section, const char* name, float fallback) const;
+    int misfits(const Params& reference) const;  // values outside the reference's limits
+
+    // Both are consumed; `own` changes what `reference` has and adds to it.
+    static Params merge(Params reference, Params own);
+
+private:
+    Params(Game& game, void* handle, bool owned) : game_(&game), handle_(handle), owned_(owned) {}
+
+    Game* game_;
+    void* handle_;
+    bool owned_;
+};
+
+}  // namespace torcs

@@ -1,0 +1,466 @@
+#include "library.h"
+
+#include <dlfcn.h>
+#include <elf.h>
+#include <link.h>
+#include <locale.h>
+#include <sys/mman.h>
+#include <unistd.h>
+
+#include <cerrno>
+#include <cstdarg>
+#include <cstdint>
+#include <cstdio>
+#include <cstdlib>
+#include <cstring>
+#include <fstream>
+#include <map>
+#include <mutex>
+#include <new>
+#include <unordered_map>
+
+#include "arena.h"
+#include "errors.h"
+
+namespace torcs {
+
+// glibc's rand() is its random(), which a process begins with seed 1.
+struct Random {
+    random_data state;
+    char words[128];
+};
+
+namespace {
+
+thread_local Host* current = nullptr;
+thread_local char message[512];
+
+// ---- What the modules' imports become ------------------------------------------------------------
+
+void* allocate(std::size_t size) { return current ? current->arena->allocate(size) : malloc(size); }
+
+void release(void* memory) {
+    if (!memory) return;
+    if (current && current->arena->owns(memory))
+        current->arena->release(memory);
+    else if (!in_any_arena(memory))
+        free(memory);
+}
+
+void* allocate_zeroed(std::size_t number, std::size_t size) {
+    if (!current) return calloc(number, size);
+    void* memory = allocate(number * size);
+    return std::memset(memory, 0, number * size);
+}
+
+void* reallocate(void* memory, std::size_t size) {
+    if (!memory) return allocate(size);
+    if (!current || !current->arena->owns(memory)) return realloc(memory, size);
+    const std::size_t had = current->arena->size_of(memory);
+    if (size <= had) return memory;
+    void* larger = std::memcpy(allocate(size), memory, had);
+    release(memory);
+    return larger;
+}
+
+char* duplicate(const char* text) {
+    const std::size_t size = std::strlen(text) + 1;
+    return static_cast<char*>(std::memcpy(allocate(size), text, size));
+}
+
+int random_number() {
+    std::int32_t number = 0;
+    if (!current) return rand();
+    random_r(&current->random->state, &number);
+    return number;
+}
+
+void seed_random(unsigned seed) {
+    if (current) srandom_r(seed, &current->random->state);
+}
+
+// One robot ends its planning by the clock; without one it plans to the end on every machine.
+long no_time_passes() { return 0; }
+
+// Robots' names for files are relative to the game's data; what they learn is not kept, since a
+// second run would then not equal the first.
+FILE* open_file(const char* path, const char* mode) {
+    if (std::strpbrk(mode, "wa+")) return fopen("/dev/null", mode);
+    if (path[0] == '/' || !current) return fopen(path, mode);
+    return fopen((current->data + path).c_str(), mode);
+}
+
+int make_directory(const char*, unsigned) {
+    errno = EROFS;
+    return -1;
+}
+
+int keep_message(const char* format, va_list arguments) {
+    char line[sizeof message];
+    const int length = vsnprintf(line, sizeof line, format, arguments);
+    if (length > 0 && line[0] != '\n') std::memcpy(message, line, sizeof line);
+    return length;
+}
+
+int print(const char* format, ...) {
+    va_list arguments;
+    va_start(arguments, format);
+    const int length = keep_message(format, arguments);
+    va_end(arguments);
+    return length;
+}
+
+int print_checked(int, const char* format, ...) {
+    va_list arguments;
+    va_start(arguments, format);
+    const int length = keep_message(format, arguments);
+    va_end(arguments);
+    return length;
+}
+
+int print_list(const char* format, va_list arguments) { return keep_message(format, arguments); }
+
+int print_list_checked(FILE*, int, const char* format, va_list arguments) {
+    return keep_message(format, arguments);
+}
+
+int print_list_to(FILE*, const char* format, va_list arguments) {
+    return keep_message(format, arguments);
+}
+
+int print_to(FILE*, const char* format, ...) {
+    va_list arguments;
+    va_start(arguments, format);
+    const int length = keep_message(format, arguments);
+    va_end(arguments);
+    return length;
+}
+
+int print_to_checked(FILE*, int, const char* format, ...) {
+    va_list arguments;
+    va_start(arguments, format);
+    const int length = keep_message(format, arguments);
+    va_end(arguments);
+    return length;
+}
+
+int print_line(const char* text) { return print("%s", text); }
+int print_character(int character) { return character; }
+void print_error(const char* text) { print("%s: %s", text, strerror(errno)); }
+
+[[noreturn]] void leave(int) {
+    throw Error("BackendUnavailable", "the game gave up: " + last_message());
+}
+
+[[noreturn]] void leave_by_abort() { leave(1); }
+
+[[noreturn]] void fail_assertion(const char* expression, const char* file, unsigned line,
+                                 const char*) {
+    print("%s:%u: %s does not hold", file, line, expression);
+    leave(1);
+}
+
+template <typename Function>
+void* address(Function function) {
+    return reinterpret_cast<void*>(function);
+}
+
+const std::unordered_map<std::string, void*>& replacements() {
+    static const auto* table = new std::unordered_map<std::string, void*>{
+        {"malloc", address(allocate)},
+        {"calloc", address(allocate_zeroed)},
+        {"realloc", address(reallocate)},
+        {"free", address(release)},
+        {"strdup", address(duplicate)},
+        {"_Znwm", address(allocate)},
+        {"_Znam", address(allocate)},
+        {"_ZdlPv", address(release)},
+        {"_ZdlPvm", address(release)},
+        {"_ZdaPv", address(release)},
+        {"_ZdaPvm", address(release)},
+        {"rand", address(random_number)},
+        {"srand", address(seed_random)},
+        {"clock", address(no_time_passes)},
+        {"fopen", address(open_file)},
+        {"mkdir", address(make_directory)},
+        {"printf", address(print)},
+        {"__printf_chk", address(print_checked)},
+        {"vprintf", address(print_list)},
+        {"vfprintf", address(print_list_to)},
+        {"__vfprintf_chk", address(print_list_checked)},
+        {"fprintf", address(print_to)},
+        {"__fprintf_chk", address(print_to_checked)},
+        {"puts", address(print_line)},
+        {"putchar", address(print_character)},
+        {"perror", address(print_error)},
+        {"exit", address(leave)},
+        {"abort", address(leave_by_abort)},
+        {"__assert_fail", address(fail_assertion)},
+    };
+    return *table;
+}
+
+// ---- Loading -------------------------------------------------------------------------------------
+
+std::string loader_message() {
+    const char* text = dlerror();
+    return text ? text : "unknown reason";
+}
+
+// A module may need one of the game's own libraries, by a name that only the game's wrapper script
+// lets the loader find. Those are loaded with global symbols already; the copy forgets the need.
+void forget_needs(std::vector<char>& bytes, const std::string& folder) {
+    const auto at = [&bytes](std::size_t offset, std::size_t size) -> char* {
+        return offset + size <= bytes.size() ? bytes.data() + offset : nullptr;
+    };
+    const auto* header = reinterpret_cast<ElfW(Ehdr)*>(at(0, sizeof(ElfW(Ehdr))));
+    if (!header || std::memcmp(header->e_ident, ELFMAG, SELFMAG) != 0) return;
+    const auto* parts = reinterpret_cast<ElfW(Phdr)*>(
+        at(header->e_phoff, header->e_phnum * sizeof(ElfW(Phdr))));
+    if (!parts) return;
+    ElfW(Dyn)* first = nullptr;
+    std::size_t number = 0;
+    for (int i = 0; i < header->e_phnum; i++) {
+        if (parts[i].p_type != PT_DYNAMIC) continue;
+        first = reinterpret_cast<ElfW(Dyn)*>(at(parts[i].p_offset, parts[i].p_filesz));
+        number = parts[i].p_filesz / sizeof(ElfW(Dyn));
+    }
+    if (!first) return;
+    ElfW(Addr) names = 0;
+    for (std::size_t i = 0; i < number; i++)
+        if (first[i].d_tag == DT_STRTAB) names = first[i].d_un.d_ptr;
+    for (int i = 0; i < header->e_phnum; i++) {
+        const ElfW(Phdr)& part = parts[i];
+        if (part.p_type != PT_LOAD || names < part.p_vaddr ||
+            names >= part.p_vaddr + part.p_filesz)
+            continue;
+        const std::size_t begin = names - part.p_vaddr + part.p_offset;
+        for (std::size_t j = 0; j < number && first[j].d_tag != DT_NULL; j++) {
+            const char* name = at(begin + first[j].d_un.d_val, 1);
+            if (first[j].d_tag == DT_NEEDED && name && access((folder + name).c_str(), F_OK) == 0)
+                first[j].d_tag = DT_DEBUG;  // says nothing in a library
+        }
+    }
+}
+
+void* open_copy(const std::string& path, const std::string& folder) {
+    std::ifstream file(path, std::ios::binary);
+    std::vector<char> bytes{std::istreambuf_iterator<char>(file), {}};
+    if (!file || bytes.empty())
+        throw Error("GameIncomplete", path + " cannot be read; install the game again with: "
+                                             "sb3-torcs install-torcs");
+    forget_needs(bytes, folder);
+    const int copy = memfd_create("torcs-module", MFD_CLOEXEC);
+    if (copy < 0) throw Error("BackendUnavailable", std::string("memfd_create: ") + strerror(errno));
+    for (std::size_t done = 0; done < bytes.size();) {
+        const ssize_t written = write(copy, bytes.data() + done, bytes.size() - done);
+        if (written < 0) {
+            close(copy);
+            throw Error("BackendUnavailable", "no memory for a copy of " + path);
+        }
+        done += static_cast<std::size_t>(written);
+    }
+    // The descriptor stays open: the loader knows libraries by their names, and a number that was
+    // given out again would name two.
+    const std::string name = "/proc/self/fd/" + std::to_string(copy);
+    void* handle = dlopen(name.c_str(), RTLD_NOW | RTLD_LOCAL);
+    if (!handle) {
+        const std::string reason = loader_message();
+        close(copy);
+        throw Error("BackendUnavailable",
+                    path + " will not load: " + reason + "; reinstall the game with: "
+                                                         "sb3-torcs install-torcs");
+    }
+    return handle;
+}
+
+std::mutex libraries_mutex;
+
+std::map<std::string, std::vector<std::unique_ptr<Library>>>& pool() {
+    static auto* libraries = new std::map<std::string, std::vector<std::unique_ptr<Library>>>;
+    return *libraries;
+}
+
+std::map<std::string, std::unique_ptr<Library>>& shared_libraries() {
+    static auto* libraries = new std::map<std::string, std::unique_ptr<Library>>;
+    return *libraries;
+}
+
+bool defines(void* handle, void* symbol) {
+    link_map* map = nullptr;
+    Dl_info info;
+    return symbol && dlinfo(handle, RTLD_DI_LINKMAP, &map) == 0 && dladdr(symbol, &info) &&
+           reinterpret_cast<ElfW(Addr)>(info.dli_fbase) == map->l_addr;
+}
+
+// What all races share - parameter files and their parser - outlives each of them, so it keeps the
+// process's own memory.
+bool is_memory(const std::string& import) {
+    return import == "malloc" || import == "calloc" || import == "realloc" || import == "free" ||
+           import == "strdup" || import.compare(0, 4, "_Zna") == 0 ||
+           import.compare(0, 4, "_Znw") == 0 || import.compare(0, 4, "_Zdl") == 0 ||
+           import.compare(0, 4, "_Zda") == 0;
+}
+
+}  // namespace
+
+std::unique_ptr<Library> Library::take(const std::string& path, const std::string& folder) {
+    std::lock_guard<std::mutex> lock(libraries_mutex);
+    auto& spare = pool()[path];
+    if (spare.empty())
+        return std::unique_ptr<Library>(new Library(path, open_copy(path, folder), true));
+    std::unique_ptr<Library> library = std::move(spare.back());
+    spare.pop_back();
+    return library;
+}
+
+void Library::give_back(std::unique_ptr<Library> library) {
+    if (!library) return;
+    library->restore(library->pristine_);
+    std::lock_guard<std::mutex> lock(libraries_mutex);
+    pool()[library->path_].push_back(std::move(library));
+}
+
+Library& Library::shared(const std::string& path, bool race_memory) {
+    std::lock_guard<std::mutex> lock(libraries_mutex);
+    auto& library = shared_libraries()[path];
+    if (!library) {
+        void* handle = dlopen(path.c_str(), RTLD_NOW | RTLD_GLOBAL);
+        if (!handle)
+            throw Error("BackendUnavailable", path + " will not load: " + loader_message() +
+                                                  "; reinstall the game with: sb3-torcs install-torcs");
+        library.reset(new Library(path, handle, race_memory));
+    }
+    return *library;
+}
+
+void* Library::find(const char* symbol) const { return dlsym(handle_, symbol); }
+
+void* Library::require_address(const char* symbol) const {
+    if (void* found = find(symbol)) return found;
+    throw Error("LayoutMismatch", path_ + " has no symbol " + symbol +
+                                      "; expected the libraries of TORCS 1.3.7: install them with "
+                                      "sb3-torcs install-torcs");
+}
+
+Library::Library(std::string path, void* handle, bool race_memory)
+    : path_(std::move(path)), handle_(handle) {
+    redirect_imports(race_memory);
+    link_map* map = nullptr;
+    dlinfo(handle_, RTLD_DI_LINKMAP, &map);
+    struct Search {
+        ElfW(Addr) base;
+        std::vector<Range>* ranges;
+    } search{map->l_addr, &variables_};
+    dl_iterate_phdr(
+        [](dl_phdr_info* info, std::size_t, void* data) {
+            auto* search = static_cast<Search*>(data);
+            if (info->dlpi_addr != search->base) return 0;
+            // Relocated data are read-only once loaded; what is behind them can change.
+            ElfW(Addr) sealed_end = 0;
+            for (int i = 0; i < info->dlpi_phnum; i++) {
+                const auto& part = info->dlpi_phdr[i];
+                if (part.p_type == PT_GNU_RELRO) sealed_end = part.p_vaddr + part.p_memsz;
+            }
+            for (int i = 0; i < info->dlpi_phnum; i++) {
+                const auto& part = info->dlpi_phdr[i];
+                if (part.p_type != PT_LOAD || !(part.p_flags & PF_W)) continue;
+                const ElfW(Addr) end = part.p_vaddr + part.p_memsz;
+                ElfW(Addr) begin = part.p_vaddr;
+                if (sealed_end > begin && sealed_end <= end) begin = sealed_end;
+                search->ranges->push_back(
+                    {reinterpret_cast<char*>(info->dlpi_addr + begin), end - begin});
+            }
+            return 1;
+        },
+        &search);
+    pristine_ = save();
+}
+
+void Library::redirect_imports(bool race_memory) const {
+    link_map* map = nullptr;
+    dlinfo(handle_, RTLD_DI_LINKMAP, &map);
+    const ElfW(Sym)* symbols = nullptr;
+    const char* names = nullptr;
+    struct Table {
+        const ElfW(Rela)* first = nullptr;
+        std::size_t size = 0;
+    } data, calls;
+    for (const ElfW(Dyn)* entry = map->l_ld; entry->d_tag != DT_NULL; entry++) {
+        const ElfW(Addr) address = entry->d_un.d_ptr;
+        switch (entry->d_tag) {
+            case DT_SYMTAB: symbols = reinterpret_cast<const ElfW(Sym)*>(address); break;
+            case DT_STRTAB: names = reinterpret_cast<const char*>(address); break;
+            case DT_RELA: data.first = reinterpret_cast<const ElfW(Rela)*>(address); break;
+            case DT_RELASZ: data.size = entry->d_un.d_val; break;
+            case DT_JMPREL: calls.first = reinterpret_cast<const ElfW(Rela)*>(address); break;
+            case DT_PLTRELSZ: calls.size = entry->d_un.d_val; break;
+        }
+    }
+    const auto replacement = [race_memory](const std::string& import) -> void* {
+        const auto ours = replacements().find(import);
+        if (ours != replacements().end())
+            return is_memory(import) && !race_memory ? nullptr : ours->second;
+        // The game's own libraries come before others of the process with the same symbols: an
+        // XML parser, for one, is in many a Python.
+        for (const auto& [path, library] : shared_libraries()) {
+            void* found = library ? library->find(import.c_str()) : nullptr;
+            if (found && defines(library->handle_, found)) return found;
+        }
+        return nullptr;
+    };
+    const auto page = static_cast<std::uintptr_t>(sysconf(_SC_PAGESIZE));
+    for (const Table& table : {data, calls}) {
+        for (std::size_t i = 0; i < table.size / sizeof(ElfW(Rela)); i++) {
+            const ElfW(Rela)& relocation = table.first[i];
+            const ElfW(Sym)& symbol = symbols[ELF64_R_SYM(relocation.r_info)];
+            if (symbol.st_name == 0 || symbol.st_shndx != SHN_UNDEF) continue;
+            void* target = replacement(names + symbol.st_name);
+            if (!target) continue;
+            const auto slot = static_cast<std::uintptr_t>(map->l_addr + relocation.r_offset);
+            // The loader has sealed these pages; the copy is ours, so they stay open.
+            mprotect(reinterpret_cast<void*>(slot - slot % page), page, PROT_READ | PROT_WRITE);
+            std::memcpy(reinterpret_cast<void*>(slot), &target, sizeof target);
+        }
+    }
+}
+
+Variables Library::save() const {
+    Variables saved;
+    for (const Range& range : variables_)
+        saved.emplace_back(range.begin, range.begin + range.size);
+    return saved;
+}
+
+void Library::restore(const Variables& saved) {
+    for (std::size_t i = 0; i < variables_.size(); i++)
+        std::memcpy(variables_[i].begin, saved[i].data(), saved[i].size());
+}
+
+// ---- Driving -------------------------------------------------------------------------------------
+
+Hosted::Hosted(Host& host) : previous_(current) {
+    static const locale_t plain = newlocale(LC_ALL_MASK, "C", nullptr);
+    locale_ = uselocale(plain);
+    current = &host;
+}
+
+Hosted::~Hosted() {
+    current = previous_;
+    uselocale(static_cast<locale_t>(locale_));
+}
+
+Random* new_random(Arena& arena) {
+    auto* random = static_cast<Random*>(arena.allocate(sizeof(Random)));
+    std::memset(random, 0, sizeof *random);
+    initstate_r(1, random->words, sizeof random->words, &random->state);
+    return random;
+}
+
+std::string last_message() {
+    std::string text = message;
+    while (!text.empty() && (text.back() == '\n' || text.back() == ' ')) text.pop_back();
+    return text;
+}
+
+}  // namespace torcs

@@ -1,0 +1,594 @@
+// How a race is set up: track, cars, starting grid, countdown, snapshots.
+#include "race.h"
+
+#include <algorithm>
+#include <cmath>
+#include <cstring>
+
+#include "checks.h"
+#include "errors.h"
+
+namespace torcs {
+
+namespace {
+
+constexpr double PI = 3.14159265358979323846;
+constexpr std::size_t RACE_MEMORY = std::size_t{256} << 20;   // reserved, not used
+constexpr std::size_t TRACK_MEMORY = std::size_t{64} << 20;
+
+constexpr double COUNTDOWN = -2.0;   // [s]
+constexpr int SETTLING_STEPS = 500;  // of standing on the brake, so that the springs come to rest
+constexpr int AGAINST_RIGHT = 0;     // of to_global
+constexpr int MANY_LAPS = 1 << 30;
+
+// Shift points of the SCR car, 8500 and 7500 rpm of the 9152 at which its limiter cuts in, as
+// shares of any car's.
+constexpr float SHIFT_UP = 8500.0f / 9152.0f;
+constexpr float SHIFT_DOWN = 7500.0f / 9152.0f;
+
+const char* const SKILLS[] = {"rookie", "amateur", "semi-pro", "pro"};
+constexpr int SEMI_PROFESSIONAL = 2;  // what the game takes for drivers that do not say
+
+std::mutex spare_mutex;
+std::vector<Arena*>& spare_arenas(std::size_t size) {
+    static auto* race = new std::vector<Arena*>;
+    static auto* track = new std::vector<Arena*>;
+    return size == RACE_MEMORY ? *race : *track;
+}
+
+Arena& take_arena(std::size_t size) {
+    std::lock_guard<std::mutex> lock(spare_mutex);
+    auto& spare = spare_arenas(size);
+    if (spare.empty()) return *new Arena(size);
+    Arena* arena = spare.back();
+    spare.pop_back();
+    return *arena;
+}
+
+void give_back(Arena& arena, std::size_t size) {
+    arena.clear();
+    std::lock_guard<std::mutex> lock(spare_mutex);
+    spare_arenas(size).push_back(&arena);
+}
+
+void copy_name(char (&to)[NAME_LENGTH], const std::string& from) {
+    std::strncpy(to, from.c_str(), NAME_LENGTH - 1);
+}
+
+// The function that a module exports under its own name fills this table.
+ModuleInfo module_info(const Library& library, const std::string& name, int index) {
+    ModuleInfo modules[MODULE_INTERFACES] = {};
+    library.require<int (*)(ModuleInfo*)>(name.c_str())(modules);
+    for (const ModuleInfo& module : modules)
+        if (module.init && module.index == index) return module;
+    throw Error("UnknownRobot", name + " has no driver of index " + std::to_string(index) +
+                                    "; list them with: sb3-torcs robots");
+}
+
+void no_track(int, TrackData*, void*, void** params, Situation*) { *params = nullptr; }
+void no_race(int, CarElement*, Situation*) {}
+int no_pit(int, CarElement*, Situation*) { return 0; }
+void no_shutdown(int) {}
+
+Robot agent_robot() {
+    return {no_track, no_race, no_race, no_race, no_pit, no_shutdown, 0};
+}
+
+}  // namespace
+
+Race::Race(Game& game, RaceOptions options)
+    : game_(game),
+      options_(std::move(options)),
+      arena_(take_arena(RACE_MEMORY)),
+      track_arena_(take_arena(TRACK_MEMORY)),
+      session_(game, nullptr) {
+    std::lock_guard<std::recursive_mutex> lock(game_.mutex);
+    host_ = {&arena_, new_random(arena_), game_.data};
+    track_host_ = {&track_arena_, host_.random, game_.data};
+    try {
+        load_track();
+        load_cars();
+        prepare();
+    } catch (...) {
+        close();
+        throw;
+    }
+}
+
+Race::~Race() {
+    std::lock_guard<std::recursive_mutex> lock(game_.mutex);
+    close();
+}
+
+void Race::close() {
+    if (world_) {
+        Hosted hosted(host_);
+        for (int i = 0; i < world_->situation.cars_number; i++) {
+            CarElement& car = world_->cars[i];
+            if (car.robot && car.robot->shutdown)
+                car.robot->shutdown(car.robot->index);
+            Params(game_, car.priv.driver_params);
+            Params(game_, car.priv.car_params);
+        }
+    }
+    if (track_) {
+        Hosted hosted(track_host_);
+        if (track_pits_) track_->pits.pits = track_pits_;
+        track_interface_.shutdown();
+    }
+    for (auto& library : robot_libraries_) Library::give_back(std::move(library));
+    Library::give_back(std::move(simulation_library_));
+    Library::give_back(std::move(track_library_));
+    give_back(arena_, RACE_MEMORY);
+    give_back(track_arena_, TRACK_MEMORY);
+}
+
+// ---- Loading -------------------------------------------------------------------------------------
+
+void Race::load_track() {
+    Hosted hosted(track_host_);
+    track_library_ = game_.take_module("modules/track", "track");
+    ModuleInfo module = module_info(*track_library_, "track", 0);
+    module.init(module.index, &track_interface_);
+    if (!Params::read(game_, options_.track))
+        throw Error("TrackFileError", options_.track + ": " + last_message());
+    std::string path = options_.track;
+    track_ = track_interface_.build(path.data());
+    check_track(track_, Params::read(game_, options_.track), options_.track);
+}
+
+Params Race::load_car(const std::string& name) {
+    const std::string path = "cars/" + name + "/" + name + ".xml";
+    Params car = Params::read(game_, path);
+    if (!car) throw Error("CarFileError", game_.data + path + ": " + last_message());
+    const std::string category = car.text("Car", "category");
+    if (category.empty())
+        throw Error("CarFileError",
+                    game_.data + path + " names no category; every car of the game has one");
+    const std::string category_path = "categories/" + category + ".xml";
+    Params limits = Params::read(game_, category_path);
+    if (!limits)
+        throw Error("CarFileError", game_.data + category_path + ": " + last_message());
+    if (car.misfits(limits))
+        throw Error("CarFileError", game_.data + path + " does not fit its category " + category +
+                                        ": " + last_message());
+    return Params::merge(std::move(limits), std::move(car));
+}
+
+void Race::load_cars() {
+    Hosted hosted(host_);
+    session_ = Params::read(game_, "config/raceman/" + options_.session + ".xml");
+    if (!session_)
+        throw Error("GameIncomplete", game_.data + "config/raceman/" + options_.session +
+                                          ".xml: " + last_message());
+    race_name_ = session_.text("Races/1", "name");
+    simulation_library_ = game_.take_module("modules/simu", "simuv2");
+    ModuleInfo module = module_info(*simulation_library_, "simuv2", 0);
+    module.init(module.index, &simulation_);
+
+    const int number = static_cast<int>(options_.entries.size());
+    world_ = make<World>();
+    world_->cars = make<CarElement>(number);
+    world_->order = make<CarElement*>(number);
+    world_->records = make<Record>(number);
+    world_->manager.cars = world_->cars;
+    world_->manager.situation = &world_->situation;
+    world_->manager.track = track_;
+    set_rules();
+    for (int i = 0; i < number; i++) {
+        CarElement& car = world_->cars[i];
+        car.index = i;
+        world_->order[i] = &car;
+        world_->situation.cars_number = i + 1;
+        load_driver(car, options_.entries[static_cast<std::size_t>(i)]);
+    }
+    world_->situation.cars = world_->order;
+
+    simulation_.init(number, track_, rules_.fuel_factor, rules_.damage_factor);
+    simulated_ = simulation_library_->require<SimulatedCar**>("SimCarTable");
+    for (int i = 0; i < number; i++) {
+        world_->cars[i].race.best_lap_counts = true;
+        place_on_grid(world_->cars[i]);
+    }
+    assign_pits();
+}
+
+void Race::load_driver(CarElement& car, const Entry& entry) {
+    car.race.penalties.last = &car.race.penalties.first;
+    car.priv.driver_index = entry.index;
+    car.info.driver_type = ROBOT_DRIVER;
+    car.info.start_rank = car.index;
+    car.info.skill = SEMI_PROFESSIONAL;
+    car.race.position = car.index + 1;
+    car.race.remaining_laps = world_->situation.laps;
+    car.robot = make<Robot>();
+    std::string car_name = options_.car;
+    if (entry.module.empty()) {
+        agent_ = car.index;
+        *car.robot = agent_robot();
+        copy_name(car.info.name, "agent");
+        copy_name(car.info.team, "agent");
+        copy_name(car.priv.module, "agent");
+    } else {
+        // Several drivers of a module share its copy, as they do in the game.
+        Library*& library = robots_[entry.module];
+        if (!library) {
+            robot_libraries_.push_back(
+                game_.take_module("drivers/" + entry.module, entry.module));
+            library = robot_libraries_.back().get();
+        }
+        ModuleInfo module = module_info(*library, entry.module, entry.index);
+        module.init(entry.index, car.robot);
+        Params driver =
+            Params::read(game_, "drivers/" + entry.module + "/" + entry.module + ".xml");
+        if (!driver)
+            throw Error("GameIncomplete", game_.data + "drivers/" + entry.module + "/" +
+                                              entry.module + ".xml: " + last_message());
+        const std::string section = "Robots/index/" + std::to_string(entry.index);
+        copy_name(car.priv.module, entry.module);
+        copy_name(car.info.name, driver.text(section.c_str(), "name", "<none>"));
+        copy_name(car.info.team, driver.text(section.c_str(), "team", "<none>"));
+        car.info.race_number =
+            static_cast<int>(driver.number(section.c_str(), "race number", 0.0f));
+        const std::string skill = driver.text(section.c_str(), "skill level", "semi-pro");
+        car.info.skill = 0;
+        for (int i = 0; i < 4; i++)
+            if (skill == SKILLS[i]) car.info.skill = i;
+        car_name = driver.text(section.c_str(), "car name");
+        car.priv.driver_params = driver.release();
+    }
+    copy_name(car.info.car, car_name);
+    Params params = load_car(car_name);
+    copy_name(car.info.category, params.text("Car", "category"));
+    void* own = nullptr;
+    car.robot->new_track(entry.index, track_, params.handle(), &own, &world_->situation);
+    if (own) {
+        Params setup(game_, own);
+        if (setup.misfits(params))
+            throw Error("RobotUnavailable", entry.module + " has a set-up that does not fit " +
+                                                car_name + ": " + last_message());
+        params = Params::merge(std::move(params), std::move(setup));
+    }
+    car.priv.car_params = params.release();
+    game_.init_pit_setup(car.priv.car_params, car.pit_command.setup, false);
+}
+
+void Race::set_rules() {
+    const char* race = race_name_.c_str();
+    const auto enabled = [&](const char* name) { return session_.text(race, name, "yes") == "yes"; };
+    const auto at_least = [&](const char* name, float fallback, float least) {
+        return std::max(session_.number(race, name, fallback), least);
+    };
+    rules_.wall_voids_lap = enabled("invalidate best lap on wall touch");
+    rules_.cut_voids_lap = enabled("invalidate best lap on corner cutting");
+    rules_.cut_costs_time = enabled("corner cutting time penalty");
+    rules_.fuel_factor = at_least("fuel consumption factor", 1.0f, 0.0f);
+    rules_.damage_factor = at_least("damage factor", 1.0f, 0.0f);
+    rules_.fuel_flow = at_least("refuel fuel flow", 8.0f, 1.0f);
+    rules_.repair_factor = at_least("damage repair factor", 0.007f, 0.0f);
+    rules_.pit_base_time = at_least("pitstop base time", 2.0f, 0.0f);
+    track_->pits.speed_limit = session_.number(race, "pit speed limit", track_->pits.speed_limit);
+
+    Situation& situation = world_->situation;
+    situation.laps = options_.laps ? options_.laps : MANY_LAPS;
+    situation.max_damage = static_cast<int>(session_.number(race, "maximum dammage", 10000.0f));
+    const std::string type = session_.text(race, "type", "race");
+    situation.type = type == "practice" ? PRACTICE : type == "qualifications" ? QUALIFYING : RACE;
+}
+
+// ---- The grid ------------------------------------------------------------------------------------
+
+// A track's own settings come before the session's.
+float Race::grid_number(const char* name, float fallback) const {
+    const std::string section = race_name_ + "/Starting Grid";
+    return Params::view(game_, track_->params)
+        .number("Starting Grid", name, session_.number(section.c_str(), name, fallback));
+}
+
+float Race::grid_distance(int index) const {
+    const int rows = std::max(static_cast<int>(grid_number("rows", 2.0f)), 1);
+    const float to_start = grid_number("distance to start", 10.0f);
+    const float between_columns = grid_number("distance between columns", 10.0f);
+    const float within_column = grid_number("offset within a column", 5.0f);
+    return track_->length - (to_start + static_cast<float>(index / rows) * between_columns +
+                             static_cast<float>(index % rows) * within_column);
+}
+
+float Race::grid_to_right(int index) const {
+    const Segment* turn = track_->last->next;
+    while (turn->type == STRAIGHT) turn = turn->next;
+    const std::string section = race_name_ + "/Starting Grid";
+    std::string pole = turn->type == LEFT_TURN ? "left" : "right";
+    pole = session_.text(section.c_str(), "pole position side", pole.c_str());
+    pole = Params::view(game_, track_->params)
+               .text("Starting Grid", "pole position side", pole.c_str());
+    const float first = pole == "left" ? track_->width : 0.0f;
+    const float across = pole == "left" ? -track_->width : track_->width;
+    const int rows = std::max(static_cast<int>(grid_number("rows", 2.0f)), 1);
+    return first + across * static_cast<float>(index % rows + 1) / static_cast<float>(rows + 1);
+}
+
+void Race::place_on_grid(CarElement& car) {
+    place(car, grid_distance(car.index), grid_to_right(car.index), 0.0f);
+}
+
+void Race::place(CarElement& car, float distance, float to_right, float heading_error) {
+    Segment* segment = track_->last;
+    while (distance < segment->from_start) segment = segment->prev;
+    const float along = distance - segment->from_start;
+    car.pub.local = Motion{};
+    Pose& pose = car.pub.local.pos;
+    TrackPosition& position = car.pub.track;
+    position.segment = segment;
+    position.type = 0;
+    position.to_right = to_right;
+    position.to_start = segment->type == STRAIGHT ? along : along / segment->radius;
+    game_.to_global(&position, &pose.x, &pose.y, AGAINST_RIGHT);
+    pose.az = segment->heading;
+    if (segment->type == RIGHT_TURN) pose.az = segment->heading - position.to_start;
+    if (segment->type == LEFT_TURN) pose.az = segment->heading + position.to_start;
+    pose.az -= heading_error;
+    pose.z = game_.road_height(&position) + grid_number("initial height", 0.3f);
+    while (pose.az > 2 * PI) pose.az -= 2 * PI;
+    while (pose.az < 0) pose.az += 2 * PI;
+    simulation_.config(&car, &world_->manager);
+}
+
+void Race::assign_pits() {
+    Pits& pits = track_->pits;
+    if (pits.type != 1) return;
+    // The race's pits are its own, so that a snapshot has them.
+    track_pits_ = pits.pits;
+    world_->pits = make<Pit>(pits.number);
+    std::copy_n(track_pits_, pits.number, world_->pits);
+    pits.pits = world_->pits;
+    pits.cars_number = world_->situation.cars_number;
+    const float shared = session_.number(race_name_.c_str(), "cars per pit", 1.0f);
+    pits.cars_per_pit = std::clamp(static_cast<int>(shared), 1, 4);
+    for (int i = 0; i < pits.number; i++) {
+        pits.pits[i].cars_number = 0;
+        pits.pits[i].occupied_by = -1;
+        std::fill(std::begin(pits.pits[i].cars), std::end(pits.pits[i].cars), nullptr);
+    }
+    for (int i = 0; i < world_->situation.cars_number; i++) {
+        CarElement& car = world_->cars[i];
+        for (int j = 0; j < pits.number; j++) {
+            Pit& pit = pits.pits[j];
+            const bool mates = pit.cars_number > 0 && pit.cars_number < pits.cars_per_pit &&
+                               std::strcmp(pit.cars[0]->info.team, car.info.team) == 0;
+            if (pit.cars_number > 0 && !mates) continue;
+            if (pit.cars_number == 0) {
+                const float middle = pit.pos.segment->from_start + pit.pos.to_start;
+                pit.from = middle - pits.length / 2.0 + car.info.dimension.x / 2.0;
+                pit.to = middle + pits.length / 2.0 - car.info.dimension.x / 2.0;
+                if (pit.from > track_->length) pit.from -= track_->length;
+                if (pit.to > track_->length) pit.to -= track_->length;
+            }
+            pit.cars[pit.cars_number++] = &car;
+            car.race.pit = &pit;
+            break;
+        }
+    }
+}
+
+// ---- The start -----------------------------------------------------------------------------------
+
+void Race::prepare() {
+    Hosted hosted(host_);
+    for (int i = 0; i < cars_number(); i++) {
+        CarElement& car = world_->cars[i];
+        car.robot->new_race(car.robot->index, &car, &world_->situation);
+    }
+    ready_ = save();
+    settle();
+    check_simulation(*simulated_, world_->cars, cars_number());
+    Situation& situation = world_->situation;
+    world_->last_call = -1.0;
+    situation.time = COUNTDOWN;
+    situation.delta_time = PHYSICS_STEP;
+    situation.state = STARTING;
+    // The agent waits on its brake; robots are called, as they are in the game.
+    while (situation.time < 0.0 || !call_is_due()) step();
+    for (int i = 0; i < cars_number(); i++)
+        world_->records[i].start_distance = world_->cars[i].race.distance_raced;
+    on_grid_ = save();
+}
+
+void Race::settle() {
+    simulation_.update(&world_->situation, PHYSICS_STEP, -1);
+    for (int i = 0; i < cars_number(); i++) {
+        CarElement& car = world_->cars[i];
+        world_->records[i].previous = car.pub.track;
+        const int gear = car.control.gear;
+        car.control = Control{};
+        car.control.brake = 1.0f;
+        car.control.gear = world_->records[i].flying ? gear : 0;
+    }
+    for (int i = 0; i < SETTLING_STEPS; i++)
+        simulation_.update(&world_->situation, PHYSICS_STEP, -1);
+}
+
+void Race::start() { restore(on_grid_); }
+
+void Race::start(const Start& start) {
+    restore(ready_);
+    Hosted hosted(host_);
+    const double ahead = start.distance - grid_distance(agent_);
+    for (int i = 0; i < cars_number(); i++) {
+        CarElement& car = world_->cars[i];
+        world_->records[i].flying = true;
+        double distance = std::fmod(grid_distance(i) + ahead, track_->length);
+        if (distance < 0.0) distance += track_->length;
+        if (i == agent_) {
+            distance = start.distance;
+            const double half_width = 0.5 * segment_at(distance)->width;
+            place(car, static_cast<float>(distance),
+                  static_cast<float>((1.0 + start.track_position) * half_width),
+                  static_cast<float>(start.heading_error));
+        } else {
+            place(car, static_cast<float>(distance), grid_to_right(i), 0.0f);
+        }
+        car.control.gear = gear_for(car, start.speed);  // engages while the car settles
+    }
+    settle();
+    Situation& situation = world_->situation;
+    situation.state = RUNNING;
+    situation.time = 0.0;
+    situation.delta_time = ROBOT_STEP;
+    world_->last_call = -ROBOT_STEP;
+    for (int i = 0; i < cars_number(); i++) {
+        CarElement& car = world_->cars[i];
+        give_speed(car, start.speed);
+        manage(car);
+        // On the line itself, the lap has begun.
+        if (i == agent_ && start.distance == 0.0 &&
+            car.pub.track.segment->race_info & AFTER_LINE)
+            car.race.crossings = 1;
+        measure_distance(car);
+        world_->records[i].start_distance = car.race.distance_raced;
+    }
+    sort();
+}
+
+const Segment* Race::segment_at(double distance) const {
+    const Segment* segment = track_->last;
+    while (distance < segment->from_start) segment = segment->prev;
+    return segment;
+}
+
+int Race::gear_for(const CarElement& car, double speed) const {
+    const double spin = speed / (*simulated_)[car.index].wheel[REAR_RIGHT].radius;
+    const int highest = car.priv.gears_number - 1 - car.priv.gear_offset;
+    int gear = 1;
+    while (gear < highest &&
+           spin * car.priv.gear_ratio[gear + car.priv.gear_offset] > SHIFT_UP * car.priv.red_line)
+        gear++;
+    return gear;
+}
+
+void Race::give_speed(CarElement& car, double speed) {
+    SimulatedCar& simulated = (*simulated_)[car.index];
+    const double yaw = simulated.global.pos.az;
+    simulated.local.vel.x = static_cast<float>(speed);
+    simulated.global.vel.x = static_cast<float>(speed * std::cos(yaw));
+    simulated.global.vel.y = static_cast<float>(speed * std::sin(yaw));
+    for (int i = 0; i < 4; i++) {
+        SimulatedWheel& wheel = simulated.wheel[i];
+        wheel.spin = wheel.previous_spin = wheel.axle_spin =
+            static_cast<float>(speed / wheel.radius);
+        car.priv.wheel[i].spin = wheel.spin;
+    }
+    const float ratio = car.priv.gear_ratio[car.priv.gear + car.priv.gear_offset];
+    simulated.engine_speed =
+        std::max(simulated.engine_speed, simulated.wheel[REAR_RIGHT].spin * ratio);
+    car.priv.engine_speed = simulated.engine_speed;
+    car.pub.local = simulated.local;
+    car.pub.global = simulated.global;
+    car.pub.speed = static_cast<float>(speed);
+}
+
+// ---- Driving -------------------------------------------------------------------------------------
+
+void Race::drive(const Controls& controls, int ticks) {
+    Hosted hosted(host_);
+    world_->controls = controls;
+    for (int i = 0; i < ticks && !ended(); i++) {
+        step();
+        while (!call_is_due() && !ended()) step();
+    }
+}
+
+void Race::update_physics(int steps) {
+    Hosted hosted(host_);
+    for (int i = 0; i < steps; i++) simulation_.update(&world_->situation, PHYSICS_STEP, -1);
+}
+
+bool Race::ended() const { return world_->situation.state == ENDED; }
+
+bool Race::call_is_due() const {
+    return world_->situation.time + PHYSICS_STEP - world_->last_call >= ROBOT_STEP;
+}
+
+void Race::step() {
+    Situation& situation = world_->situation;
+    situation.time += PHYSICS_STEP;
+    if (situation.time < 0.0) {
+        situation.state = PRESTART;
+    } else if (situation.state == PRESTART) {
+        situation.state = RUNNING;
+        situation.time = 0.0;
+        world_->last_call = 0.0;
+    }
+    if (situation.time - world_->last_call >= ROBOT_STEP) call_drivers();
+    simulation_.update(&situation, PHYSICS_STEP, -1);
+    for (int i = 0; i < situation.cars_number; i++) manage(*world_->order[i]);
+    sort();
+}
+
+void Race::call_drivers() {
+    Situation& situation = world_->situation;
+    situation.delta_time = situation.time - world_->last_call;
+    for (int i = 0; i < situation.cars_number; i++) {
+        CarElement& car = *world_->order[i];
+        if (car.pub.status & NOT_SIMULATED) continue;
+        if (car.index == agent_)
+            drive_agent(car);
+        else
+            car.robot->drive(car.robot->index, &car, &situation);
+    }
+    world_->last_call = situation.time;
+}
+
+void Race::drive_agent(CarElement& car) {
+    if (world_->situation.state == PRESTART) return;
+    const Controls& controls = world_->controls;
+    car.control.steering = controls.steering;
+    car.control.throttle = controls.throttle;
+    car.control.brake = controls.brake;
+    car.control.clutch = 0.0f;  // the gearbox presses it while it shifts
+    car.control.gear =
+        controls.gear == AUTOMATIC_GEAR ? automatic_gear(car.priv) : controls.gear;
+}
+
+int Race::automatic_gear(const CarPrivate& car) {
+    const int gear = car.gear;
+    if (gear < 1) return 1;
+    const float* ratio = car.gear_ratio + car.gear_offset;
+    if (car.engine_speed > SHIFT_UP * car.red_line && gear < car.gears_number - 1 - car.gear_offset)
+        return gear + 1;
+    if (gear > 1 && car.engine_speed * ratio[gear - 1] / ratio[gear] < SHIFT_DOWN * car.red_line)
+        return gear - 1;
+    return gear;
+}
+
+// ---- Reading and keeping -------------------------------------------------------------------------
+
+float Race::height(int index) const {
+    TrackPosition position = world_->cars[index].pub.track;
+    return world_->cars[index].pub.local.pos.z - game_.road_height(&position);
+}
+
+double Race::distance_raced(int index) const {
+    return world_->cars[index].race.distance_raced - world_->records[index].start_distance;
+}
+
+std::vector<LapRecord> Race::laps(int index) const {
+    const Record& record = world_->records[index];
+    return {record.laps, record.laps + record.laps_number};
+}
+
+Snapshot Race::save() const {
+    Snapshot snapshot{this, arena_.save(), {}};
+    snapshot.variables.push_back(simulation_library_->save());
+    for (const auto& library : robot_libraries_) snapshot.variables.push_back(library->save());
+    return snapshot;
+}
+
+void Race::restore(const Snapshot& snapshot) {
+    arena_.restore(snapshot.memory);
+    simulation_library_->restore(snapshot.variables[0]);
+    for (std::size_t i = 0; i < robot_libraries_.size(); i++)
+        robot_libraries_[i]->restore(snapshot.variables[i + 1]);
+}
+
+}  // namespace torcs

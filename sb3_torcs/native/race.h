@@ -1,0 +1,199 @@
+// One race of the real game: a track, cars, and the loop that drives them.
+//
+// The loop, the lap counting, the rules, the pits and the results follow TORCS 1.3.7's race engine
+// to the arithmetic, in the same types, since rounding decides at which physics step a robot is
+// called. What the game shows or prints is left out.
+#pragma once
+
+#include <cstring>
+#include <map>
+#include <memory>
+#include <string>
+#include <vector>
+
+#include "arena.h"
+#include "game.h"
+#include "layout.h"
+#include "library.h"
+
+namespace torcs {
+
+// A driver of the starting list: a robot of the game, or without a module the agent.
+struct Entry {
+    std::string module;
+    int index = 0;
+};
+
+struct RaceOptions {
+    std::string track;    // path of its XML
+    std::string session;  // of the game's race managers, "practice" or "quickrace"
+    std::string car;      // the agent's
+    std::vector<Entry> entries;
+    int laps = 0;         // 0 drives on
+};
+
+struct Start {
+    double distance;        // [m] along the road from the start line
+    double track_position;  // [-] of the agent: 1 is the left edge, -1 the right
+    double heading_error;   // [rad] of the agent: positive if it points to the right
+    double speed;           // [m/s] of all cars
+};
+
+struct Controls {
+    float steering, throttle, brake;
+    int gear;
+};
+
+constexpr int AUTOMATIC_GEAR = -100;
+
+struct LapRecord {
+    double time;       // [s]
+    int damage;        // [points] at its end
+    float top_speed;   // [m/s]
+    float lowest_speed;
+};
+
+struct Result {
+    int entry;          // place in the starting list
+    int laps;
+    double total_time;  // [s] with penalties
+    double best_lap;    // [s], 0 if none counts
+    int damage;
+    bool out;           // did not finish
+};
+
+struct Snapshot {
+    const void* race;
+    std::vector<char> memory;
+    std::vector<Variables> variables;
+};
+
+class Race {
+public:
+    Race(Game& game, RaceOptions options);
+    ~Race();
+    Race(const Race&) = delete;
+    Race& operator=(const Race&) = delete;
+
+    // The field on the grid, at the moment before drivers are called for the first time.
+    void start();
+    // The field moved along the road so that the agent is at a place, all at a speed.
+    void start(const Start& start);
+
+    // Hold the agent's controls for some intervals between two calls of drivers.
+    void drive(const Controls& controls, int ticks);
+    // The physics alone, for comparison: no drivers, no rules.
+    void update_physics(int steps);
+    bool ended() const;
+
+    Snapshot save() const;
+    void restore(const Snapshot& snapshot);
+
+    // What follows is read between two calls; index counts the starting list.
+    const TrackData& track() const { return *track_; }
+    const Situation& situation() const { return world_->situation; }
+    const CarElement& car(int index) const { return world_->cars[index]; }
+    CarElement* const* cars() const { return world_->order; }
+    int cars_number() const { return world_->situation.cars_number; }
+    int agent() const { return agent_; }  // -1 if there is none
+    float height(int index) const;        // [m] of the mass centre above the road
+    double distance_raced(int index) const;  // [m] since the start
+    std::vector<LapRecord> laps(int index) const;
+    std::vector<Result> results() const;  // in the order of a race's standings
+
+private:
+    // What the race engine keeps about a car beside the shared record.
+    struct Record {
+        TrackPosition previous;
+        double lap_began;          // [s]
+        int backwards;             // crossings of the line that have to be made up for
+        double pit_time;           // [s] of the present stop
+        float top_speed, lowest_speed;
+        int lane_state;            // of race_rules.cpp
+        double start_distance;     // [m] by the race's count, where the episode began
+        bool flying;               // began on the way: the first crossing starts the clock
+        LapRecord* laps;
+        int laps_number, laps_room;
+    };
+    struct World {
+        Situation situation;
+        RaceManager manager;
+        double last_call;          // [s] when drivers were called
+        Controls controls;
+        CarElement** order;
+        CarElement* cars;
+        Record* records;
+        Pit* pits;
+    };
+    struct Rules {
+        bool wall_voids_lap, cut_voids_lap, cut_costs_time;
+        float fuel_factor, damage_factor, fuel_flow, repair_factor, pit_base_time;
+    };
+
+    template <typename T>
+    T* make(int number = 1) {
+        const std::size_t size = sizeof(T) * static_cast<std::size_t>(number);
+        return static_cast<T*>(std::memset(arena_.allocate(size), 0, size));
+    }
+    void close();
+
+    void load_track();
+    void load_cars();
+    void load_driver(CarElement& car, const Entry& entry);
+    Params load_car(const std::string& name);
+    void set_rules();
+    float grid_number(const char* name, float fallback) const;
+    float grid_distance(int index) const;
+    float grid_to_right(int index) const;
+    void place_on_grid(CarElement& car);
+    void place(CarElement& car, float distance, float to_right, float heading_error);
+    void assign_pits();
+    void prepare();
+    void settle();
+    const Segment* segment_at(double distance) const;
+    int gear_for(const CarElement& car, double speed) const;
+    void give_speed(CarElement& car, double speed);
+
+    void step();
+    bool call_is_due() const;
+    void call_drivers();
+    void drive_agent(CarElement& car);
+    static int automatic_gear(const CarPrivate& car);
+
+    // Of race_rules.cpp.
+    void manage(CarElement& car);
+    void manage_pit(CarElement& car, Record& record);
+    void stop_in_pit(CarElement& car, Record& record);
+    bool stands_in_pit(const CarElement& car) const;
+    bool cross_line(CarElement& car, Record& record);
+    void record_lap(const CarElement& car, Record& record);
+    void measure_distance(CarElement& car);
+    void apply_rules(CarElement& car, Record& record);
+    void check_cut(CarElement& car);
+    void check_pit_lane(CarElement& car, Record& record);
+    void add_penalty(CarElement& car, int kind);
+    void sort();
+
+    Game& game_;
+    RaceOptions options_;
+    Arena& arena_;
+    Host host_;
+    Arena& track_arena_;
+    Host track_host_;
+    std::unique_ptr<Library> track_library_, simulation_library_;
+    std::vector<std::unique_ptr<Library>> robot_libraries_;
+    std::map<std::string, Library*> robots_;  // of robot_libraries_, by name
+    TrackInterface track_interface_{};
+    Simulation simulation_{};
+    TrackData* track_ = nullptr;
+    Pit* track_pits_ = nullptr;  // the track's own, while the race's are in their place
+    Params session_;
+    std::string race_name_;
+    Rules rules_{};
+    World* world_ = nullptr;
+    SimulatedCar** simulated_ = nullptr;
+    int agent_ = -1;
+    Snapshot ready_, on_grid_;
+};
+
+}  // namespace torcs
