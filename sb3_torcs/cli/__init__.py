@@ -7,7 +7,7 @@ import os
 import sys
 from collections.abc import Sequence
 
-from sb3_torcs.cli import bench, doctor, evaluate, tracks, train
+from sb3_torcs.cli import bench, doctor, evaluate, install_torcs, robots, tracks, train
 from sb3_torcs.errors import Sb3TorcsError
 
 __all__ = ["main"]
@@ -15,7 +15,7 @@ __all__ = ["main"]
 USAGE_ERROR = 2
 INTERRUPTED = 130
 READER_LEFT = 141
-VERBS = (doctor, tracks, train, evaluate, bench)
+VERBS = (doctor, install_torcs, tracks, train, evaluate, robots, bench)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

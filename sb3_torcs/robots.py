@@ -1,0 +1,95 @@
+"""The game's robots, driven by the engine: lap times, results, and the drive itself."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from sb3_torcs.backends.native import make_engine
+from sb3_torcs.car import CarState, is_count
+from sb3_torcs.errors import InvalidOption, OutputNotWritable
+from sb3_torcs.game import find_game
+from sb3_torcs.race_results import Lap, RobotResult
+
+__all__ = ["TELEMETRY_FIELDS", "race"]
+
+TICKS_AT_ONCE = 50  # a second of the race
+MAX_ROBOTS = 20  # that a grid of the game's tracks has room for
+
+STATE_FIELDS = CarState._fields[: CarState._fields.index("wheel_speeds")]
+TELEMETRY_FIELDS = ("robot", "index", *STATE_FIELDS, "steering", "throttle", "brake", "gear_asked")
+"""Columns of a telemetry file: one row per robot and call of drivers, every 0.02 s."""
+
+
+def race(
+    robots: Sequence[tuple[str, int]],
+    track: str,
+    laps: int,
+    *,
+    session: str = "practice",
+    telemetry: Path | None = None,
+) -> list[RobotResult]:
+    """
+    Let robots drive a race by the engine.
+
+    :param robots: names and indices, the first one at the head of the grid
+    :param track: ``"aalborg"``, ``"road/aalborg"``, or the path of a TORCS XML file
+    :param laps: to drive
+    :param session: the game's ``"practice"``, or ``"race"``
+    :param telemetry: CSV file for the drive itself, see :data:`TELEMETRY_FIELDS`
+    :return: one result per robot, the winner first
+    :raises InvalidOption: if the session cannot be had
+    :raises BackendUnavailable: if the game or the extension is missing
+    """
+    if not robots or len(robots) > MAX_ROBOTS:
+        raise InvalidOption(f"{len(robots)} robots; expected 1 to {MAX_ROBOTS}")
+    if not is_count(laps):
+        raise InvalidOption(f"laps is {laps!r}; expected a whole number >= 1")
+    engine = make_engine(find_game(), track, robots, session=session, laps=laps)
+    try:
+        engine.start()
+        if telemetry is None:
+            while not engine.ended:
+                engine.advance(TICKS_AT_ONCE)
+        else:
+            _record(engine, robots, telemetry)
+        return [
+            _result(engine, robots, rank, row) for rank, row in enumerate(engine.results(), start=1)
+        ]
+    finally:
+        engine.close()
+
+
+def _result(
+    engine: Any, robots: Sequence[tuple[str, int]], rank: int, row: tuple[Any, ...]
+) -> RobotResult:
+    entry, laps_completed, total_time, best_lap, damage, out = row
+    name, index = robots[entry]
+    return RobotResult(
+        robot=name,
+        index=index,
+        car=engine.car_name(entry),
+        laps=[Lap(time, damage) for time, damage in engine.laps(entry)],
+        total_time=total_time,
+        rank=rank,
+        damage=damage,
+        out=out,
+        laps_completed=laps_completed,
+        best_lap=best_lap or None,
+    )
+
+
+def _record(engine: Any, robots: Sequence[tuple[str, int]], path: Path) -> None:
+    try:
+        with path.open("w", newline="") as file:
+            writer = csv.writer(file)
+            writer.writerow(TELEMETRY_FIELDS)
+            while not engine.ended:
+                engine.advance(1)
+                for car, robot in enumerate(robots):
+                    state = engine.read(car)[: len(STATE_FIELDS)]
+                    writer.writerow((*robot, *state, *engine.controls(car)))
+    except OSError as error:
+        raise OutputNotWritable(f"{path}: {error}; choose another file") from error
