@@ -305,16 +305,20 @@ def _corner(segments: Iterable[Segment]) -> tuple[float, float]:
         left, right = s.left_end, s.right_end
         if s.curvature:
             left, right = max(s.left_start, left), max(s.right_start, right)
-        half_width = 0.5 * s.width_end
+        left_most = 0.5 * s.width_end + max(left, 0.0)
+        right_most = -0.5 * s.width_end - max(right, 0.0)
         turn = s.curvature * s.length / samples
         chord = s.length / samples * (math.sin(0.5 * turn) / (0.5 * turn) if turn else 1.0)
         for _ in range(samples):
             x += chord * math.cos(heading + 0.5 * turn)
             y += chord * math.sin(heading + 0.5 * turn)
             heading += turn
-            for offset in (half_width, half_width + left, -half_width, -half_width - right):
-                low_x = min(low_x, x - offset * math.sin(heading))
-                low_y = min(low_y, y + offset * math.cos(heading))
+            sine, cosine = math.sin(heading), math.cos(heading)
+            for offset in (left_most, right_most):
+                if x - offset * sine < low_x:  # min() takes most of the time to read a track
+                    low_x = x - offset * sine
+                if y + offset * cosine < low_y:
+                    low_y = y + offset * cosine
     return low_x, low_y
 
 

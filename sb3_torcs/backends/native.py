@@ -19,7 +19,7 @@ from sb3_torcs.tracks import Track, load_track
 if TYPE_CHECKING:
     from sb3_torcs._engine import Engine
 
-__all__ = ["AGENT", "NativeBackend", "check_layout", "make_engine", "parse_robot", "step_all"]
+__all__ = ["AGENT", "Fleet", "NativeBackend", "check_layout", "make_engine", "parse_robot"]
 
 AGENT = ("", 0)
 """The agent's entry in a starting list; robots have a name and an index."""
@@ -218,23 +218,43 @@ class NativeBackend:
             self.step(controls, ticks)
 
 
-def step_all(
-    backends: Sequence[NativeBackend], controls: Sequence[Controls], ticks: int, threads: int
-) -> list[CarState]:
+class Fleet:
     """
-    Drive several cars of several races at once.
+    Cars of several races that are driven at once.
 
-    :param backends: each begun, and each only once
-    :param controls: for each
-    :param ticks: control ticks of 0.02 s
-    :param threads: that share the work
-    :return: the cars afterwards
+    :param backends: each only once
+    :param threads: that drive, this one among them
     """
-    for backend, control in zip(backends, controls, strict=True):
-        backend._drive.append((control, ticks))
-    engines = [backend.engine for backend in backends]
-    states: list[CarState] = _extension().step_all(engines, list(controls), ticks, threads)
-    return states
+
+    def __init__(self, backends: Sequence[NativeBackend], threads: int) -> None:
+        self._backends = list(backends)
+        self._fleet = _extension().Fleet([backend.engine for backend in backends], threads)
+
+    def begin(self, places: Sequence[int], controls: Sequence[Controls], ticks: int) -> None:
+        """
+        Begin to drive, and return at once; backends that are not named can be used meanwhile.
+
+        :param places: of the backends to drive, each begun
+        :param controls: for each of these
+        :param ticks: control ticks of 0.02 s
+        """
+        for place, control in zip(places, controls, strict=True):
+            self._backends[place]._drive.append((control, ticks))
+        self._fleet.begin(places, controls, ticks)
+
+    def wait(self, i: int) -> CarState:
+        """
+        Drive until one car has been driven.
+
+        :param i: counts what ``begin`` named
+        :return: the car afterwards
+        """
+        state: CarState = self._fleet.wait(i)
+        return state
+
+    def finish(self) -> None:
+        """Drive until all have been driven; nothing is in use afterwards."""
+        self._fleet.finish()
 
 
 @lru_cache

@@ -4,10 +4,10 @@
 #include <pybind11/stl.h>
 
 #include <cmath>
-#include <thread>
 
 #include "engine.h"
 #include "errors.h"
+#include "pool.h"
 
 namespace py = pybind11;
 using namespace py::literals;
@@ -59,29 +59,56 @@ std::array<double, RANGE_FINDERS> angles_of(const std::vector<double>& angles) {
     return array;
 }
 
-// Drive several engines for the same number of ticks, on several threads.
-void drive_all(const std::vector<Engine*>& engines, const std::vector<Controls>& controls,
-               int ticks, int threads, std::vector<Reading>& readings) {
-    std::vector<std::exception_ptr> failures(engines.size());
-    const auto work = [&](std::size_t first, std::size_t step) {
-        for (std::size_t i = first; i < engines.size(); i += step) {
-            try {
-                Engine::Access race(*engines[i]);
-                race->drive(controls[i], ticks);
-                readings[i] = engines[i]->read(*race, race->agent());
-            } catch (...) {
-                failures[i] = std::current_exception();
-            }
+// Several engines that are driven at once. Python keeps them alive.
+class Fleet {
+public:
+    Fleet(std::vector<Engine*> engines, int threads)
+        : engines_(std::move(engines)),
+          readings_(engines_.size()),
+          failures_(engines_.size()),
+          pool_(threads) {}
+
+    // Begin to drive some of them, named by their places.
+    void begin(std::vector<std::size_t> places, std::vector<Controls> controls, int ticks) {
+        if (places.size() != controls.size())
+            throw Error("InvalidAction", std::to_string(controls.size()) + " controls for " +
+                                             std::to_string(places.size()) + " cars");
+        for (const std::size_t place : places) engines_.at(place);
+        pool_.finish();
+        places_ = std::move(places);
+        controls_ = std::move(controls);
+        pool_.begin(places_.size(), [this, ticks](std::size_t i) { drive(i, ticks); });
+    }
+
+    // The car that was named there, when it has been driven.
+    const Reading& wait(std::size_t i) {
+        pool_.wait(i);
+        if (failures_[places_[i]]) std::rethrow_exception(failures_[places_[i]]);
+        return readings_[places_[i]];
+    }
+
+    void finish() { pool_.finish(); }
+
+private:
+    void drive(std::size_t i, int ticks) {
+        const std::size_t place = places_[i];
+        failures_[place] = nullptr;
+        try {
+            Engine::Access race(*engines_[place]);
+            race->drive(controls_[i], ticks);
+            readings_[place] = engines_[place]->read(*race, race->agent());
+        } catch (...) {
+            failures_[place] = std::current_exception();
         }
-    };
-    std::vector<std::thread> others;
-    const auto number = static_cast<std::size_t>(std::max(threads, 1));
-    for (std::size_t i = 1; i < number; i++) others.emplace_back(work, i, number);
-    work(0, number);
-    for (std::thread& other : others) other.join();
-    for (const std::exception_ptr& failure : failures)
-        if (failure) std::rethrow_exception(failure);
-}
+    }
+
+    std::vector<Engine*> engines_;
+    std::vector<Reading> readings_;
+    std::vector<std::exception_ptr> failures_;
+    std::vector<std::size_t> places_;
+    std::vector<Controls> controls_;
+    Pool pool_;  // last, so that its threads end first
+};
 
 }  // namespace
 
@@ -209,24 +236,32 @@ PYBIND11_MODULE(_engine, module) {
             engine.update_physics(steps);
         });
 
-    module.def(
-        "step_all",
-        [](const std::vector<Engine*>& engines,
-           const std::vector<std::tuple<double, double, double, std::optional<int>>>& controls,
-           int ticks, int threads) {
-            std::vector<Controls> list;
-            for (const auto& [steering, throttle, brake, gear] : controls)
-                list.push_back(controls_of(steering, throttle, brake, gear));
-            std::vector<Reading> readings(engines.size());
-            {
-                py::gil_scoped_release released;
-                drive_all(engines, list, ticks, threads, readings);
-            }
-            py::list states;
-            for (const Reading& reading : readings) states.append(as_state(reading));
-            return states;
-        },
-        "Step several engines at once, on threads.");
+    py::class_<Fleet>(module, "Fleet", "Engines that are driven at once, on threads that stay.")
+        .def(py::init<std::vector<Engine*>, int>(), py::keep_alive<1, 2>(), "engines"_a,
+             "threads"_a)
+        .def("begin",
+             [](Fleet& fleet, std::vector<std::size_t> places,
+                const std::vector<std::tuple<double, double, double, std::optional<int>>>& controls,
+                int ticks) {
+                 std::vector<Controls> list;
+                 for (const auto& [steering, throttle, brake, gear] : controls)
+                     list.push_back(controls_of(steering, throttle, brake, gear));
+                 py::gil_scoped_release released;
+                 fleet.begin(std::move(places), std::move(list), ticks);
+             })
+        .def("wait",
+             [](Fleet& fleet, std::size_t i) {
+                 const Reading* reading;
+                 {
+                     py::gil_scoped_release released;
+                     reading = &fleet.wait(i);
+                 }
+                 return as_state(*reading);
+             })
+        .def("finish", [](Fleet& fleet) {
+            py::gil_scoped_release released;
+            fleet.finish();
+        });
 }
 
 }  // namespace torcs

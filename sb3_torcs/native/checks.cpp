@@ -104,6 +104,10 @@ void check_simulation(const SimulatedCar* simulated, const CarElement* cars, int
         SimulatedCar own;
         if (!probe.read(simulated + i, own) || own.element != &car || own.control != &car.control)
             disagree("the simulation's car", "a record of 3472 bytes", "none of that layout");
+        if (!std::isfinite(car.pub.global.pos.x) || !std::isfinite(car.pub.global.vel.z))
+            throw Error("CarFileError", std::string(car.info.car) +
+                                            " does not come to rest on its wheels: its file "
+                                            "describes no car that can drive");
         expect("its x", own.global.pos.x, car.pub.global.pos.x);
         expect("its yaw", own.local.pos.az, car.pub.local.pos.az);
         expect("its engine speed", own.engine_speed, car.priv.engine_speed);

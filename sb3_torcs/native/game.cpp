@@ -58,6 +58,7 @@ Game::Game(const std::string& data, const std::string& libraries, const std::str
     check_ = params.require<decltype(check_)>("_Z17GfParmCheckHandlePvS_");
     text_ = params.require<decltype(text_)>("_Z12GfParmGetStrPvPKcS1_S1_");
     number_ = params.require<decltype(number_)>("_Z12GfParmGetNumPvPKcS1_S1_f");
+    elements_ = params.require<decltype(elements_)>("_Z14GfParmGetEltNbPvPKc");
     segment_under = tools.require<decltype(segment_under)>("_Z13RtTrackGetSegP10tTrkLocPos");
     road_height = tools.require<decltype(road_height)>("_Z14RtTrackHeightLP10tTrkLocPos");
     segment_width = tools.require<decltype(segment_width)>("_Z15RtTrackGetWidthP8trackSegf");
@@ -104,6 +105,8 @@ std::string Params::text(const char* section, const char* name, const char* fall
 float Params::number(const char* section, const char* name, float fallback) const {
     return game_->number_(handle_, section, name, nullptr, fallback);
 }
+
+int Params::elements(const char* section) const { return game_->elements_(handle_, section); }
 
 int Params::misfits(const Params& reference) const {
     return game_->check_(reference.handle_, handle_);

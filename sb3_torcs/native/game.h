@@ -25,8 +25,9 @@ public:
     // Parameter files are one list for all races.
     std::recursive_mutex mutex;
 
-    std::unique_ptr<Library> take_module(const std::string& kind, const std::string& name) const {
-        return Library::take(libraries + kind + "/" + name + ".so", libraries + "lib/");
+    std::unique_ptr<Library> take_module(const std::string& kind, const std::string& name,
+                                         const char* error = "BackendUnavailable") const {
+        return Library::take(libraries + kind + "/" + name + ".so", libraries + "lib/", error);
     }
 
     // Of librobottools.
@@ -45,6 +46,7 @@ private:
     void* (*merge_)(void*, void*, int);
     int (*check_)(void*, void*);
     const char* (*text_)(void*, const char*, const char*, const char*);
+    int (*elements_)(void*, const char*);
     float (*number_)(void*, const char*, const char*, const char*, float);
 };
 
@@ -69,6 +71,7 @@ public:
 
     std::string text(const char* section, const char* name, const char* fallback = "") const;
     float number(const char* section, const char* name, float fallback) const;
+    int elements(const char* section) const;     // number of its subsections
     int misfits(const Params& reference) const;  // values outside the reference's limits
 
     // Both are consumed; `own` changes what `reference` has and adds to it.

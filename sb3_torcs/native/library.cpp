@@ -32,6 +32,8 @@ struct Random {
 
 namespace {
 
+const char* const REINSTALL = "; install the game again with: sb3-torcs install-torcs";
+
 thread_local Host* current = nullptr;
 thread_local char message[512];
 
@@ -243,12 +245,11 @@ void forget_needs(std::vector<char>& bytes, const std::string& folder) {
     }
 }
 
-void* open_copy(const std::string& path, const std::string& folder) {
+void* open_copy(const std::string& path, const std::string& folder, const char* error) {
     std::ifstream file(path, std::ios::binary);
     std::vector<char> bytes{std::istreambuf_iterator<char>(file), {}};
     if (!file || bytes.empty())
-        throw Error("GameIncomplete", path + " cannot be read; install the game again with: "
-                                             "sb3-torcs install-torcs");
+        throw Error("GameIncomplete", path + " cannot be read or is empty" + REINSTALL);
     forget_needs(bytes, folder);
     const int copy = memfd_create("torcs-module", MFD_CLOEXEC);
     if (copy < 0) throw Error("BackendUnavailable", std::string("memfd_create: ") + strerror(errno));
@@ -267,9 +268,7 @@ void* open_copy(const std::string& path, const std::string& folder) {
     if (!handle) {
         const std::string reason = loader_message();
         close(copy);
-        throw Error("BackendUnavailable",
-                    path + " will not load: " + reason + "; reinstall the game with: "
-                                                         "sb3-torcs install-torcs");
+        throw Error(error, path + " will not load: " + reason + REINSTALL);
     }
     return handle;
 }
@@ -304,11 +303,12 @@ bool is_memory(const std::string& import) {
 
 }  // namespace
 
-std::unique_ptr<Library> Library::take(const std::string& path, const std::string& folder) {
+std::unique_ptr<Library> Library::take(const std::string& path, const std::string& folder,
+                                       const char* error) {
     std::lock_guard<std::mutex> lock(libraries_mutex);
     auto& spare = pool()[path];
     if (spare.empty())
-        return std::unique_ptr<Library>(new Library(path, open_copy(path, folder), true));
+        return std::unique_ptr<Library>(new Library(path, open_copy(path, folder, error), true));
     std::unique_ptr<Library> library = std::move(spare.back());
     spare.pop_back();
     return library;
@@ -327,8 +327,8 @@ Library& Library::shared(const std::string& path, bool race_memory) {
     if (!library) {
         void* handle = dlopen(path.c_str(), RTLD_NOW | RTLD_GLOBAL);
         if (!handle)
-            throw Error("BackendUnavailable", path + " will not load: " + loader_message() +
-                                                  "; reinstall the game with: sb3-torcs install-torcs");
+            throw Error("BackendUnavailable",
+                        path + " will not load: " + loader_message() + REINSTALL);
         library.reset(new Library(path, handle, race_memory));
     }
     return *library;
@@ -338,9 +338,8 @@ void* Library::find(const char* symbol) const { return dlsym(handle_, symbol); }
 
 void* Library::require_address(const char* symbol) const {
     if (void* found = find(symbol)) return found;
-    throw Error("LayoutMismatch", path_ + " has no symbol " + symbol +
-                                      "; expected the libraries of TORCS 1.3.7: install them with "
-                                      "sb3-torcs install-torcs");
+    throw Error("LayoutMismatch",
+                path_ + " has no symbol " + symbol + ", which that of TORCS 1.3.7 has" + REINSTALL);
 }
 
 Library::Library(std::string path, void* handle, bool race_memory)

@@ -19,8 +19,10 @@ using Variables = std::vector<std::vector<char>>;
 class Library {
 public:
     // A copy of the module; one that an earlier race gave back is taken first, since libraries
-    // with C++ templates can never be unloaded. `folder` holds the libraries that all share.
-    static std::unique_ptr<Library> take(const std::string& path, const std::string& folder);
+    // with C++ templates can never be unloaded. `folder` holds the libraries that all share;
+    // `error` is the exception if it does not load.
+    static std::unique_ptr<Library> take(const std::string& path, const std::string& folder,
+                                         const char* error);
     static void give_back(std::unique_ptr<Library> library);
 
     // The one instance that all races share, with global symbols. What it allocates lives in the

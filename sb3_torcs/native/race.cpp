@@ -133,7 +133,11 @@ void Race::load_track() {
     if (!Params::read(game_, options_.track))
         throw Error("TrackFileError", options_.track + ": " + last_message());
     std::string path = options_.track;
-    track_ = track_interface_.build(path.data());
+    try {
+        track_ = track_interface_.build(path.data());
+    } catch (const Error& error) {
+        throw Error("TrackFileError", path + ": " + error.what());
+    }
     check_track(track_, Params::read(game_, options_.track), options_.track);
 }
 
@@ -152,7 +156,15 @@ Params Race::load_car(const std::string& name) {
     if (car.misfits(limits))
         throw Error("CarFileError", game_.data + path + " does not fit its category " + category +
                                         ": " + last_message());
-    return Params::merge(std::move(limits), std::move(car));
+    Params whole = Params::merge(std::move(limits), std::move(car));
+    // Without these the simulation reads what is not there, or divides by nothing.
+    const auto require = [&](bool has, const char* what) {
+        if (!has) throw Error("CarFileError", game_.data + path + " has no " + what);
+    };
+    require(whole.elements("Engine/data points") >= 2, "engine torque of two speeds or more");
+    require(whole.number("Car", "mass", 0.0f) > 0.0f, "mass");
+    require(whole.number("Engine", "revs limiter", 0.0f) > 0.0f, "rev limiter");
+    return whole;
 }
 
 void Race::load_cars() {
@@ -214,7 +226,7 @@ void Race::load_driver(CarElement& car, const Entry& entry) {
         Library*& library = robots_[entry.module];
         if (!library) {
             robot_libraries_.push_back(
-                game_.take_module("drivers/" + entry.module, entry.module));
+                game_.take_module("drivers/" + entry.module, entry.module, "RobotUnavailable"));
             library = robot_libraries_.back().get();
         }
         ModuleInfo module = module_info(*library, entry.module, entry.index);
