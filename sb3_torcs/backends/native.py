@@ -127,6 +127,7 @@ class NativeBackend:
     :param car: any of the game's
     :param range_finders: see :func:`sb3_torcs.sensors.range_finder_angles`
     :param opponents: robots, e.g. ``("inferno", "berniw:3")``
+    :param laps: of the race with opponents, who take fuel for so many; ``None`` drives on
     :param grid_place: of the agent among them, 1 in front; ``None`` is behind them all
     :param sensor_noise: whether sensors err as those of the SCR server's ``-noisy``
     """
@@ -138,6 +139,7 @@ class NativeBackend:
         car: str = "car1-trb1",
         range_finders: str | Sequence[float] = "scr",
         opponents: Sequence[str] = (),
+        laps: int | None = None,
         grid_place: int | None = None,
         sensor_noise: bool = False,
     ) -> None:
@@ -158,6 +160,7 @@ class NativeBackend:
             "car": car,
             "range_finders": range_finders,
             "opponents": tuple(opponents),
+            "laps": laps,
             "grid_place": grid_place,
             "sensor_noise": sensor_noise,
         }
@@ -167,6 +170,7 @@ class NativeBackend:
             entries,
             car=car,
             session="race" if opponents else "practice",
+            laps=laps if opponents and laps else 0,
             angles=self.range_finder_angles,
         )
         self.track: Track = load_track(track_path(game, track))
@@ -193,12 +197,43 @@ class NativeBackend:
             self.engine.start()
         else:
             self.engine.start_at(*start)
-        return self.engine.read(self._agent)
+        self._state = self.engine.read(self._agent)
+        return self._state
 
     def step(self, controls: Controls, ticks: int) -> CarState:
         """Drive on; see :class:`~sb3_torcs.backends.base.Backend`."""
         self._drive.append((controls, ticks))
-        return self.engine.step(*controls, ticks)
+        self._state: CarState = self.engine.step(*controls, ticks)
+        return self._state
+
+    def focus(self, direction: float) -> FloatArray:
+        """
+        Look ahead as the SCR server's ``focus`` sensors do, without their pause of a second.
+
+        :param direction: against the car's axis [rad], left negative
+        :return: (5,) distances to the road's edge [m] at 1 degree from each other; -1 off the road
+        """
+        return self.engine.focus(self._agent, direction)
+
+    def save(self) -> Any:
+        """
+        Keep the whole race, robots and noise included.
+
+        :return: a moment, for :meth:`restore` of this backend
+        """
+        return self.engine.save(), list(self._drive), self._state
+
+    def restore(self, moment: Any) -> CarState:
+        """
+        Go back; what follows equals what followed the first time, to the bit.
+
+        :param moment: from :meth:`save`
+        :return: the agent's car then
+        """
+        race, drive, self._state = moment
+        self.engine.restore(race)
+        self._drive = list(drive)
+        return self._state
 
     def close(self) -> None:
         """Give the race back to the pool of those that can be loaded again."""

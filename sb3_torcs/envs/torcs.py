@@ -68,6 +68,7 @@ class TorcsEnv(RacingEnv):
                 car=car,
                 range_finders=range_finders,
                 opponents=opponents,
+                laps=laps,
                 grid_place=grid_place,
                 sensor_noise=sensor_noise,
             ),

@@ -124,10 +124,9 @@ PYBIND11_MODULE(_engine, module) {
         }
     });
 
-    py::class_<Snapshot>(module, "Snapshot", "The whole state of a race at one moment.")
-        .def_property_readonly("size", [](const Snapshot& snapshot) {
-            return snapshot.memory.size();
-        });
+    py::class_<Moment>(module, "Moment", "The whole state of a race, to go back to.")
+        .def_property_readonly("size",
+                               [](const Moment& moment) { return moment.race.memory.size(); });
 
     py::class_<Engine>(module, "Engine", "One race of the real game.")
         .def(py::init([](const std::string& data, const std::string& libraries,
@@ -178,6 +177,10 @@ PYBIND11_MODULE(_engine, module) {
         .def("set_origin", &Engine::set_origin, "Move the positions that are read by x and y [m].")
         .def("save", &Engine::save)
         .def("restore", &Engine::restore)
+        .def("focus",
+             [](Engine& engine, int car, double direction) {
+                 return read_only(engine.focus(car, direction));
+             })
         .def("close", &Engine::close)
         .def("controls",
              [](Engine& engine, int car) {

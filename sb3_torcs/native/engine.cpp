@@ -2,6 +2,7 @@
 
 #include <pthread.h>
 
+#include <algorithm>
 #include <cmath>
 
 #include "errors.h"
@@ -61,14 +62,18 @@ void Engine::set_origin(double x, double y) {
     y_ = y;
 }
 
-Snapshot Engine::save() { return Access(*this)->save(); }
-
-void Engine::restore(const Snapshot& snapshot) {
+Moment Engine::save() {
     Access race(*this);
-    if (snapshot.race != &*race)
+    return {race->save(), noise_};
+}
+
+void Engine::restore(const Moment& moment) {
+    Access race(*this);
+    if (moment.race.race != &*race)
         throw Error("InvalidOption",
                     "the snapshot was saved by another engine; restore it where it was saved");
-    race->restore(snapshot);
+    race->restore(moment.race);
+    noise_ = moment.noise;
 }
 
 void Engine::close() {
@@ -77,12 +82,28 @@ void Engine::close() {
     race_.reset();
 }
 
+void Engine::check_car(const Race& race, int car) {
+    if (car < 0 || car >= race.cars_number())
+        throw Error("InvalidOption", "car is " + std::to_string(car) + "; expected 0 to " +
+                                         std::to_string(race.cars_number() - 1));
+}
+
 Reading Engine::read(int car) {
     Access race(*this);
-    if (car < 0 || car >= race->cars_number())
-        throw Error("InvalidOption", "car is " + std::to_string(car) + "; expected 0 to " +
-                                         std::to_string(race->cars_number() - 1));
+    check_car(*race, car);
     return read(*race, car);
+}
+
+std::array<double, FOCUS_BEAMS> Engine::focus(int car, double direction) {
+    Access race(*this);
+    check_car(*race, car);
+    std::array<double, RANGE_FINDERS> angles{}, distances;
+    for (int i = 0; i < FOCUS_BEAMS; i++)
+        angles[static_cast<std::size_t>(i)] = direction + (i - FOCUS_BEAMS / 2) * M_PI / 180.0;
+    range_finders(race->car(car), angles.data(), distances.data());
+    std::array<double, FOCUS_BEAMS> beams;
+    std::copy_n(distances.begin(), beams.size(), beams.begin());
+    return beams;
 }
 
 Reading Engine::read(Race& race, int index) {

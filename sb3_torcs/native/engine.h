@@ -25,6 +25,14 @@ struct Reading {
     std::array<double, OPPONENT_SECTORS> opponents;
 };
 
+// A race at one moment, with its sensors' noise.
+struct Moment {
+    Snapshot race;
+    std::optional<Generator> noise;
+};
+
+constexpr int FOCUS_BEAMS = 5;
+
 class Engine {
 public:
     Engine(Game& game, RaceOptions options, std::array<double, RANGE_FINDERS> angles);
@@ -35,8 +43,11 @@ public:
     Reading read(int car);
     void set_noise(std::optional<std::uint64_t> seed);
     void set_origin(double x, double y);  // added to positions that are read
-    Snapshot save();
-    void restore(const Snapshot& snapshot);
+    Moment save();
+    void restore(const Moment& moment);
+    // The SCR server's `focus`: distances at 1 degree from each other around a direction [rad]
+    // against the car's axis, left negative.
+    std::array<double, FOCUS_BEAMS> focus(int car, double direction);
     void close();
 
     // Drives what a list of controls says, one tick each, with or without sensors; for measuring.
@@ -60,6 +71,8 @@ public:
     Reading read(Race& race, int car);
 
 private:
+    static void check_car(const Race& race, int car);
+
     std::unique_ptr<Race> race_;
     std::array<double, RANGE_FINDERS> angles_;
     std::optional<Generator> noise_;

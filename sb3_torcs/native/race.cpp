@@ -454,8 +454,10 @@ void Race::start(const Start& start) {
         manage(car);
         // On the line itself, the lap has begun.
         if (i == agent_ && start.distance == 0.0 &&
-            car.pub.track.segment->race_info & AFTER_LINE)
+            car.pub.track.segment->race_info & AFTER_LINE) {
             car.race.crossings = 1;
+            car.race.remaining_laps--;
+        }
         measure_distance(car);
         world_->records[i].start_distance = car.race.distance_raced;
     }
