@@ -24,9 +24,10 @@ double wrapped(double angle) { return std::remainder(angle, 2.0 * M_PI); }
 }  // namespace
 
 Engine::Engine(Game& game, RaceOptions options, std::array<double, RANGE_FINDERS> angles)
-    : race_(std::make_unique<Race>(game, std::move(options))),
-      angles_(angles),
-      forks_(count_forks()) {}
+    : angles_(angles), forks_(count_forks()) {
+    const PlainRounding rounding;
+    race_ = std::make_unique<Race>(game, std::move(options));
+}
 
 Engine::Access::Access(Engine& engine) : engine_(engine) {
     if (engine.busy_.exchange(true, std::memory_order_acquire))

@@ -3,6 +3,7 @@
 
 #include <array>
 #include <atomic>
+#include <cfenv>
 #include <memory>
 #include <optional>
 #include <vector>
@@ -32,6 +33,22 @@ struct Moment {
 };
 
 constexpr int FOCUS_BEAMS = 5;
+
+// Libraries of the process may have set how numbers are rounded, or that tiny ones become zero: a
+// race is computed as in a process of its own.
+class PlainRounding {
+public:
+    PlainRounding() {
+        std::fegetenv(&previous_);
+        std::fesetenv(FE_DFL_ENV);
+    }
+    ~PlainRounding() { std::fesetenv(&previous_); }
+    PlainRounding(const PlainRounding&) = delete;
+    PlainRounding& operator=(const PlainRounding&) = delete;
+
+private:
+    std::fenv_t previous_;
+};
 
 class Engine {
 public:
@@ -66,6 +83,7 @@ public:
 
     private:
         Engine& engine_;
+        PlainRounding rounding_;
     };
 
     Reading read(Race& race, int car);
