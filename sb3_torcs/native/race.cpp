@@ -18,6 +18,7 @@ constexpr std::size_t TRACK_MEMORY = std::size_t{64} << 20;
 
 constexpr double COUNTDOWN = -2.0;   // [s]
 constexpr int SETTLING_STEPS = 500;  // of standing on the brake, so that the springs come to rest
+constexpr int SETTLING_STEPS_AT_REST = 300;  // of a car put down at the height at which it stands
 constexpr int AGAINST_RIGHT = 0;     // of to_global
 constexpr int MANY_LAPS = 1 << 30;
 
@@ -321,10 +322,12 @@ float Race::grid_to_right(int index) const {
 }
 
 void Race::place_on_grid(CarElement& car) {
-    place(car, grid_distance(car.index), grid_to_right(car.index), 0.0f);
+    place(car, grid_distance(car.index), grid_to_right(car.index), 0.0f,
+          grid_number("initial height", 0.3f));
 }
 
-void Race::place(CarElement& car, float distance, float to_right, float heading_error) {
+void Race::place(CarElement& car, float distance, float to_right, float heading_error,
+                 float height) {
     Segment* segment = track_->last;
     while (distance < segment->from_start) segment = segment->prev;
     const float along = distance - segment->from_start;
@@ -340,7 +343,7 @@ void Race::place(CarElement& car, float distance, float to_right, float heading_
     if (segment->type == RIGHT_TURN) pose.az = segment->heading - position.to_start;
     if (segment->type == LEFT_TURN) pose.az = segment->heading + position.to_start;
     pose.az -= heading_error;
-    pose.z = game_.road_height(&position) + grid_number("initial height", 0.3f);
+    pose.z = game_.road_height(&position) + height;
     while (pose.az > 2 * PI) pose.az -= 2 * PI;
     while (pose.az < 0) pose.az += 2 * PI;
     simulation_.config(&car, &world_->manager);
@@ -392,7 +395,8 @@ void Race::prepare() {
         car.robot->new_race(car.robot->index, &car, &world_->situation);
     }
     ready_ = save();
-    settle();
+    settle(SETTLING_STEPS);
+    for (int i = 0; i < cars_number(); i++) rest_heights_.push_back(height(i));
     check_simulation(*simulated_, world_->cars, cars_number());
     Situation& situation = world_->situation;
     world_->last_call = -1.0;
@@ -406,7 +410,7 @@ void Race::prepare() {
     on_grid_ = save();
 }
 
-void Race::settle() {
+void Race::settle(int steps) {
     simulation_.update(&world_->situation, PHYSICS_STEP, -1);
     for (int i = 0; i < cars_number(); i++) {
         CarElement& car = world_->cars[i];
@@ -416,7 +420,7 @@ void Race::settle() {
         car.control.brake = 1.0f;
         car.control.gear = world_->records[i].flying ? gear : 0;
     }
-    for (int i = 0; i < SETTLING_STEPS; i++)
+    for (int i = 0; i < steps; i++)
         simulation_.update(&world_->situation, PHYSICS_STEP, -1);
 }
 
@@ -436,13 +440,13 @@ void Race::start(const Start& start) {
             const double half_width = 0.5 * segment_at(distance)->width;
             place(car, static_cast<float>(distance),
                   static_cast<float>((1.0 + start.track_position) * half_width),
-                  static_cast<float>(start.heading_error));
+                  static_cast<float>(start.heading_error), rest_heights_[static_cast<std::size_t>(i)]);
         } else {
-            place(car, static_cast<float>(distance), grid_to_right(i), 0.0f);
+            place(car, static_cast<float>(distance), grid_to_right(i), 0.0f, rest_heights_[static_cast<std::size_t>(i)]);
         }
         car.control.gear = gear_for(car, start.speed);  // engages while the car settles
     }
-    settle();
+    settle(SETTLING_STEPS_AT_REST);
     Situation& situation = world_->situation;
     situation.state = RUNNING;
     situation.time = 0.0;

@@ -146,10 +146,10 @@ private:
     float grid_distance(int index) const;
     float grid_to_right(int index) const;
     void place_on_grid(CarElement& car);
-    void place(CarElement& car, float distance, float to_right, float heading_error);
+    void place(CarElement& car, float distance, float to_right, float heading_error, float height);
     void assign_pits();
     void prepare();
-    void settle();
+    void settle(int steps);
     const Segment* segment_at(double distance) const;
     int gear_for(const CarElement& car, double speed) const;
     void give_speed(CarElement& car, double speed);
@@ -193,6 +193,7 @@ private:
     World* world_ = nullptr;
     SimulatedCar** simulated_ = nullptr;
     int agent_ = -1;
+    std::vector<float> rest_heights_;  // [m] of each car's mass centre over the road, standing
     Snapshot ready_, on_grid_;
 };
 
