@@ -29,6 +29,11 @@ Engine::Engine(Game& game, RaceOptions options, std::array<double, RANGE_FINDERS
     race_ = std::make_unique<Race>(game, std::move(options));
 }
 
+Engine::~Engine() {
+    // In a child process the locks may be held by threads that stayed in the parent.
+    if (forks_ != forks) (void)race_.release();
+}
+
 Engine::Access::Access(Engine& engine) : engine_(engine) {
     if (engine.busy_.exchange(true, std::memory_order_acquire))
         throw Error("EngineBusy",

@@ -53,6 +53,9 @@ private:
 class Engine {
 public:
     Engine(Game& game, RaceOptions options, std::array<double, RANGE_FINDERS> angles);
+    ~Engine();
+    Engine(const Engine&) = delete;
+    Engine& operator=(const Engine&) = delete;
 
     void start();
     void start(const Start& start);

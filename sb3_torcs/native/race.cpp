@@ -106,8 +106,11 @@ void Race::close() {
         Hosted hosted(host_);
         for (int i = 0; i < world_->situation.cars_number; i++) {
             CarElement& car = world_->cars[i];
-            if (car.robot && car.robot->shutdown)
-                car.robot->shutdown(car.robot->index);
+            try {
+                if (car.robot && car.robot->shutdown) car.robot->shutdown(car.robot->index);
+            } catch (const Error&) {
+                // Its memory goes with the race all the same.
+            }
             Params(game_, car.priv.driver_params);
             Params(game_, car.priv.car_params);
         }
