@@ -30,6 +30,7 @@ KEYS = (
     "torcs_env_ticks_per_s",
     "torcs_env_repeat5_ticks_per_s",
     "torcs_reset_ms",
+    "torcs_load_ms",
     "torcs_vector2_ratio",
     "scr_ticks_per_s",
     "scr_reset_ms",
@@ -57,13 +58,33 @@ def stages(seconds: float) -> dict[str, Callable[[], Figures]]:
     :param seconds: to spend on all of them, about [s]
     :return: by name; each returns some of the figures
     """
-    share = seconds / 3.0
+    from sb3_torcs import bench_torcs
+
+    share = seconds / 5.0
     return {
         "environments": lambda: environments(share),
         "resets": resets,
+        "game": _where_it_is(lambda: bench_torcs.ticks(share)),
+        "game resets": _where_it_is(bench_torcs.resets),
+        "game loads": _where_it_is(bench_torcs.loads),
+        "game threads": _where_it_is(lambda: bench_torcs.vector(share)),
         "policy": lambda: _policy(share),
         "training": lambda: training_share(max(int(40.0 * share), 100)),
     }
+
+
+def _where_it_is(measure: Callable[[], Figures]) -> Callable[[], Figures]:
+    """Leave figures of the game empty where it cannot be driven."""
+
+    def measured() -> Figures:
+        from sb3_torcs.errors import BackendUnavailable
+
+        try:
+            return measure()
+        except BackendUnavailable:  # sb3-torcs doctor says why
+            return {}
+
+    return measured
 
 
 def environments(seconds: float) -> Figures:

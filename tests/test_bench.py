@@ -1,6 +1,9 @@
+import os
+
 import pytest
 
-from sb3_torcs import bench
+from sb3_torcs import bench, bench_torcs
+from sb3_torcs.errors import BackendUnavailable
 
 
 def test_every_figure_is_measured_once_or_empty(monkeypatch):
@@ -9,7 +12,7 @@ def test_every_figure_is_measured_once_or_empty(monkeypatch):
     stages = bench.stages(0.01)
     figures = stages["resets"]()
     assert list(figures) == ["lite_reset_ms"]
-    assert len(set(bench.KEYS)) == len(bench.KEYS) == 15
+    assert len(set(bench.KEYS)) == len(bench.KEYS) == 16
 
 
 def test_the_environments_are_measured_in_the_same_run(monkeypatch):
@@ -30,6 +33,70 @@ def test_the_measured_actions_keep_the_car_moving(monkeypatch):
     env.close()
     assert len(actions) == 500
     assert speeds[-1] > 10.0
+
+
+@pytest.fixture
+def short(game, monkeypatch):
+    """Turns of a fraction of a second."""
+    monkeypatch.setattr(bench_torcs, "TICKS_PER_TURN", 100)
+    monkeypatch.setattr(bench_torcs, "RESETS", 2)
+    monkeypatch.setattr(bench_torcs, "LOADS", 1)
+    monkeypatch.setattr(bench_torcs, "RACES", 2)
+    monkeypatch.setattr(bench_torcs, "BATCHES", 5)
+    monkeypatch.setattr(bench_torcs, "SLICE", 0.01)
+
+
+@pytest.mark.usefixtures("short")
+def test_the_game_is_measured_by_its_names():
+    figures = {**bench_torcs.ticks(0.0001), **bench_torcs.resets(), **bench_torcs.loads()}
+    assert list(figures) == [
+        "torcs_limit_ticks_per_s",
+        "torcs_cpp_ticks_per_s",
+        "torcs_env_ticks_per_s",
+        "torcs_env_repeat5_ticks_per_s",
+        "torcs_reset_ms",
+        "torcs_load_ms",
+    ]
+    assert min(figures.values()) > 0.0
+    assert set(figures) < set(bench.KEYS)
+
+
+@pytest.mark.usefixtures("short")
+def test_the_second_thread_is_measured_against_a_second_process(monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0, 1})
+    assert bench_torcs.vector(0.0001)["torcs_vector2_ratio"] > 0.0
+
+
+def test_one_core_has_no_second_thread_to_measure(monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0})
+    assert bench_torcs.vector(1.0) == {"torcs_vector2_ratio": None}
+
+
+@pytest.mark.usefixtures("game")
+def test_the_drive_of_the_limit_is_the_same_each_turn():
+    """Saving and restoring in between leaves no trace in it."""
+    env = bench_torcs.gym.make(bench_torcs.TORCS, action_repeat=1)
+    actions = bench_torcs._scripted_actions(env, 200)
+    engine = env.unwrapped.backend.engine
+    controls = bench_torcs.np.array(actions, float)
+    bench_torcs._limit(engine, controls)
+    place = engine.read(0)
+    engine.start()
+    engine.replay(controls, False)
+    expected = engine.read(0)
+    env.close()
+    assert place.speed_x > 10.0
+    assert place[:23] == expected[:23]
+
+
+def test_without_the_game_its_figures_stay_empty(monkeypatch):
+    def missing(*args):
+        raise BackendUnavailable("no TORCS")
+
+    for name in ("ticks", "resets", "loads", "vector"):
+        monkeypatch.setattr(bench_torcs, name, missing)
+    stages = bench.stages(1.0)
+    assert [stages[name]() for name in stages if name.startswith("game")] == [{}] * 4
 
 
 @pytest.mark.slow

@@ -197,13 +197,13 @@ class NativeBackend:
             self.engine.start()
         else:
             self.engine.start_at(*start)
-        self._state = self.engine.read(self._agent)
+        self._state: CarState = self.engine.read(self._agent)
         return self._state
 
     def step(self, controls: Controls, ticks: int) -> CarState:
         """Drive on; see :class:`~sb3_torcs.backends.base.Backend`."""
         self._drive.append((controls, ticks))
-        self._state: CarState = self.engine.step(*controls, ticks)
+        self._state = self.engine.step(*controls, ticks)
         return self._state
 
     def focus(self, direction: float) -> FloatArray:
@@ -255,40 +255,40 @@ class NativeBackend:
 
 class Fleet:
     """
-    Cars of several races that are driven at once.
+    Several worlds that are driven at once, by threads that live as long as this object.
 
     :param backends: each only once
-    :param threads: that drive, this one among them
+    :param threads: that drive, with the calling one among them
     """
 
     def __init__(self, backends: Sequence[NativeBackend], threads: int) -> None:
         self._backends = list(backends)
         self._fleet = _extension().Fleet([backend.engine for backend in backends], threads)
 
-    def begin(self, places: Sequence[int], controls: Sequence[Controls], ticks: int) -> None:
+    def begin(self, place: int, controls: Controls, ticks: int) -> None:
         """
-        Begin to drive, and return at once; backends that are not named can be used meanwhile.
+        Begin a step of one of them, and return at once. It must not be used until it is waited for.
 
-        :param places: of the backends to drive, each begun
-        :param controls: for each of these
-        :param ticks: control ticks of 0.02 s
+        :param place: of the backend
+        :param controls: as of ``step``
+        :param ticks: as of ``step``
         """
-        for place, control in zip(places, controls, strict=True):
-            self._backends[place]._drive.append((control, ticks))
-        self._fleet.begin(places, controls, ticks)
+        self._backends[place]._drive.append((controls, ticks))
+        self._fleet.begin(place, *controls, ticks)
 
-    def wait(self, i: int) -> CarState:
+    def wait(self, place: int) -> CarState:
         """
-        Drive until one car has been driven.
+        Drive until the step of one of them is done.
 
-        :param i: counts what ``begin`` named
-        :return: the car afterwards
+        :param place: of the backend
+        :return: as of ``step``
         """
-        state: CarState = self._fleet.wait(i)
+        state: CarState = self._fleet.wait(place)
+        self._backends[place]._state = state
         return state
 
     def finish(self) -> None:
-        """Drive until all have been driven; nothing is in use afterwards."""
+        """Drive until all steps are done."""
         self._fleet.finish()
 
 

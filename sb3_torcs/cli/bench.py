@@ -15,8 +15,13 @@ Measure speeds on one core, in processor time, the compared ones in turns.
 
 lite_ticks_per_s: env.step of TorcsLite-v0, action_repeat=1, on actions that a scripted driver
 chose beforehand; resets are not counted. racetrack_v1_steps_per_s: env.step of highway-env's
-racetrack-v1. policy_*: updates of a DDPG with SplitHeadPolicy, batch 64. training_env_share: part
-of a DDPG training step (shipped hyperparameters) that the environment and the callbacks take.
+racetrack-v1. torcs_limit_ticks_per_s: the bare physics of the game along a recorded drive;
+torcs_cpp_ticks_per_s: that drive in the engine, with rules and sensors; torcs_env_*: env.step of
+Torcs-v0 on it. torcs_reset_ms: to the grid and to random places by turns. torcs_load_ms: gym.make
+on the track that takes longest. torcs_vector2_ratio: what a second thread brings to gym.make_vec
+with 16 races, over what a second process brings to bare engines; the only one by the wall clock.
+policy_*: updates of a DDPG with SplitHeadPolicy, batch 64. training_env_share: part of a DDPG
+training step (shipped hyperparameters) that the environment and the callbacks take.
 What cannot be measured here is null.
 """
 

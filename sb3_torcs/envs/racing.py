@@ -172,15 +172,34 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         :return: observation, reward, terminated, truncated, info
         :raises InvalidAction: if the action has another shape or is not a number
         """
+        controls = self.begin_step(action)
+        return self.finish_step(self.backend.step(controls, self.action_repeat))
+
+    def begin_step(self, action: npt.NDArray[np.float32]) -> Controls:
+        """
+        Do what comes before the world moves: for those who drive several worlds at once.
+
+        :param action: as of ``step``
+        :return: what the backend has to be stepped with
+        """
         if self._closed or self.car is None:
             when = "close" if self._closed else "reset"
             remedy = "make a new environment" if self._closed else "call reset first"
             raise EnvClosed(f"step {'after' if self._closed else 'before'} {when}; {remedy}")
-        before = self.car
-        self._controls = controls = controls_from_action(action)
-        self.car = after = self.backend.step(controls, self.action_repeat)
+        self._controls = controls_from_action(action)
+        return self._controls
+
+    def finish_step(self, after: CarState) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """
+        Do what comes after the world has moved.
+
+        :param after: what the backend returned
+        :return: as ``step``
+        """
+        before, self.car = self.car, after
+        assert before is not None, "begin_step raises before the first reset"
         end = self._end(after)
-        terms = self._reward(before, after, controls, end)
+        terms = self._reward(before, after, self._controls, end)
         info = self._info(after, terms, end)
         if after.laps > before.laps:
             info["lap_time"] = after.last_lap_time

@@ -62,51 +62,53 @@ std::array<double, RANGE_FINDERS> angles_of(const std::vector<double>& angles) {
 // Several engines that are driven at once. Python keeps them alive.
 class Fleet {
 public:
-    Fleet(std::vector<Engine*> engines, int threads)
-        : engines_(std::move(engines)),
-          readings_(engines_.size()),
-          failures_(engines_.size()),
-          pool_(threads) {}
-
-    // Begin to drive some of them, named by their places.
-    void begin(std::vector<std::size_t> places, std::vector<Controls> controls, int ticks) {
-        if (places.size() != controls.size())
-            throw Error("InvalidAction", std::to_string(controls.size()) + " controls for " +
-                                             std::to_string(places.size()) + " cars");
-        for (const std::size_t place : places) engines_.at(place);
-        pool_.finish();
-        places_ = std::move(places);
-        controls_ = std::move(controls);
-        pool_.begin(places_.size(), [this, ticks](std::size_t i) { drive(i, ticks); });
+    Fleet(const std::vector<Engine*>& engines, int threads)
+        : tasks_(engines.size()), pool_(threads, tasks_.size(), [this](std::size_t i) { work(i); }) {
+        for (std::size_t i = 0; i < engines.size(); i++) {
+            if (!engines[i]) throw py::type_error("engine is None; expected an Engine");
+            tasks_[i].engine = engines[i];
+        }
     }
 
-    // The car that was named there, when it has been driven.
-    const Reading& wait(std::size_t i) {
-        pool_.wait(i);
-        if (failures_[places_[i]]) std::rethrow_exception(failures_[places_[i]]);
-        return readings_[places_[i]];
+    void begin(std::size_t place, const Controls& controls, int ticks) {
+        Task& task = tasks_.at(place);
+        pool_.wait(place);
+        task.controls = controls;
+        task.ticks = ticks;
+        pool_.begin(place);
+    }
+
+    const Reading& wait(std::size_t place) {
+        Task& task = tasks_.at(place);
+        pool_.wait(place);
+        if (task.failure) std::rethrow_exception(task.failure);
+        return task.reading;
     }
 
     void finish() { pool_.finish(); }
 
 private:
-    void drive(std::size_t i, int ticks) {
-        const std::size_t place = places_[i];
-        failures_[place] = nullptr;
+    struct Task {
+        Engine* engine;
+        Controls controls;
+        int ticks;
+        Reading reading;
+        std::exception_ptr failure;
+    };
+
+    void work(std::size_t place) {
+        Task& task = tasks_[place];
+        task.failure = nullptr;
         try {
-            Engine::Access race(*engines_[place]);
-            race->drive(controls_[i], ticks);
-            readings_[place] = engines_[place]->read(*race, race->agent());
+            Engine::Access race(*task.engine);
+            race->drive(task.controls, task.ticks);
+            task.reading = task.engine->read(*race, race->agent());
         } catch (...) {
-            failures_[place] = std::current_exception();
+            task.failure = std::current_exception();
         }
     }
 
-    std::vector<Engine*> engines_;
-    std::vector<Reading> readings_;
-    std::vector<std::exception_ptr> failures_;
-    std::vector<std::size_t> places_;
-    std::vector<Controls> controls_;
+    std::vector<Task> tasks_;
     Pool pool_;  // last, so that its threads end first
 };
 
@@ -240,24 +242,21 @@ PYBIND11_MODULE(_engine, module) {
         });
 
     py::class_<Fleet>(module, "Fleet", "Engines that are driven at once, on threads that stay.")
-        .def(py::init<std::vector<Engine*>, int>(), py::keep_alive<1, 2>(), "engines"_a,
+        .def(py::init<const std::vector<Engine*>&, int>(), py::keep_alive<1, 2>(), "engines"_a,
              "threads"_a)
         .def("begin",
-             [](Fleet& fleet, std::vector<std::size_t> places,
-                const std::vector<std::tuple<double, double, double, std::optional<int>>>& controls,
-                int ticks) {
-                 std::vector<Controls> list;
-                 for (const auto& [steering, throttle, brake, gear] : controls)
-                     list.push_back(controls_of(steering, throttle, brake, gear));
+             [](Fleet& fleet, std::size_t place, double steering, double throttle, double brake,
+                std::optional<int> gear, int ticks) {
+                 const Controls controls = controls_of(steering, throttle, brake, gear);
                  py::gil_scoped_release released;
-                 fleet.begin(std::move(places), std::move(list), ticks);
+                 fleet.begin(place, controls, ticks);
              })
         .def("wait",
-             [](Fleet& fleet, std::size_t i) {
+             [](Fleet& fleet, std::size_t place) {
                  const Reading* reading;
                  {
                      py::gil_scoped_release released;
-                     reading = &fleet.wait(i);
+                     reading = &fleet.wait(place);
                  }
                  return as_state(*reading);
              })

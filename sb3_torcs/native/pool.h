@@ -1,13 +1,16 @@
-// Threads that stay, and share the jobs of a batch with the thread that waits for the results.
+// Threads that stay, and share a queue of jobs with the thread that waits for the results.
 #pragma once
 
 #include <unistd.h>
 
-#include <cfenv>
+#include <atomic>
 #include <condition_variable>
+#include <deque>
 #include <functional>
 #include <memory>
 #include <mutex>
+#include <string>
+#include <system_error>
 #include <thread>
 #include <vector>
 
@@ -17,97 +20,115 @@ namespace torcs {
 
 class Pool {
 public:
-    // With the thread that calls, which works while it waits.
-    explicit Pool(int threads) : shared_(std::make_unique<Shared>()), process_(getpid()) {
-        for (int i = 1; i < threads; i++) shared_->threads.emplace_back(work, shared_.get());
+    static constexpr int MOST_THREADS = 1024;
+
+    // Jobs have numbers below `jobs`, and must not throw. The calling thread is one of the threads:
+    // it works while it waits.
+    Pool(int threads, std::size_t jobs, std::function<void(std::size_t)> work)
+        : shared_(std::make_unique<Shared>(jobs, std::move(work))), process_(getpid()) {
+        if (threads < 1 || threads > MOST_THREADS)
+            throw Error("InvalidOption", "threads is " + std::to_string(threads) +
+                                             "; expected 1 to " + std::to_string(MOST_THREADS));
+        try {
+            for (int i = 1; i < threads; i++)
+                shared_->threads.emplace_back(&Shared::serve, shared_.get());
+        } catch (const std::system_error&) {
+            shared_->stop();
+            throw Error("InvalidOption", "the system gives no " + std::to_string(threads) +
+                                             " threads; take fewer, one per core is enough");
+        }
     }
     ~Pool() {
-        if (forked()) {
-            // The threads were left behind in the parent, perhaps with the lock.
-            (void)shared_.release();
-            return;
-        }
-        {
-            std::lock_guard<std::mutex> lock(shared_->mutex);
-            shared_->stopped = true;
-        }
-        shared_->begun.notify_all();
-        for (std::thread& thread : shared_->threads) thread.join();
+        if (forked())
+            (void)shared_.release();  // its threads stayed in the parent, perhaps with the lock
+        else
+            shared_->stop();
     }
     Pool(const Pool&) = delete;
     Pool& operator=(const Pool&) = delete;
 
-    // Begin jobs 0 to number - 1, in this order. They must not throw.
-    void begin(std::size_t number, std::function<void(std::size_t)> job) {
-        finish();
+    // Queue a job. It has to be waited for before it is begun again.
+    void begin(std::size_t job) {
+        check();
         {
             std::lock_guard<std::mutex> lock(shared_->mutex);
-            // Libraries set how small numbers are rounded, thread by thread.
-            std::fegetenv(&shared_->rounding);
-            shared_->job = std::move(job);
-            shared_->next = shared_->finished = 0;
-            shared_->done.assign(number, false);
+            shared_->pending[job] = true;
+            shared_->queue.push_back(job);
         }
-        shared_->begun.notify_all();
+        shared_->added.notify_one();
     }
 
-    // Do jobs until this one is done, by whomever.
-    void wait(std::size_t index) {
+    // Work until a job is done, by whomever.
+    void wait(std::size_t job) {
         check();
         std::unique_lock<std::mutex> lock(shared_->mutex);
-        while (!shared_->done.at(index))
-            if (!shared_->do_next(lock)) shared_->ended.wait(lock);
+        while (shared_->pending[job])
+            if (!shared_->do_next(lock)) shared_->await(lock, job);
     }
 
-    // Do jobs until all are done.
+    // Work until all jobs are done.
     void finish() {
-        check();
-        std::unique_lock<std::mutex> lock(shared_->mutex);
-        while (shared_->finished < shared_->done.size())
-            if (!shared_->do_next(lock)) shared_->ended.wait(lock);
+        for (std::size_t job = 0; job < shared_->pending.size(); job++) wait(job);
     }
 
 private:
+    // Looks at a job before sleeping: it is done within about the time that falling asleep and
+    // being woken take.
+    static constexpr int PATIENCE = 200;
+
     struct Shared {
-        std::mutex mutex;
-        std::condition_variable begun, ended;
-        std::vector<std::thread> threads;
-        std::function<void(std::size_t)> job;
-        std::fenv_t rounding;
-        std::vector<bool> done;
-        std::size_t next = 0, finished = 0;
-        bool stopped = false;
+        Shared(std::size_t jobs, std::function<void(std::size_t)> what)
+            : work(std::move(what)), pending(jobs) {}
 
         bool do_next(std::unique_lock<std::mutex>& lock) {
-            if (next == done.size()) return false;
-            const std::size_t index = next++;
+            if (queue.empty()) return false;
+            const std::size_t job = queue.front();
+            queue.pop_front();
             lock.unlock();
-            job(index);
+            work(job);
             lock.lock();
-            done[index] = true;
-            finished++;
-            ended.notify_all();
+            pending[job] = false;
+            done.notify_all();
             return true;
         }
-    };
 
-    static void work(Shared* shared) {
-        std::unique_lock<std::mutex> lock(shared->mutex);
-        while (!shared->stopped) {
-            if (shared->next == shared->done.size()) {
-                shared->begun.wait(lock);
-                continue;
-            }
-            std::fesetenv(&shared->rounding);
-            shared->do_next(lock);
+        void await(std::unique_lock<std::mutex>& lock, std::size_t job) {
+            lock.unlock();
+            for (int i = 0; i < PATIENCE && pending[job]; i++) std::this_thread::yield();
+            lock.lock();
+            if (pending[job]) done.wait(lock);
         }
-    }
+
+        void serve() {
+            std::unique_lock<std::mutex> lock(mutex);
+            while (!stopped) {
+                if (!do_next(lock)) added.wait(lock);
+            }
+        }
+
+        void stop() {
+            {
+                std::lock_guard<std::mutex> lock(mutex);
+                stopped = true;
+            }
+            added.notify_all();
+            for (std::thread& thread : threads) thread.join();
+        }
+
+        std::mutex mutex;
+        std::condition_variable added, done;
+        std::function<void(std::size_t)> work;
+        std::deque<std::size_t> queue;
+        std::vector<std::atomic<bool>> pending;
+        std::vector<std::thread> threads;
+        bool stopped = false;
+    };
 
     bool forked() const { return getpid() != process_; }
     void check() const {
         if (forked())
             throw Error("EngineForked",
-                        "these threads belong to the parent process; make the environment after "
+                        "these engines belong to the parent process; make the environment after "
                         "the fork");
     }
 
