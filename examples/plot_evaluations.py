@@ -20,8 +20,8 @@ for row, run in zip(rows, args.runs, strict=True):
     row.plot(saved["timesteps"], returns, color="tab:blue", marker="o", markersize=3)
     row.plot(saved["timesteps"][best], returns[best], color="tab:red", marker="o")
     row.set_title(f"{run}", fontsize=8, loc="left", pad=2)
-    row.set_ylim(bottom=0.0)
     row.grid(alpha=0.3)
+rows[-1].set_ylim(bottom=0.0)  # of all rows: they share the axis
 rows[-1].set_xlabel("decisions learned from")
 figure.supylabel("return of the evaluation from the grid", fontsize=9)
 figure.savefig(args.out, dpi=110)

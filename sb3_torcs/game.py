@@ -16,6 +16,7 @@ from typing import NamedTuple
 from sb3_torcs.errors import (
     GameIncomplete,
     GameNotFound,
+    InvalidOption,
     TrackFileError,
     TrackNotFound,
     UnknownCar,
@@ -54,6 +55,7 @@ MODULES = (  # what a race without a window needs, in the folder of libraries
 PHYSICS = "modules/simu/simuv2.so"
 SURFACES = "data/tracks/surfaces.xml"
 NOT_ROBOTS = ("human",)
+SCR_CAR = "car1-trb1"  # of the SCR championship, and the default of the environments
 
 
 @dataclass(frozen=True, order=True)
@@ -163,6 +165,28 @@ class Game:
                 f"the game at {self.data} has no car '{name}'{hint} it has {', '.join(cars)}"
             )
         return cars[name]
+
+    def parse_robot(self, text: str) -> tuple[str, int]:
+        """
+        Read a robot's name, perhaps with the index of its driver.
+
+        :param text: ``"inferno:5"``; or ``"inferno"`` for its first driver of ``car1-trb1``, or its
+            first driver if none has that car
+        :return: name and index
+        :raises InvalidOption: if what follows the colon is no index
+        :raises UnknownRobot: if there is none of this name, or none with this index
+        """
+        name, colon, index = text.strip().partition(":")
+        if not name or (colon and not index.isdigit()):
+            raise InvalidOption(f"robot {text!r}: expected NAME or NAME:INDEX, e.g. inferno:3")
+        if colon:
+            return name, self.find_robot(name, int(index)).index
+        drivers = self.robots().get(name, ())
+        if not drivers:
+            return name, self.find_robot(name, 0).index  # whose error says which there are
+        cars = self.cars()
+        best = min(drivers, key=lambda d: (d.car != SCR_CAR, d.car not in cars, d.index))
+        return name, self.find_robot(name, best.index).index
 
     def find_robot(self, name: str, index: int) -> RobotEntry:
         """

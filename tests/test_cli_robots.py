@@ -169,9 +169,8 @@ class TestRefusals:
         assert (status, out) == (2, "")
         assert "there is no TORCS in" in err
 
-    @pytest.mark.parametrize("rivals", ["", "a:b", ":3", "a,,b"])
-    def test_rivals_have_a_form(self, capsys, rivals):
-        with pytest.raises(SystemExit) as caught:
-            main(["robots", "racer", "--with", rivals])
-        assert caught.value.code == 2
-        assert "expected NAME:INDEX, e.g. berniw:3" in capsys.readouterr().err
+    @pytest.mark.parametrize("rivals", ["", "racer:b", ":3", "racer,,racer"])
+    def test_rivals_have_a_form(self, fake, capsys, rivals):
+        status, out, err = run(capsys, "racer", "--track", "loop", "--with", f"racer:3,{rivals}")
+        assert (status, out) == (2, "")
+        assert "expected NAME or NAME:INDEX, e.g. inferno:3" in err

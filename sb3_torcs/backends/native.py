@@ -19,7 +19,7 @@ from sb3_torcs.tracks import Track, load_track
 if TYPE_CHECKING:
     from sb3_torcs._engine import Engine
 
-__all__ = ["AGENT", "Fleet", "NativeBackend", "check_layout", "make_engine", "parse_robot"]
+__all__ = ["AGENT", "Fleet", "NativeBackend", "check_layout", "make_engine"]
 
 AGENT = ("", 0)
 """The agent's entry in a starting list; robots have a name and an index."""
@@ -101,24 +101,6 @@ def track_path(game: Game, track: str | os.PathLike[str]) -> Path:
     return game.tracks()[game.find_track(os.fspath(track))].absolute()
 
 
-def parse_robot(name: str) -> tuple[str, int]:
-    """
-    Read the name of an opponent.
-
-    :param name: ``"inferno"`` for the one that drives ``car1-trb1``, or ``"inferno:5"``
-    :return: name and index
-    """
-    robot, colon, index = name.partition(":")
-    if colon and not index.isdigit():
-        raise InvalidOption(f"opponent {name!r}: expected NAME or NAME:INDEX, e.g. 'inferno:3'")
-    if colon:
-        return robot, int(index)
-    for entry in find_game().robots().get(robot, ()):
-        if entry.car == "car1-trb1":
-            return robot, entry.index
-    return robot, 0  # whose error says which there are
-
-
 class NativeBackend:
     """
     One agent in the real game, alone or among its robots.
@@ -145,14 +127,14 @@ class NativeBackend:
     ) -> None:
         if isinstance(opponents, str):
             raise InvalidOption(f"opponents is {opponents!r}; expected a list of names")
-        entries = [parse_robot(name) for name in opponents]
+        game = find_game()
+        entries = [game.parse_robot(name) for name in opponents]
         place = len(entries) + 1 if grid_place is None else grid_place
         if not is_count(place) or place > len(entries) + 1:
             raise InvalidOption(
                 f"grid_place is {grid_place!r}; expected 1 to {len(entries) + 1}, or None"
             )
         entries.insert(place - 1, AGENT)
-        game = find_game()
         self.car = car
         self.range_finder_angles = range_finder_angles(range_finders)
         self._settings: dict[str, Any] = {

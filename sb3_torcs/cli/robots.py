@@ -15,7 +15,6 @@ if TYPE_CHECKING:
 
 __all__ = ["add_parser", "run"]
 
-DEFAULT_INDEX = 3
 ROBOT_HEADERS = ("robot", "index", "name", "car")
 LAP_HEADERS = ("lap", "time s", "damage")
 RACE_HEADERS = ("rank", "robot", "index", "car", "laps", "total s", "best lap s", "damage", "out")
@@ -40,11 +39,11 @@ def add_parser(subparsers: Any) -> None:
     )
     add = parser.add_argument
     add("name", nargs="?", metavar="NAME", help="e.g. inferno")
-    add("--index", type=natural, default=DEFAULT_INDEX, metavar="I",
-        help="which of the robot's drivers; default: 3")  # fmt: skip
+    add("--index", type=natural, metavar="I",
+        help="which of the robot's drivers; default: that of car1-trb1")  # fmt: skip
     add("--track", default="aalborg", metavar="T", help="default: aalborg")
     add("--laps", type=positive, default=3, metavar="N", help="default: 3")
-    add("--with", type=_rivals, default=[], dest="rivals", metavar="NAME:I,…",
+    add("--with", dest="rivals", metavar="NAME:I,…",
         help="race against these, who start behind")  # fmt: skip
     add("--game", action="store_true", help="by the game's text mode, not by the engine")
     add("--telemetry", metavar="FILE", help="write the drive itself down; only by the engine")
@@ -69,9 +68,9 @@ def run(args: argparse.Namespace) -> int:
     telemetry = None
     if args.telemetry is not None:
         telemetry = writable_file(args.telemetry, (Path(args.telemetry).suffix.lower(),))
-    robots = [(args.name, args.index), *args.rivals]
-    for robot in robots:
-        game.find_robot(*robot)
+    name = args.name if args.index is None else f"{args.name}:{args.index}"
+    rivals = [] if args.rivals is None else args.rivals.split(",")
+    robots = [game.parse_robot(word) for word in (name, *rivals)]
     is_file = args.track.lower().endswith(".xml") and not args.game
     track = args.track if is_file else game.find_track(args.track)
     with quiet_output(args.json):
@@ -83,21 +82,6 @@ def run(args: argparse.Namespace) -> int:
     if telemetry is not None:
         print(f"telemetry: {telemetry}")
     return 0
-
-
-def _rivals(text: str) -> list[tuple[str, int]]:
-    """
-    Read ``NAME:INDEX,…``, for argparse.
-
-    :param text: from the command line
-    """
-    rivals = []
-    for word in text.split(","):
-        name, colon, index = word.strip().partition(":")
-        if not name or (colon and not index.isdigit()):
-            raise argparse.ArgumentTypeError(f"{word!r}: expected NAME:INDEX, e.g. berniw:3")
-        rivals.append((name, int(index) if colon else DEFAULT_INDEX))
-    return rivals
 
 
 def _list(game: Game, as_json: bool) -> None:
