@@ -20,6 +20,7 @@ from stable_baselines3.common.vec_env import VecEnv
 import sb3_torcs  # noqa: F401  registers the environments
 from sb3_torcs import cli, rewards, zoo
 from sb3_torcs.driving_metrics import DrivingMetricsCallback
+from sb3_torcs.envs.torcs import TorcsEnv
 from sb3_torcs.envs.torcs_lite import TorcsLiteEnv
 from sb3_torcs.noise import BLOG
 from sb3_torcs.sensors import RANGE_FINDERS, sensor_table
@@ -45,15 +46,28 @@ def one_line(text):
     return " ".join(text.split()).replace("``", "`")
 
 
-def arguments_table():
-    parameters = inspect.signature(TorcsLiteEnv.__init__).parameters
-    said = dict(re.findall(r":param (\w+): (.*?)(?=\n\s*:|\Z)", TorcsLiteEnv.__doc__, re.DOTALL))
+def arguments(environment):
+    """Rows of the keyword arguments of an environment, as its signature and docstring say."""
+    parameters = inspect.signature(environment.__init__).parameters
+    said = dict(re.findall(r":param (\w+): (.*?)(?=\n\s*:|\Z)", environment.__doc__, re.DOTALL))
     rows = []
     for name, parameter in parameters.items():
         if name == "self":
             continue
-        default = json.dumps(parameter.default).replace("null", "None")
-        rows.append([f"`{name}`", f"`{default}`", one_line(said[name])])
+        default = parameter.default
+        shown = json.dumps(default) if isinstance(default, str) else repr(default)
+        rows.append([f"`{name}`", f"`{shown}`", one_line(said[name])])
+    return rows
+
+
+def arguments_table():
+    return markdown(["argument", "default", ""], arguments(TorcsLiteEnv))
+
+
+def torcs_arguments_table():
+    """What the real game adds to the arguments of the other world, or says otherwise."""
+    shared = arguments(TorcsLiteEnv)
+    rows = [row for row in arguments(TorcsEnv) if row not in shared]
     return markdown(["argument", "default", ""], rows)
 
 
@@ -139,6 +153,7 @@ GENERATED = {
     "README.md": {"verbs": verbs_table},
     "docs/environments.md": {
         "arguments": arguments_table,
+        "torcs-arguments": torcs_arguments_table,
         "sensors": sensor_table,
         "range-finders": range_finders_table,
         "terms": terms_table,
@@ -298,8 +313,11 @@ def test_a_command_in_the_docs_parses_and_names_what_exists(page, line, parsed, 
             check_zoo(parsed_by_the_zoo(words, monkeypatch))
         case ["make", target, *_]:
             assert target in TARGETS
+        case ["python", script, *_]:
+            assert (ROOT / script).is_relative_to(ROOT / "examples")
+            assert (ROOT / script).is_file()
         case ["sudo", "apt", "install", *packages]:
-            assert set(packages) <= {"git", "make", "g++", "python3-venv", "torcs-data"}
+            assert set(packages) <= {"git", "make", "g++", "python3-dev", "python3-venv"}
         case other:
             pytest.fail(f"{other} is nothing that a test knows")
 
@@ -326,13 +344,16 @@ def check(args, monkeypatch):
         changed = parsed_by_the_zoo(["--gym-packages", "sb3_torcs", *words], monkeypatch)
         assert set(changed.hyperparams or ()) <= set(entry)
     if args.verb == "evaluate":
-        run = re.fullmatch(r"logs/(?:\w+/)?(\w+)/TorcsLite-v0_1(/best_model\.zip)?", args.model)
+        run = re.fullmatch(
+            r"logs/(?:\w+/)?(\w+)/Torcs(?:Lite)?-v0_1(?:/best_model\.zip)?", args.model
+        )
         assert args.model == "scripted" or zoo.config_file(run[1])
 
 
 def check_zoo(args):
     """Look up what a command of the zoo names."""
-    allowed = inspect.signature(TorcsLiteEnv.__init__).parameters
+    environment = {"TorcsLite-v0": TorcsLiteEnv, "Torcs-v0": TorcsEnv}[args.env]
+    allowed = inspect.signature(environment.__init__).parameters
     zoo.read_entry(Path(args.conf_file), args.env)
     assert Path(args.conf_file).stem == args.algo
     for keywords in (args.env_kwargs or {}, args.eval_env_kwargs or {}):
