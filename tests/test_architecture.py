@@ -22,7 +22,7 @@ LONGER_FILES = {
 # Lower floors know nothing of higher ones. A name stands for the module or the folder.
 FLOORS = (
     {"errors", "car"},
-    {"tracks", "torcs_params", "track_file", "track_xml", "track_random", "track_plot"},
+    {"game", "tracks", "torcs_params", "track_file", "track_xml", "track_random", "track_plot"},
     {"sensors", "actions", "rewards"},
     {"backends"},
     {"highway", "scenery", "hud", "rendering", "video"},
@@ -35,6 +35,7 @@ LEARNING = {
     "progress",
 }  # fmt: skip
 GRAPHICS = {"highway", "scenery", "hud", "rendering"}
+STARTS_PROGRAMS = {"text_mode.py", "cli/install_torcs.py"}  # nothing that drives imports them
 
 
 class Import(NamedTuple):
@@ -141,7 +142,8 @@ def test_arrows_point_downward(path):
     """Modules import from their own floor or a lower one when they are loaded."""
     (floor,) = [number for number, units in enumerate(FLOORS) if unit(path) in units]
     below = set().union(*FLOORS[: floor + 1])
-    own = [found for found in imports_of(source(path)) if found.within("sb3_torcs")]
+    # The package itself registers the environments and loads nothing.
+    own = [found for found in imports_of(source(path)) if found.name.startswith("sb3_torcs.")]
     upward = [f.name for f in own if not f.lazy and f.name.split(".")[1] not in below]
     assert upward == []
 
@@ -161,10 +163,43 @@ def test_no_clock_stands_in_the_way_of_a_step(path):
 
 @pytest.mark.parametrize("path", FILES, ids=named)
 def test_no_shell_and_no_other_process(path):
-    assert forbidden(path, {"subprocess", "pty", "pexpect", "os.system", "os.popen"}) == []
+    processes = set() if named(path) in STARTS_PROGRAMS else {"subprocess"}
+    assert forbidden(path, processes | {"pty", "pexpect", "os.system", "os.popen"}) == []
     text = source(path)
-    for word in ("os.system", "os.popen", "os.exec", "os.spawn", "pkill", "killall"):
+    for word in ("os.system", "os.popen", "os.exec", "os.spawn", "pkill", "killall", "shell=True"):
         assert word not in text
+
+
+@pytest.mark.parametrize("path", [p for p in FILES if unit(p) != "cli"], ids=named)
+def test_only_verbs_start_programs(path):
+    starters = {f"sb3_torcs.{name[:-3].replace('/', '.')}" for name in STARTS_PROGRAMS}
+    assert forbidden(path, starters) == []
+
+
+@pytest.mark.parametrize("path", FILES, ids=named)
+def test_one_file_knows_the_engine(path):
+    """All others go through it, so that there is one place that says how to build it."""
+    found = forbidden(path, {"sb3_torcs._engine"})
+    assert found == (["sb3_torcs._engine"] if named(path) == "backends/native.py" else [])
+
+
+def test_the_engine_loads_only_when_somebody_drives():
+    path = PACKAGE / "backends" / "native.py"
+    assert forbidden(path, {"sb3_torcs._engine"}, lazy_too=False) == []
+
+
+@pytest.mark.parametrize("path", of({"robots", "race_results"}), ids=named)
+def test_robots_need_no_agent(path):
+    packages = {"gymnasium", "torch", "stable_baselines3", "rl_zoo3", "sb3_torcs.envs"}
+    assert forbidden(path, packages) == []
+
+
+@pytest.mark.parametrize("path", sorted((PACKAGE / "native").iterdir()), ids=lambda p: p.name)
+def test_one_file_knows_python(path):
+    """The engine could be used from C++."""
+    text = source(path)
+    assert ("pybind11" in text) == (path.name == "bindings.cpp")
+    assert "Python.h" not in text
 
 
 ALLOWED_OF_RANDOM = {"Generator", "default_rng", "SeedSequence", "PCG64", "BitGenerator"}

@@ -9,14 +9,16 @@ import types
 import numpy as np
 import pytest
 import yaml
+from fake_game import write_game
 from stable_baselines3 import DDPG
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_torcs import bench, models
 from sb3_torcs.cli import VERBS, common, doctor, evaluate, main, recording, train
 from sb3_torcs.cli.train import TrainOptions
+from sb3_torcs.errors import BackendUnavailable
 
-NAMES = [verb.__name__.rpartition(".")[2] for verb in VERBS]
+NAMES = [verb.__name__.rpartition(".")[2].replace("_", "-") for verb in VERBS]
 PNG = b"\x89PNG"
 
 ENTRY = {
@@ -148,6 +150,16 @@ def test_tracks_as_json_is_a_list_of_what_is_in_the_table(capsys):
     assert [set(track) for track in tracks] == [keys] * len(tracks)
     listed = run(capsys, "tracks")[1]
     assert [line.split()[0] for line in listed.splitlines()[2:]] == [t["name"] for t in tracks]
+
+
+def test_tracks_lists_those_of_the_game_too(capsys, game):
+    """Each once: where a bundled one has the same name, that one."""
+    listed = json.loads(run(capsys, "tracks", "--json")[1])
+    names = [f"{track['category']}/{track['name']}" for track in listed]
+    assert sorted(names) == sorted(game.tracks())
+    assert {track["source"] for track in listed} == {"bundled", "torcs"}
+    sources = {track["name"]: track["source"] for track in listed}
+    assert (sources["aalborg"], sources["michigan"]) == ("bundled", "torcs")
 
 
 def test_tracks_lists_only_those_that_are_named(capsys):
@@ -404,17 +416,85 @@ def test_the_shipped_hyperparameters_train(tmp_path):
 # doctor
 
 
-def test_the_doctor_is_not_content_without_the_game(capsys):
-    """Torcs-v0 has no engine in this version, and the exit status must say so."""
+PARTS = (
+    "python", "TorcsLite-v0", "compiler", "extension", "game", "tracks", "cars", "layout",
+    "Torcs-v0", "text mode", "window",
+)  # fmt: skip
+
+
+def doctor_says(capsys):
     status, out, _ = run(capsys, "doctor", "--json")
     result = json.loads(out)
     by_name = {check["name"]: check for check in result["checks"]}
-    assert (status, result["ok"]) == (1, False)
+    assert len(by_name) == len(result["checks"])
+    assert set(PARTS) <= set(by_name)
     assert {tuple(check) for check in result["checks"]} == {("name", "ok", "found", "fix")}
-    assert by_name["TorcsLite-v0"]["ok"]
-    assert not by_name["Torcs-v0"]["ok"]
-    assert "TorcsLite-v0" in by_name["Torcs-v0"]["fix"]
     assert all(bool(check["fix"]) != check["ok"] for check in result["checks"])
+    assert (status, result["ok"]) in {(0, True), (1, False)}
+    assert result["ok"] == all(check["ok"] for check in result["checks"])
+    return result["ok"], by_name
+
+
+def test_the_doctor_is_content_with_the_game_and_the_engine(capsys, game):
+    ok, found = doctor_says(capsys)
+    assert ok, [check for check in found.values() if not check["ok"]]
+    assert "21 road" in found["tracks"]["found"]
+    assert found["text mode"]["found"] == str(game.program)
+
+
+def test_the_doctor_is_not_content_without_the_game(capsys, monkeypatch, tmp_path):
+    monkeypatch.setenv("SB3_TORCS_HOME", str(tmp_path))
+    ok, found = doctor_says(capsys)
+    assert not ok
+    assert found["TorcsLite-v0"]["ok"]
+    assert found["game"]["found"].startswith(f"there is no TORCS in {tmp_path}")
+    assert "`sb3-torcs install-torcs`" in found["game"]["fix"]
+    for part in ("tracks", "cars", "layout"):
+        assert found[part]["found"] == "there is no game to look at"
+        assert found[part]["fix"] == found["game"]["fix"]
+    assert not found["Torcs-v0"]["ok"]
+    # Nothing that drives in this process needs them.
+    assert found["text mode"]["ok"]
+    assert found["window"]["ok"]
+
+
+def test_the_doctor_names_each_missing_part(capsys, monkeypatch, tmp_path):
+    write_game(tmp_path)
+    (tmp_path / "share/games/torcs/cars/big/big.xml").unlink()
+    monkeypatch.setenv("SB3_TORCS_HOME", str(tmp_path))
+    monkeypatch.setitem(sys.modules, "sb3_torcs._engine", None)
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    ok, found = doctor_says(capsys)
+    assert not ok
+    assert found["compiler"]["found"] == "none of no-such-compiler"
+    assert found["extension"] == {
+        "name": "extension", "ok": False, "found": "sb3_torcs._engine is not built",
+        "fix": doctor.BUILD,
+    }  # fmt: skip
+    assert found["game"]["ok"]
+    assert "mud-1.xml: there are no track segments" in found["tracks"]["found"]
+    assert found["cars"]["found"] == "1, no car1-trb1"
+    assert found["layout"]["found"] == "not compared: the extension is missing"
+    assert "no torcs-bin" in found["text mode"]["found"]
+
+
+def test_the_doctor_compares_the_layout(capsys, monkeypatch, game):
+    def check_layout(asked):
+        raise BackendUnavailable(f"TORCS at {asked.root} is another version; install 1.3.7")
+
+    native = types.ModuleType("sb3_torcs.backends.native")
+    native.check_layout = check_layout
+    engine = types.ModuleType("sb3_torcs._engine")
+    engine.__file__ = "engine.so"
+    monkeypatch.setitem(sys.modules, "sb3_torcs.backends.native", native)
+    monkeypatch.setitem(sys.modules, "sb3_torcs._engine", engine)
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    ok, found = doctor_says(capsys)
+    assert not ok
+    assert found["layout"]["found"] == f"TORCS at {game.root} is another version"
+    assert found["layout"]["fix"] == "install 1.3.7"
+    # What is built already needs no compiler.
+    assert found["compiler"]["ok"]
 
 
 def test_the_doctor_survives_what_is_broken():

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env as check_gymnasium
 from gymnasium.utils.env_checker import data_equivalence
+from gymnasium.wrappers import PassiveEnvChecker
 from stable_baselines3.common.env_checker import check_env as check_sb3
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
@@ -21,8 +22,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 import sb3_torcs
 from sb3_torcs.drivers import ScriptedDriver
 from sb3_torcs.errors import BackendUnavailable
+from sb3_torcs.sensors import encode
 
-WORLDS = ["TorcsLite-v0"]
+WORLDS = ["TorcsLite-v0", "Torcs-v0"]
 
 ROLLOUT = """
 import sys, hashlib, gymnasium as gym, numpy as np, sb3_torcs
@@ -40,6 +42,8 @@ print(digest.hexdigest())
 
 @pytest.fixture(params=WORLDS)
 def world(request):
+    if request.param == "Torcs-v0":
+        request.getfixturevalue("game")  # which fails where there is none
     return request.param
 
 
@@ -130,6 +134,20 @@ def test_observations_stay_in_their_space(world):
     env = gym.make(world)
     for answer in rollout(world, 11, 500, start="random"):
         assert env.observation_space.contains(answer[0]), answer[0]
+
+
+def test_an_observation_is_what_the_sensor_table_makes_of_the_car(world):
+    """Also where a world encodes its states itself."""
+    for answer in rollout(world, 6, 200, start="random"):
+        assert encode(answer[-1]["car"]).tobytes() == answer[0].tobytes()
+
+
+def test_no_checker_stands_between_the_agent_and_the_world(world):
+    """It would be asked at every step; both libraries' checks above look at more."""
+    env = gym.make(world)
+    while env is not env.unwrapped:
+        assert not isinstance(env, PassiveEnvChecker)
+        env = env.env
 
 
 def test_no_memory_is_shared_between_steps(world):
@@ -247,6 +265,23 @@ def test_importing_the_package_twice_registers_once():
         sb3_torcs.register_envs()
 
 
-def test_the_real_game_is_never_replaced_in_silence():
+def test_the_real_game_is_never_replaced_in_silence(monkeypatch):
+    """Without the engine it is an error that names the other world, for whoever wants that."""
+    monkeypatch.setitem(sys.modules, "sb3_torcs._engine", None)
+    monkeypatch.delattr("sb3_torcs._engine", raising=False)
     with pytest.raises(BackendUnavailable, match="TorcsLite-v0"):
         gym.make("sb3_torcs:Torcs-v0", track="aalborg")
+
+
+def test_a_model_of_one_world_drives_in_the_other():
+    """They share their spaces to the bit; so a policy of one loads in the other."""
+    lite, real = (gym.make(world, track="g-track-1") for world in WORLDS)
+    assert lite.observation_space == real.observation_space
+    assert lite.action_space == real.action_space
+    driver = ScriptedDriver()
+    for env in (lite, real):
+        observation, _ = env.reset(seed=0)
+        for _ in range(100):
+            observation, *_, info = env.step(driver.predict(observation)[0])
+        assert info["distance"] > 50.0
+        assert info["end"] is None

@@ -101,6 +101,7 @@ private:
         task.failure = nullptr;
         try {
             Engine::Access race(*task.engine);
+            Engine::check_agent(*race);
             race->drive(task.controls, task.ticks);
             task.reading = task.engine->read(*race, race->agent());
         } catch (...) {
@@ -163,6 +164,7 @@ PYBIND11_MODULE(_engine, module) {
                 {
                     py::gil_scoped_release released;
                     Engine::Access race(engine);
+                    Engine::check_agent(*race);
                     race->drive(controls, ticks);
                     reading = engine.read(*race, race->agent());
                 }
@@ -186,7 +188,9 @@ PYBIND11_MODULE(_engine, module) {
         .def("close", &Engine::close)
         .def("controls",
              [](Engine& engine, int car) {
-                 const Control& control = Engine::Access(engine)->car(car).control;
+                 const Engine::Access race(engine);
+                 Engine::check_car(*race, car);
+                 const Control& control = race->car(car).control;
                  return py::make_tuple(control.steering, control.throttle, control.brake,
                                        control.gear);
              })
@@ -196,12 +200,16 @@ PYBIND11_MODULE(_engine, module) {
                                [](Engine& engine) { return Engine::Access(engine)->ended(); })
         .def("car_name",
              [](Engine& engine, int car) {
-                 return std::string(Engine::Access(engine)->car(car).info.car);
+                 const Engine::Access race(engine);
+                 Engine::check_car(*race, car);
+                 return std::string(race->car(car).info.car);
              })
         .def("laps",
              [](Engine& engine, int car) {
                  py::list laps;
-                 for (const LapRecord& lap : Engine::Access(engine)->laps(car))
+                 const Engine::Access race(engine);
+                 Engine::check_car(*race, car);
+                 for (const LapRecord& lap : race->laps(car))
                      laps.append(py::make_tuple(lap.time, lap.damage));
                  return laps;
              })
@@ -230,6 +238,10 @@ PYBIND11_MODULE(_engine, module) {
              [](Engine& engine, const py::array_t<double, py::array::c_style>& controls,
                 bool sensors) {
                  const auto rows = controls.unchecked<2>();
+                 if (rows.shape(1) != 3)
+                     throw Error("InvalidAction",
+                                 "controls have " + std::to_string(rows.shape(1)) +
+                                     " columns; expected 3: steering, throttle, brake");
                  std::vector<Controls> list;
                  for (py::ssize_t i = 0; i < rows.shape(0); i++)
                      list.push_back(controls_of(rows(i, 0), rows(i, 1), rows(i, 2), {}));

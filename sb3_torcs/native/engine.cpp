@@ -25,6 +25,14 @@ double wrapped(double angle) { return std::remainder(angle, 2.0 * M_PI); }
 
 Engine::Engine(Game& game, RaceOptions options, std::array<double, RANGE_FINDERS> angles)
     : angles_(angles), forks_(count_forks()) {
+    const auto agents =
+        std::count_if(options.entries.begin(), options.entries.end(),
+                      [](const Entry& entry) { return entry.module.empty(); });
+    if (options.entries.empty() || agents > 1)
+        throw Error("InvalidOption", std::to_string(options.entries.size()) + " drivers, " +
+                                         std::to_string(agents) +
+                                         " of them agents; expected one or more, and one agent at "
+                                         "most");
     const PlainRounding rounding;
     race_ = std::make_unique<Race>(game, std::move(options));
 }
@@ -52,7 +60,23 @@ Engine::Access::Access(Engine& engine) : engine_(engine) {
 
 void Engine::start() { Access(*this)->start(); }
 
-void Engine::start(const Start& start) { Access(*this)->start(start); }
+void Engine::start(const Start& start) {
+    Access race(*this);
+    check_agent(*race);
+    const double length = race->track().length;
+    // A car may stand a little beyond the last centimetre: lengths are added up in other ways.
+    if (!(start.distance >= 0.0 && start.distance <= length + 1.0) ||
+        !(std::fabs(start.track_position) <= 5.0) ||
+        !(std::fabs(start.heading_error) <= 2.0 * M_PI) ||
+        !(start.speed >= 0.0 && start.speed <= 200.0))
+        throw Error("InvalidOption",
+                    "start at " + std::to_string(start.distance) + " m, place across " +
+                        std::to_string(start.track_position) + ", heading error " +
+                        std::to_string(start.heading_error) + " rad, " +
+                        std::to_string(start.speed) + " m/s; expected 0 to " +
+                        std::to_string(length) + " m, -5 to 5, -2 pi to 2 pi, 0 to 200 m/s");
+    race->start(start);
+}
 
 void Engine::drive(const Controls& controls, int ticks) { Access(*this)->drive(controls, ticks); }
 
@@ -75,7 +99,7 @@ Moment Engine::save() {
 
 void Engine::restore(const Moment& moment) {
     Access race(*this);
-    if (moment.race.race != &*race)
+    if (moment.race.race != race->number())
         throw Error("InvalidOption",
                     "the snapshot was saved by another engine; restore it where it was saved");
     race->restore(moment.race);
@@ -86,6 +110,11 @@ void Engine::close() {
     if (!race_ || forks_ != forks) return;
     Access race(*this);
     race_.reset();
+}
+
+void Engine::check_agent(const Race& race) {
+    if (race.agent() < 0)
+        throw Error("InvalidOption", "this race has robots only; put the agent into its list");
 }
 
 void Engine::check_car(const Race& race, int car) {
@@ -155,6 +184,7 @@ Reading Engine::read(Race& race, int index) {
 
 void Engine::replay(const std::vector<Controls>& controls, bool sensors) {
     Access race(*this);
+    check_agent(*race);
     double sum = 0.0;
     for (const Controls& control : controls) {
         race->drive(control, 1);

@@ -91,9 +91,10 @@ public:
 
     Reading read(Race& race, int car);
 
-private:
     static void check_car(const Race& race, int car);
+    static void check_agent(const Race& race);
 
+private:
     std::unique_ptr<Race> race_;
     std::array<double, RANGE_FINDERS> angles_;
     std::optional<Generator> noise_;

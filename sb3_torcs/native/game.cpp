@@ -78,6 +78,7 @@ Game::Game(const std::string& data, const std::string& libraries, const std::str
 }
 
 Params Params::read(Game& game, const std::string& path) {
+    forget_printed();
     return {game, game.read_file_(path.c_str(), READ_SHARED | READ_AGAIN | READ_PRIVATE)};
 }
 

@@ -26,7 +26,7 @@ public:
     std::recursive_mutex mutex;
 
     std::unique_ptr<Library> take_module(const std::string& kind, const std::string& name,
-                                         const char* error = "BackendUnavailable") const {
+                                         const char* error = "GameIncomplete") const {
         return Library::take(libraries + kind + "/" + name + ".so", libraries + "lib/", error);
     }
 

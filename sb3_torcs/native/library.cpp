@@ -35,7 +35,7 @@ namespace {
 const char* const REINSTALL = "; install the game again with: sb3-torcs install-torcs";
 
 thread_local Host* current = nullptr;
-thread_local char message[512];
+thread_local std::string messages;  // what was printed since they were forgotten
 
 // ---- What the modules' imports become ------------------------------------------------------------
 
@@ -88,8 +88,12 @@ long no_time_passes() { return 0; }
 // second run would then not equal the first.
 FILE* open_file(const char* path, const char* mode) {
     if (std::strpbrk(mode, "wa+")) return fopen("/dev/null", mode);
-    if (path[0] == '/' || !current) return fopen(path, mode);
-    return fopen((current->data + path).c_str(), mode);
+    if (!current) return fopen(path, mode);
+    if (path[0] != '/') return fopen((current->data + path).c_str(), mode);
+    FILE* file = fopen(path, mode);
+    // A track names what all tracks share relative to itself; it may lie outside of the game.
+    const char* common = file ? nullptr : std::strstr(path, "/data/tracks/");
+    return common ? fopen((current->data + (common + 1)).c_str(), mode) : file;
 }
 
 int make_directory(const char*, unsigned) {
@@ -98,9 +102,12 @@ int make_directory(const char*, unsigned) {
 }
 
 int keep_message(const char* format, va_list arguments) {
-    char line[sizeof message];
+    constexpr std::size_t ENOUGH = 600;  // the first ones tell the cause
+    char line[512];
     const int length = vsnprintf(line, sizeof line, format, arguments);
-    if (length > 0 && line[0] != '\n') std::memcpy(message, line, sizeof line);
+    std::string text = line;
+    while (!text.empty() && (text.back() == '\n' || text.back() == ' ')) text.pop_back();
+    if (!text.empty() && messages.size() < ENOUGH) messages += (messages.empty() ? "" : "; ") + text;
     return length;
 }
 
@@ -151,7 +158,7 @@ int print_character(int character) { return character; }
 void print_error(const char* text) { print("%s: %s", text, strerror(errno)); }
 
 [[noreturn]] void leave(int) {
-    throw Error("BackendUnavailable", "the game gave up: " + last_message());
+    throw Error("BackendUnavailable", "the game gave up: " + printed());
 }
 
 [[noreturn]] void leave_by_abort() { leave(1); }
@@ -209,6 +216,29 @@ std::string loader_message() {
     return text ? text : "unknown reason";
 }
 
+// The loader trusts its headers: a file that ends before them would end the process.
+void check_whole(const std::vector<char>& bytes, const std::string& path, const char* error) {
+    const auto* header = reinterpret_cast<const ElfW(Ehdr)*>(bytes.data());
+    bool whole = bytes.size() >= sizeof(ElfW(Ehdr)) &&
+                 std::memcmp(header->e_ident, ELFMAG, SELFMAG) == 0 &&
+                 header->e_phoff + header->e_phnum * sizeof(ElfW(Phdr)) <= bytes.size();
+    for (int i = 0; whole && i < header->e_phnum; i++) {
+        const auto* part = reinterpret_cast<const ElfW(Phdr)*>(bytes.data() + header->e_phoff) + i;
+        whole = part->p_offset <= bytes.size() && part->p_filesz <= bytes.size() - part->p_offset;
+    }
+    if (!whole)
+        throw Error(error, path + " is no library, or only a part of one" + REINSTALL);
+}
+
+std::vector<char> read_library(const std::string& path, const char* error) {
+    std::ifstream file(path, std::ios::binary);
+    std::vector<char> bytes{std::istreambuf_iterator<char>(file), {}};
+    if (!file || bytes.empty())
+        throw Error(error, path + " cannot be read or is empty" + REINSTALL);
+    check_whole(bytes, path, error);
+    return bytes;
+}
+
 // A module may need one of the game's own libraries, by a name that only the game's wrapper script
 // lets the loader find. Those are loaded with global symbols already; the copy forgets the need.
 void forget_needs(std::vector<char>& bytes, const std::string& folder) {
@@ -246,10 +276,7 @@ void forget_needs(std::vector<char>& bytes, const std::string& folder) {
 }
 
 void* open_copy(const std::string& path, const std::string& folder, const char* error) {
-    std::ifstream file(path, std::ios::binary);
-    std::vector<char> bytes{std::istreambuf_iterator<char>(file), {}};
-    if (!file || bytes.empty())
-        throw Error("GameIncomplete", path + " cannot be read or is empty" + REINSTALL);
+    std::vector<char> bytes = read_library(path, error);
     forget_needs(bytes, folder);
     const int copy = memfd_create("torcs-module", MFD_CLOEXEC);
     if (copy < 0) throw Error("BackendUnavailable", std::string("memfd_create: ") + strerror(errno));
@@ -325,9 +352,10 @@ Library& Library::shared(const std::string& path, bool race_memory) {
     std::lock_guard<std::mutex> lock(libraries_mutex);
     auto& library = shared_libraries()[path];
     if (!library) {
+        read_library(path, "GameIncomplete");
         void* handle = dlopen(path.c_str(), RTLD_NOW | RTLD_GLOBAL);
         if (!handle)
-            throw Error("BackendUnavailable",
+            throw Error("GameIncomplete",
                         path + " will not load: " + loader_message() + REINSTALL);
         library.reset(new Library(path, handle, race_memory));
     }
@@ -456,10 +484,8 @@ Random* new_random(Arena& arena) {
     return random;
 }
 
-std::string last_message() {
-    std::string text = message;
-    while (!text.empty() && (text.back() == '\n' || text.back() == ' ')) text.pop_back();
-    return text;
-}
+std::string printed() { return messages; }
+
+void forget_printed() { messages.clear(); }
 
 }  // namespace torcs

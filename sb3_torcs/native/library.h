@@ -78,7 +78,9 @@ private:
 
 Random* new_random(Arena& arena);  // in the state in which a process begins
 
-// The last line that a module printed; the game explains its failures there.
-std::string last_message();
+// What modules would have printed on this thread since `forget_printed`: the game explains its
+// failures there.
+std::string printed();
+void forget_printed();
 
 }  // namespace torcs

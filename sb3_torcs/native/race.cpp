@@ -2,6 +2,7 @@
 #include "race.h"
 
 #include <algorithm>
+#include <atomic>
 #include <cmath>
 #include <cstring>
 
@@ -20,6 +21,7 @@ constexpr double COUNTDOWN = -2.0;   // [s]
 constexpr int SETTLING_STEPS = 500;  // of standing on the brake, so that the springs come to rest
 constexpr int SETTLING_STEPS_AT_REST = 300;  // of a car put down at the height at which it stands
 constexpr int AGAINST_RIGHT = 0;     // of to_global
+constexpr float ON_THE_LINE = 0.25f; // [m] behind it at most; cars move a little as they settle
 constexpr int MANY_LAPS = 1 << 30;
 
 // Shift points of the SCR car, 8500 and 7500 rpm of the 9152 at which its limiter cuts in, as
@@ -83,6 +85,8 @@ Race::Race(Game& game, RaceOptions options)
       arena_(take_arena(RACE_MEMORY)),
       track_arena_(take_arena(TRACK_MEMORY)),
       session_(game, nullptr) {
+    static std::atomic<std::uint64_t> races{0};
+    number_ = ++races;
     std::lock_guard<std::recursive_mutex> lock(game_.mutex);
     host_ = {&arena_, new_random(arena_), game_.data};
     track_host_ = {&track_arena_, host_.random, game_.data};
@@ -135,8 +139,9 @@ void Race::load_track() {
     ModuleInfo module = module_info(*track_library_, "track", 0);
     module.init(module.index, &track_interface_);
     if (!Params::read(game_, options_.track))
-        throw Error("TrackFileError", options_.track + ": " + last_message());
+        throw Error("TrackFileError", options_.track + ": " + printed());
     std::string path = options_.track;
+    forget_printed();
     try {
         track_ = track_interface_.build(path.data());
     } catch (const Error& error) {
@@ -148,7 +153,7 @@ void Race::load_track() {
 Params Race::load_car(const std::string& name) {
     const std::string path = "cars/" + name + "/" + name + ".xml";
     Params car = Params::read(game_, path);
-    if (!car) throw Error("CarFileError", game_.data + path + ": " + last_message());
+    if (!car) throw Error("CarFileError", game_.data + path + ": " + printed());
     const std::string category = car.text("Car", "category");
     if (category.empty())
         throw Error("CarFileError",
@@ -156,17 +161,21 @@ Params Race::load_car(const std::string& name) {
     const std::string category_path = "categories/" + category + ".xml";
     Params limits = Params::read(game_, category_path);
     if (!limits)
-        throw Error("CarFileError", game_.data + category_path + ": " + last_message());
+        throw Error("CarFileError", game_.data + path + " is of the category " + category +
+                                        ", but " + category_path + " cannot be read: " + printed());
     if (car.misfits(limits))
         throw Error("CarFileError", game_.data + path + " does not fit its category " + category +
-                                        ": " + last_message());
+                                        ": " + printed());
     Params whole = Params::merge(std::move(limits), std::move(car));
     // Without these the simulation reads what is not there, or divides by nothing.
     const auto require = [&](bool has, const char* what) {
         if (!has) throw Error("CarFileError", game_.data + path + " has no " + what);
     };
     require(whole.elements("Engine/data points") >= 2, "engine torque of two speeds or more");
+    require(whole.elements("Gearbox/gears") >= 2, "gears");
     require(whole.number("Car", "mass", 0.0f) > 0.0f, "mass");
+    require(whole.number("Engine", "inertia", 0.2f) > 0.0f, "engine inertia");
+    require(whole.number("Car", "fuel tank", 80.0f) > 0.0f, "fuel tank");
     require(whole.number("Engine", "revs limiter", 0.0f) > 0.0f, "rev limiter");
     return whole;
 }
@@ -176,7 +185,7 @@ void Race::load_cars() {
     session_ = Params::read(game_, "config/raceman/" + options_.session + ".xml");
     if (!session_)
         throw Error("GameIncomplete", game_.data + "config/raceman/" + options_.session +
-                                          ".xml: " + last_message());
+                                          ".xml: " + printed());
     race_name_ = session_.text("Races/1", "name");
     simulation_library_ = game_.take_module("modules/simu", "simuv2");
     ModuleInfo module = module_info(*simulation_library_, "simuv2", 0);
@@ -239,7 +248,7 @@ void Race::load_driver(CarElement& car, const Entry& entry) {
             Params::read(game_, "drivers/" + entry.module + "/" + entry.module + ".xml");
         if (!driver)
             throw Error("GameIncomplete", game_.data + "drivers/" + entry.module + "/" +
-                                              entry.module + ".xml: " + last_message());
+                                              entry.module + ".xml: " + printed());
         const std::string section = "Robots/index/" + std::to_string(entry.index);
         copy_name(car.priv.module, entry.module);
         copy_name(car.info.name, driver.text(section.c_str(), "name", "<none>"));
@@ -262,7 +271,7 @@ void Race::load_driver(CarElement& car, const Entry& entry) {
         Params setup(game_, own);
         if (setup.misfits(params))
             throw Error("RobotUnavailable", entry.module + " has a set-up that does not fit " +
-                                                car_name + ": " + last_message());
+                                                car_name + ": " + printed());
         params = Params::merge(std::move(params), std::move(setup));
     }
     car.priv.car_params = params.release();
@@ -457,11 +466,12 @@ void Race::start(const Start& start) {
     world_->last_call = -ROBOT_STEP;
     for (int i = 0; i < cars_number(); i++) {
         CarElement& car = world_->cars[i];
+        // It may have settled across the line.
+        world_->records[i].previous = car.pub.track;
         give_speed(car, start.speed);
         manage(car);
         // On the line itself, the lap has begun.
-        if (i == agent_ && start.distance == 0.0 &&
-            car.pub.track.segment->race_info & AFTER_LINE) {
+        if (car.race.distance_from_start < ON_THE_LINE) {
             car.race.crossings = 1;
             car.race.remaining_laps--;
         }
@@ -489,6 +499,8 @@ int Race::gear_for(const CarElement& car, double speed) const {
 
 void Race::give_speed(CarElement& car, double speed) {
     SimulatedCar& simulated = (*simulated_)[car.index];
+    simulated.damage = car.priv.damage = 0;  // of being put down level on a slope
+    if (speed == 0.0) return;
     const double yaw = simulated.global.pos.az;
     simulated.local.vel.x = static_cast<float>(speed);
     simulated.global.vel.x = static_cast<float>(speed * std::cos(yaw));
@@ -513,10 +525,17 @@ void Race::give_speed(CarElement& car, double speed) {
 void Race::drive(const Controls& controls, int ticks) {
     Hosted hosted(host_);
     world_->controls = controls;
-    for (int i = 0; i < ticks && !ended(); i++) {
+    // Who has an agent decides himself when it is over.
+    const auto over = [this] { return agent_ < 0 && ended(); };
+    for (int i = 0; i < ticks && !over(); i++) {
         step();
-        while (!call_is_due() && !ended()) step();
+        while (!call_is_due() && !over()) step();
     }
+    for (int i = 0; i < cars_number(); i++)
+        if (!std::isfinite(car(i).pub.local.vel.x) || !std::isfinite(car(i).pub.local.pos.x))
+            throw Error("GameFailed", "the game's physics has divided by zero, " +
+                                          std::string(car(i).info.name) +
+                                          " is nowhere; call reset to go on");
 }
 
 void Race::update_physics(int steps) {
@@ -541,9 +560,20 @@ void Race::step() {
         world_->last_call = 0.0;
     }
     if (situation.time - world_->last_call >= ROBOT_STEP) call_drivers();
+    keep_rolling();
     simulation_.update(&situation, PHYSICS_STEP, -1);
     for (int i = 0; i < situation.cars_number; i++) manage(*world_->order[i]);
     sort();
+}
+
+// A wheel that moves sideways, and forwards by exactly nothing, divides by zero in the game's tyre
+// model. That is rare, and ends the game's drive; here such a car rolls by a hair.
+void Race::keep_rolling() {
+    constexpr float HAIR = 1e-5f;  // [m/s]
+    for (int i = 0; i < world_->situation.cars_number; i++) {
+        Pose& velocity = (*simulated_)[i].local.vel;
+        if (velocity.x == 0.0f && velocity.az == 0.0f && velocity.y != 0.0f) velocity.x = HAIR;
+    }
 }
 
 void Race::call_drivers() {
@@ -599,7 +629,7 @@ std::vector<LapRecord> Race::laps(int index) const {
 }
 
 Snapshot Race::save() const {
-    Snapshot snapshot{this, arena_.save(), {}};
+    Snapshot snapshot{number_, arena_.save(), {}};
     snapshot.variables.push_back(simulation_library_->save());
     for (const auto& library : robot_libraries_) snapshot.variables.push_back(library->save());
     return snapshot;

@@ -63,7 +63,7 @@ struct Result {
 };
 
 struct Snapshot {
-    const void* race;
+    std::uint64_t race;  // number of the one that it is of
     std::vector<char> memory;
     std::vector<Variables> variables;
 };
@@ -88,6 +88,8 @@ public:
 
     Snapshot save() const;
     void restore(const Snapshot& snapshot);
+
+    std::uint64_t number() const { return number_; }
 
     // What follows is read between two calls; index counts the starting list.
     const TrackData& track() const { return *track_; }
@@ -156,6 +158,7 @@ private:
 
     void step();
     bool call_is_due() const;
+    void keep_rolling();
     void call_drivers();
     void drive_agent(CarElement& car);
     static int automatic_gear(const CarPrivate& car);
@@ -174,6 +177,7 @@ private:
     void add_penalty(CarElement& car, int kind);
     void sort();
 
+    std::uint64_t number_;
     Game& game_;
     RaceOptions options_;
     Arena& arena_;

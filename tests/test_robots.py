@@ -1,0 +1,172 @@
+"""The engine drives as the game does: every time to the millisecond, every damage.
+
+This is a choice that takes seconds; ``examples/compare_with_game.py`` compares them all.
+"""
+
+from __future__ import annotations
+
+import csv
+import itertools
+
+import pytest
+
+from sb3_torcs.errors import InvalidOption, OutputNotWritable, TrackNotFound, UnknownRobot
+from sb3_torcs.robots import MAX_ROBOTS, TELEMETRY_FIELDS, race
+from sb3_torcs.text_mode import run as run_game
+
+ROBOTS = ["inferno", "berniw", "bt", "olethros", "tita", "lliaw"]
+EVERYBODY_ON = ["road/aalborg", "oval/michigan", "dirt/dirt-1"]
+ONE_MORE = [
+    ("inferno", "road/corkscrew"),  # the steepest
+    ("inferno", "road/wheel-2"),  # a figure of eight, with a bridge
+    ("berniw", "road/e-track-6"),
+    ("berniw", "dirt/mixed-2"),  # two surfaces
+    ("bt", "road/alpine-1"),  # it refuels
+    ("bt", "oval/b-speedway"),
+    ("olethros", "road/g-track-3"),
+    ("olethros", "dirt/dirt-3"),
+    ("tita", "oval/e-track-5"),
+    ("tita", "road/street-1"),  # walls beside the road
+    ("lliaw", "dirt/dirt-4"),
+    ("lliaw", "road/e-track-2"),
+]
+FIELDS = [
+    (["inferno", "berniw", "bt", "olethros"], "road/aalborg"),
+    (["lliaw", "tita", "inferno", "berniw"], "oval/michigan"),
+    (["bt", "olethros", "tita", "lliaw"], "dirt/dirt-2"),
+    (["bt:1", "bt:3", "inferno:3", "inferno:4"], "road/g-track-1"),  # modules with two drivers
+]
+
+
+def milliseconds(seconds):
+    """The game writes six digits: those that are milliseconds are exact."""
+    return None if seconds is None else round(1000 * seconds)
+
+
+def laps_of(result):
+    return [(milliseconds(lap.time), lap.damage) for lap in result.laps]
+
+
+def standing(result):
+    """What the game writes down about a race: no laps of it."""
+    return (
+        result.rank,
+        result.robot,
+        result.index,
+        result.car,
+        result.laps_completed,
+        milliseconds(result.total_time),
+        milliseconds(result.best_lap),
+        result.damage,
+        result.out,
+    )
+
+
+class TestEqualToTheGame:
+    @pytest.mark.parametrize(
+        ("robot", "track"), [(r, t) for t in EVERYBODY_ON for r in ROBOTS] + ONE_MORE
+    )
+    def test_a_practice(self, game, robot, track):
+        driver = game.parse_robot(robot)
+        (theirs,) = run_game(game, track, [driver], 3)
+        (ours,) = race([driver], track, 3)
+        assert len(ours.laps) == 3
+        assert laps_of(ours) == laps_of(theirs)
+        assert milliseconds(ours.best_lap) == milliseconds(theirs.best_lap)
+        assert milliseconds(ours.total_time) == milliseconds(theirs.total_time)
+        assert (ours.damage, ours.out, ours.car) == (theirs.damage, theirs.out, theirs.car)
+
+    @pytest.mark.parametrize(("field", "track"), FIELDS)
+    def test_a_race(self, game, field, track):
+        drivers = [game.parse_robot(name) for name in field]
+        theirs = run_game(game, track, drivers, 3, "race")
+        ours = race(drivers, track, 3, session="race")
+        assert [standing(result) for result in ours] == [standing(result) for result in theirs]
+
+    def test_a_car_of_another_category(self, game):
+        """The agent's car is not everybody's."""
+        (theirs,) = run_game(game, "g-track-1", [("sparkle", 0)], 2)
+        (ours,) = race([("sparkle", 0)], "g-track-1", 2)
+        assert ours.car == "baja-bug"
+        assert laps_of(ours) == laps_of(theirs)
+
+
+class TestItself:
+    def test_a_race_is_the_same_again(self, game):
+        drivers = [game.parse_robot(name) for name in ("bt", "olethros", "inferno")]
+        first = race(drivers, "dirt-2", 2, session="race")
+        race([("lliaw", 3)], "michigan", 1)  # whose modules the next one may get
+        assert race(drivers, "dirt-2", 2, session="race") == first
+
+    def test_laps_add_up_to_the_total(self, game):
+        for result in race([("inferno", 3), ("bt", 3)], "g-track-1", 2, session="race"):
+            assert len(result.laps) == result.laps_completed
+            times = sum(lap.time for lap in result.laps)
+            assert result.total_time == pytest.approx(times, abs=1e-6)
+
+
+class TestTelemetry:
+    def test_it_has_a_row_per_robot_and_call(self, game, tmp_path):
+        file = tmp_path / "drive.csv"
+        drivers = [("inferno", 3), ("berniw", 3)]
+        results = race(drivers, "michigan", 1, session="race", telemetry=file)
+        with file.open(newline="") as opened:
+            rows = list(csv.DictReader(opened))
+        assert tuple(rows[0]) == TELEMETRY_FIELDS
+        times = [float(row["time"]) for row in rows if row["robot"] == "inferno"]
+        steps = {round(later - now, 3) for now, later in itertools.pairwise(times)}
+        assert steps == {0.02, 0.022} or steps == {0.02}
+        assert len(rows) == 2 * len(times)
+        for result in results:
+            own = [row for row in rows if row["robot"] == result.robot]
+            reached = max(float(row["last_lap_time"]) for row in own)
+            assert reached == pytest.approx(result.laps[-1].time, abs=1e-9)
+
+    def test_writing_it_changes_nothing(self, game, tmp_path):
+        written = race([("bt", 3)], "dirt-1", 1, telemetry=tmp_path / "drive.csv")
+        assert race([("bt", 3)], "dirt-1", 1) == written
+
+    def test_a_folder_that_is_not_there(self, game, tmp_path):
+        with pytest.raises(OutputNotWritable, match="choose another file"):
+            race([("bt", 3)], "dirt-1", 1, telemetry=tmp_path / "nowhere" / "drive.csv")
+
+
+class TestRefusals:
+    @pytest.mark.parametrize(
+        ("robots", "laps", "message"),
+        [
+            ([], 1, "0 robots; expected 1 to 20"),
+            ([("inferno", 3)] * (MAX_ROBOTS + 1), 1, "21 robots; expected 1 to 20"),
+            ([("inferno", 3)], 0, "laps is 0; expected a whole number >= 1"),
+            ([("inferno", 3)], 1.5, "laps is 1.5"),
+            ([("inferno", 3)], True, "laps is True"),
+        ],
+    )
+    def test_a_race_that_is_none(self, robots, laps, message):
+        with pytest.raises(InvalidOption, match=message):
+            race(robots, "aalborg", laps)
+
+    def test_a_session_that_is_none(self, game):
+        with pytest.raises(InvalidOption, match="session is 'rally'; expected practice or race"):
+            race([("inferno", 3)], "aalborg", 1, session="rally")
+
+    @pytest.mark.parametrize(
+        ("robot", "message"),
+        [
+            (("infenro", 3), "no robot 'infenro'; did you mean 'inferno'"),
+            (("inferno", 99), "robot 'inferno' has no index 99; it has 1, 2"),
+            (("human", 1), "no robot 'human'"),
+        ],
+    )
+    def test_a_robot_that_is_none(self, game, robot, message):
+        with pytest.raises(UnknownRobot, match=message):
+            race([robot], "aalborg", 1)
+
+    def test_a_track_that_is_none(self, game):
+        with pytest.raises(TrackNotFound, match="no track 'aalbrog'; did you mean 'aalborg'"):
+            race([("inferno", 3)], "aalbrog", 1)
+
+    @pytest.mark.parametrize("name", ["inferno:", "inferno:x", "inferno:-1", "inferno:3:4"])
+    def test_the_name_of_an_opponent_has_a_form(self, game, name):
+        with pytest.raises(InvalidOption, match="expected NAME or NAME:INDEX"):
+            game.parse_robot(name)
