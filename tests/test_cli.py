@@ -216,10 +216,11 @@ def test_a_missing_model_is_told(capsys, tmp_path):
     assert "there is no model" in err
 
 
-def test_torcs_is_not_replaced_by_something_else(capsys):
+def test_torcs_is_not_replaced_by_something_else(capsys, monkeypatch, tmp_path):
+    monkeypatch.setenv("SB3_TORCS_HOME", str(tmp_path))
     status, out, err = run(capsys, "evaluate", "scripted", "--env", "Torcs-v0", "--json")
     assert (status, out) == (2, "")
-    assert err.startswith("sb3-torcs: Torcs-v0 needs")
+    assert err.startswith("sb3-torcs: there is no TORCS in")
 
 
 def test_an_output_that_cannot_be_written_is_told_before_the_drive(capsys, tmp_path):
