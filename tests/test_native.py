@@ -13,11 +13,13 @@ import numpy as np
 import pytest
 from game_copy import python
 
+from sb3_torcs.actions import controls_from_action
 from sb3_torcs.backends.native import AGENT, Fleet, NativeBackend, make_engine
 from sb3_torcs.car import Controls, Start
 from sb3_torcs.drivers import ScriptedDriver
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.game import find_game
+from sb3_torcs.sensors import encode
 
 ALONE = [AGENT]
 # The car settles on its springs, and rolls while it does: on a slope by a few centimetres. At the
@@ -587,3 +589,32 @@ class TestNoise:
             car = backend.step(GAS, 300)
             digests.append(hashlib.sha256(np.array(car[:23], float)).hexdigest())
         assert digests[0] == digests[1]
+
+
+class TestFieldsAndWalls:
+    @pytest.mark.parametrize(("place", "distance"), [(3, -5.0), (3, 0.0), (1, 5.0), (1, 0.0)])
+    def test_a_field_across_the_line_keeps_its_order(self, rng, place, distance):
+        backend = NativeBackend("g-track-1", opponents=("inferno", "berniw"), grid_place=place)
+        backend.reset(rng, Start(distance % backend.track.length, speed=10.0))
+        assert [backend.engine.read(car)[22] for car in range(3)] == [1, 2, 3]
+        raced = [backend.engine.read(car)[13] for car in range(3)]
+        assert np.allclose(raced, 0.0)
+
+    def test_a_start_in_a_wall_is_refused(self, rng):
+        backend = NativeBackend("e-track-2")
+        with pytest.raises(InvalidOption, match="would stand in a wall"):
+            backend.reset(rng, Start(53.87, 0.952))
+        assert np.isfinite(backend.reset(rng, Start(53.87, 0.3)).x)
+
+    def test_an_agent_that_comes_last_drives_on(self, rng):
+        """Its laps count after the robots have driven theirs."""
+        backend = NativeBackend("g-track-1", opponents=("inferno", "berniw"), laps=1)
+        car = backend.reset(rng, None)
+        driver = ScriptedDriver()
+        raced = car.distance_raced
+        while car.laps < 1:
+            car = backend.step(controls_from_action(driver.predict(encode(car))[0]), 5)
+            assert car.distance_raced > raced - 1.0
+            raced = car.distance_raced
+        assert car.last_lap_time > 60.0
+        assert not backend.engine.ended

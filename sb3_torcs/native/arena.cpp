@@ -6,7 +6,6 @@
 #include <atomic>
 #include <cstdint>
 #include <cstring>
-#include <mutex>
 
 #include "errors.h"
 
@@ -33,36 +32,35 @@ std::size_t class_size(std::size_t size_class) {
 // variables. In the game the heap lies below the libraries, so arenas are asked for down there.
 constexpr std::uintptr_t FIRST_ARENA = 0x200000000000;
 
+constexpr int MOST_ARENAS = 4096;
+
 struct Range {
     const char* begin;
     const char* end;
 };
 
-struct Registry {
-    std::mutex mutex;
-    std::vector<Range> ranges;
-    std::uintptr_t next = FIRST_ARENA;
-};
-
-// Never destroyed: modules free memory while the process ends.
-Registry& registry() {
-    static Registry* registry = new Registry;
-    return *registry;
-}
+// Only grows, so that it can be read without a lock, and is never destroyed: modules free memory
+// while the process ends.
+Range ranges[MOST_ARENAS];
+std::atomic<int> ranges_number{0};
+std::uintptr_t next_arena = FIRST_ARENA;
 
 }  // namespace
 
 Arena::Arena(std::size_t reserve) : reserve_(reserve) {
-    Registry& all = registry();
-    std::lock_guard<std::mutex> lock(all.mutex);
-    void* memory = mmap(reinterpret_cast<void*>(all.next), reserve, PROT_READ | PROT_WRITE,
-                        MAP_PRIVATE | MAP_ANONYMOUS | MAP_NORESERVE, -1, 0);
+    const int number = ranges_number.load();
+    void* memory = number == MOST_ARENAS
+                       ? MAP_FAILED
+                       : mmap(reinterpret_cast<void*>(next_arena), reserve, PROT_READ | PROT_WRITE,
+                              MAP_PRIVATE | MAP_ANONYMOUS | MAP_NORESERVE, -1, 0);
     if (memory == MAP_FAILED)
         throw Error("BackendUnavailable",
-                    "no address space for another race; close environments that are not needed");
+                    "no address space for another race; close environments that are not needed, "
+                    "or raise the limit (ulimit -v)");
     base_ = static_cast<char*>(memory);
-    all.next += reserve;
-    all.ranges.push_back({base_, base_ + reserve});
+    next_arena += reserve;
+    ranges[number] = {base_, base_ + reserve};
+    ranges_number.store(number + 1);
     reset_head();
 }
 
@@ -112,10 +110,8 @@ void Arena::restore(const std::vector<char>& saved) {
 }
 
 bool in_any_arena(const void* memory) {
-    Registry& all = registry();
-    std::lock_guard<std::mutex> lock(all.mutex);
     const char* address = static_cast<const char*>(memory);
-    return std::any_of(all.ranges.begin(), all.ranges.end(), [address](const Range& range) {
+    return std::any_of(ranges, ranges + ranges_number.load(), [address](const Range& range) {
         return address >= range.begin && address < range.end;
     });
 }

@@ -12,7 +12,7 @@ namespace torcs {
 
 class Arena {
 public:
-    // Memory is only reserved, and used page by page.
+    // Memory is only reserved, and used page by page. To be made under the game's lock.
     explicit Arena(std::size_t reserve);
     Arena(const Arena&) = delete;
     Arena& operator=(const Arena&) = delete;

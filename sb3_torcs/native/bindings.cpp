@@ -3,6 +3,8 @@
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
 
+#include <unistd.h>
+
 #include <cmath>
 
 #include "engine.h"
@@ -15,6 +17,27 @@ using namespace py::literals;
 namespace torcs {
 
 namespace {
+
+// Lets other threads of Python run. A thread that comes back while the interpreter ends waits for
+// the end, since it could neither go on nor be unwound.
+class WithoutPython {
+public:
+    WithoutPython() : state_(PyEval_SaveThread()) {}
+    ~WithoutPython() {
+#if PY_VERSION_HEX >= 0x030D0000
+        const bool ending = Py_IsFinalizing();
+#else
+        const bool ending = _Py_IsFinalizing();
+#endif
+        while (ending) pause();
+        PyEval_RestoreThread(state_);
+    }
+    WithoutPython(const WithoutPython&) = delete;
+    WithoutPython& operator=(const WithoutPython&) = delete;
+
+private:
+    PyThreadState* state_;
+};
 
 template <std::size_t n>
 py::array_t<double> read_only(const std::array<double, n>& values) {
@@ -116,6 +139,7 @@ private:
 }  // namespace
 
 PYBIND11_MODULE(_engine, module) {
+    Game::watch_forks();
     module.doc() = "The real TORCS in this process; use it through sb3_torcs.backends.native.";
 
     py::register_exception_translator([](std::exception_ptr pointer) {
@@ -139,7 +163,7 @@ PYBIND11_MODULE(_engine, module) {
                          const std::vector<double>& angles) {
                  RaceOptions options{track, session, car, {}, laps};
                  for (const auto& [name, index] : entries) options.entries.push_back({name, index});
-                 py::gil_scoped_release released;
+                 const WithoutPython released;
                  Game& game = Game::open(data, libraries, plib);
                  return std::make_unique<Engine>(game, std::move(options), angles_of(angles));
              }),
@@ -147,12 +171,12 @@ PYBIND11_MODULE(_engine, module) {
              "entries"_a, "laps"_a, "angles"_a)
         .def("start",
              [](Engine& engine) {
-                 py::gil_scoped_release released;
+                 const WithoutPython released;
                  engine.start();
              })
         .def("start_at",
              [](Engine& engine, double distance, double position, double error, double speed) {
-                 py::gil_scoped_release released;
+                 const WithoutPython released;
                  engine.start(Start{distance, position, error, speed});
              })
         .def(
@@ -162,7 +186,7 @@ PYBIND11_MODULE(_engine, module) {
                 const Controls controls = controls_of(steering, throttle, brake, gear);
                 Reading reading;
                 {
-                    py::gil_scoped_release released;
+                    const WithoutPython released;
                     Engine::Access race(engine);
                     Engine::check_agent(*race);
                     race->drive(controls, ticks);
@@ -173,7 +197,7 @@ PYBIND11_MODULE(_engine, module) {
             "Hold controls for some ticks; returns the agent's car as the fields of CarState.")
         .def("advance",
              [](Engine& engine, int ticks) {
-                 py::gil_scoped_release released;
+                 const WithoutPython released;
                  engine.drive(Controls{0.0f, 0.0f, 1.0f, 0}, ticks);
              })
         .def("read", [](Engine& engine, int car) { return as_state(engine.read(car)); })
@@ -245,11 +269,11 @@ PYBIND11_MODULE(_engine, module) {
                  std::vector<Controls> list;
                  for (py::ssize_t i = 0; i < rows.shape(0); i++)
                      list.push_back(controls_of(rows(i, 0), rows(i, 1), rows(i, 2), {}));
-                 py::gil_scoped_release released;
+                 const WithoutPython released;
                  engine.replay(list, sensors);
              })
         .def("update_physics", [](Engine& engine, int steps) {
-            py::gil_scoped_release released;
+            const WithoutPython released;
             engine.update_physics(steps);
         });
 
@@ -260,20 +284,20 @@ PYBIND11_MODULE(_engine, module) {
              [](Fleet& fleet, std::size_t place, double steering, double throttle, double brake,
                 std::optional<int> gear, int ticks) {
                  const Controls controls = controls_of(steering, throttle, brake, gear);
-                 py::gil_scoped_release released;
+                 const WithoutPython released;
                  fleet.begin(place, controls, ticks);
              })
         .def("wait",
              [](Fleet& fleet, std::size_t place) {
                  const Reading* reading;
                  {
-                     py::gil_scoped_release released;
+                     const WithoutPython released;
                      reading = &fleet.wait(place);
                  }
                  return as_state(*reading);
              })
         .def("finish", [](Fleet& fleet) {
-            py::gil_scoped_release released;
+            const WithoutPython released;
             fleet.finish();
         });
 }

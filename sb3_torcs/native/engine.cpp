@@ -132,6 +132,8 @@ Reading Engine::read(int car) {
 std::array<double, FOCUS_BEAMS> Engine::focus(int car, double direction) {
     Access race(*this);
     check_car(*race, car);
+    if (!std::isfinite(direction))
+        throw Error("InvalidOption", "direction is no finite number; expected radians");
     std::array<double, RANGE_FINDERS> angles{}, distances;
     for (int i = 0; i < FOCUS_BEAMS; i++)
         angles[static_cast<std::size_t>(i)] = direction + (i - FOCUS_BEAMS / 2) * M_PI / 180.0;

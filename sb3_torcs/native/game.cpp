@@ -1,6 +1,7 @@
 #include "game.h"
 
 #include <dlfcn.h>
+#include <pthread.h>
 
 #include "errors.h"
 
@@ -15,6 +16,9 @@ constexpr int READ_PRIVATE = 0x8;
 constexpr int MERGE_BOTH = 0x1 | 0x2;
 constexpr int MERGE_RELEASES = 0x4 | 0x8;
 
+std::mutex opening;
+std::unique_ptr<Game>* const opened = new std::unique_ptr<Game>;  // threads outlive statics
+
 std::string with_slash(std::string folder) {
     if (folder.empty() || folder.back() != '/') folder += '/';
     return folder;
@@ -28,9 +32,22 @@ void preload(const std::string& path) {
 
 }  // namespace
 
+void Game::watch_forks() {
+    // Otherwise a child could inherit a lock that a thread of its parent will never give back.
+    static const auto lock = [] {
+        opening.lock();
+        if (*opened) (*opened)->mutex.lock();
+    };
+    static const auto unlock = [] {
+        if (*opened) (*opened)->mutex.unlock();
+        opening.unlock();
+    };
+    static const int watching =
+        pthread_atfork([] { lock(); }, [] { unlock(); }, [] { unlock(); });
+    (void)watching;
+}
+
 Game& Game::open(const std::string& data, const std::string& libraries, const std::string& plib) {
-    static std::mutex opening;
-    static std::unique_ptr<Game>* opened = new std::unique_ptr<Game>;
     std::lock_guard<std::mutex> lock(opening);
     if (!*opened) opened->reset(new Game(with_slash(data), with_slash(libraries), plib));
     if ((*opened)->libraries != with_slash(libraries) || (*opened)->data != with_slash(data))

@@ -22,8 +22,10 @@ public:
     const std::string data;       // each ends in a slash
     const std::string libraries;
 
-    // Parameter files are one list for all races.
-    std::recursive_mutex mutex;
+    // Held while races are loaded and closed: parameter files are one list for all of them, and so
+    // are spare libraries and arenas. A fork waits for it.
+    std::mutex mutex;
+    static void watch_forks();  // once, before any race
 
     std::unique_ptr<Library> take_module(const std::string& kind, const std::string& name,
                                          const char* error = "GameIncomplete") const {

@@ -141,7 +141,8 @@ enum CarStatus : int {
 
 constexpr int NAME_LENGTH = 32;
 constexpr int ROBOT_DRIVER = 2;
-constexpr int COLLISION_WITH_WALL = 0x2;  // of CarElement::collision
+constexpr int COLLISION_WITH_WALL = 0x2;  // of CarPrivate::collision
+constexpr int COLLISION_WITH_BODY = 0x4;  // another car, or a wall that stands on the ground
 constexpr int PIT_ASKED = 1;              // of Control::race_command
 
 struct CarInfo {

@@ -15,7 +15,6 @@
 #include <cstring>
 #include <fstream>
 #include <map>
-#include <mutex>
 #include <new>
 #include <unordered_map>
 
@@ -275,11 +274,24 @@ void forget_needs(std::vector<char>& bytes, const std::string& folder) {
     }
 }
 
+[[noreturn]] void refuse_copy(const std::string& path, const char* error,
+                              const std::string& reason) {
+    std::string remedy = REINSTALL;
+    if (reason.find(strerror(EMFILE)) != std::string::npos) {
+        error = "BackendUnavailable";
+        remedy = "; each module of a race keeps a file open: raise the limit with ulimit -n";
+    } else if (access("/proc/self/fd", F_OK) != 0) {
+        error = "BackendUnavailable";
+        remedy = "; the loader finds copies of modules in /proc, which is not mounted";
+    }
+    throw Error(error, path + " will not load: " + reason + remedy);
+}
+
 void* open_copy(const std::string& path, const std::string& folder, const char* error) {
     std::vector<char> bytes = read_library(path, error);
     forget_needs(bytes, folder);
     const int copy = memfd_create("torcs-module", MFD_CLOEXEC);
-    if (copy < 0) throw Error("BackendUnavailable", std::string("memfd_create: ") + strerror(errno));
+    if (copy < 0) refuse_copy(path, error, strerror(errno));
     for (std::size_t done = 0; done < bytes.size();) {
         const ssize_t written = write(copy, bytes.data() + done, bytes.size() - done);
         if (written < 0) {
@@ -295,13 +307,12 @@ void* open_copy(const std::string& path, const std::string& folder, const char* 
     if (!handle) {
         const std::string reason = loader_message();
         close(copy);
-        throw Error(error, path + " will not load: " + reason + REINSTALL);
+        refuse_copy(path, error, reason);
     }
     return handle;
 }
 
-std::mutex libraries_mutex;
-
+// Both are under the game's lock.
 std::map<std::string, std::vector<std::unique_ptr<Library>>>& pool() {
     static auto* libraries = new std::map<std::string, std::vector<std::unique_ptr<Library>>>;
     return *libraries;
@@ -332,7 +343,6 @@ bool is_memory(const std::string& import) {
 
 std::unique_ptr<Library> Library::take(const std::string& path, const std::string& folder,
                                        const char* error) {
-    std::lock_guard<std::mutex> lock(libraries_mutex);
     auto& spare = pool()[path];
     if (spare.empty())
         return std::unique_ptr<Library>(new Library(path, open_copy(path, folder, error), true));
@@ -344,12 +354,10 @@ std::unique_ptr<Library> Library::take(const std::string& path, const std::strin
 void Library::give_back(std::unique_ptr<Library> library) {
     if (!library) return;
     library->restore(library->pristine_);
-    std::lock_guard<std::mutex> lock(libraries_mutex);
     pool()[library->path_].push_back(std::move(library));
 }
 
 Library& Library::shared(const std::string& path, bool race_memory) {
-    std::lock_guard<std::mutex> lock(libraries_mutex);
     auto& library = shared_libraries()[path];
     if (!library) {
         read_library(path, "GameIncomplete");

@@ -16,6 +16,7 @@ namespace torcs {
 
 using Variables = std::vector<std::vector<char>>;
 
+// Libraries are taken and given back under the game's lock.
 class Library {
 public:
     // A copy of the module; one that an earlier race gave back is taken first, since libraries

@@ -14,14 +14,13 @@ namespace torcs {
 namespace {
 
 constexpr double PI = 3.14159265358979323846;
-constexpr std::size_t RACE_MEMORY = std::size_t{256} << 20;   // reserved, not used
+constexpr std::size_t RACE_MEMORY = std::size_t{128} << 20;  // reserved; a full grid uses 17
 constexpr std::size_t TRACK_MEMORY = std::size_t{64} << 20;
 
 constexpr double COUNTDOWN = -2.0;   // [s]
 constexpr int SETTLING_STEPS = 500;  // of standing on the brake, so that the springs come to rest
 constexpr int SETTLING_STEPS_AT_REST = 300;  // of a car put down at the height at which it stands
 constexpr int AGAINST_RIGHT = 0;     // of to_global
-constexpr float ON_THE_LINE = 0.25f; // [m] behind it at most; cars move a little as they settle
 constexpr int MANY_LAPS = 1 << 30;
 
 // Shift points of the SCR car, 8500 and 7500 rpm of the 9152 at which its limiter cuts in, as
@@ -32,7 +31,7 @@ constexpr float SHIFT_DOWN = 7500.0f / 9152.0f;
 const char* const SKILLS[] = {"rookie", "amateur", "semi-pro", "pro"};
 constexpr int SEMI_PROFESSIONAL = 2;  // what the game takes for drivers that do not say
 
-std::mutex spare_mutex;
+// Of races that are closed; under the game's lock.
 std::vector<Arena*>& spare_arenas(std::size_t size) {
     static auto* race = new std::vector<Arena*>;
     static auto* track = new std::vector<Arena*>;
@@ -40,7 +39,6 @@ std::vector<Arena*>& spare_arenas(std::size_t size) {
 }
 
 Arena& take_arena(std::size_t size) {
-    std::lock_guard<std::mutex> lock(spare_mutex);
     auto& spare = spare_arenas(size);
     if (spare.empty()) return *new Arena(size);
     Arena* arena = spare.back();
@@ -50,7 +48,6 @@ Arena& take_arena(std::size_t size) {
 
 void give_back(Arena& arena, std::size_t size) {
     arena.clear();
-    std::lock_guard<std::mutex> lock(spare_mutex);
     spare_arenas(size).push_back(&arena);
 }
 
@@ -87,7 +84,7 @@ Race::Race(Game& game, RaceOptions options)
       session_(game, nullptr) {
     static std::atomic<std::uint64_t> races{0};
     number_ = ++races;
-    std::lock_guard<std::recursive_mutex> lock(game_.mutex);
+    std::lock_guard<std::mutex> lock(game_.mutex);
     host_ = {&arena_, new_random(arena_), game_.data};
     track_host_ = {&track_arena_, host_.random, game_.data};
     try {
@@ -101,7 +98,7 @@ Race::Race(Game& game, RaceOptions options)
 }
 
 Race::~Race() {
-    std::lock_guard<std::recursive_mutex> lock(game_.mutex);
+    std::lock_guard<std::mutex> lock(game_.mutex);
     close();
 }
 
@@ -459,6 +456,12 @@ void Race::start(const Start& start) {
         car.control.gear = gear_for(car, start.speed);  // engages while the car settles
     }
     settle(SETTLING_STEPS_AT_REST);
+    // The collision library finds no way out of what was never apart: not a number comes of it.
+    for (int i = 0; i < cars_number(); i++)
+        if (car(i).priv.collision & COLLISION_WITH_BODY || !std::isfinite(car(i).pub.local.pos.z))
+            throw Error("InvalidOption", std::string(car(i).info.name) +
+                                             " would stand in a wall or in another car; start "
+                                             "elsewhere, or nearer to the middle of the road");
     Situation& situation = world_->situation;
     situation.state = RUNNING;
     situation.time = 0.0;
@@ -466,19 +469,25 @@ void Race::start(const Start& start) {
     world_->last_call = -ROBOT_STEP;
     for (int i = 0; i < cars_number(); i++) {
         CarElement& car = world_->cars[i];
-        // It may have settled across the line.
-        world_->records[i].previous = car.pub.track;
         give_speed(car, start.speed);
+        world_->records[i].previous = car.pub.track;  // it may have settled across the line
         manage(car);
-        // On the line itself, the lap has begun.
-        if (car.race.distance_from_start < ON_THE_LINE) {
-            car.race.crossings = 1;
-            car.race.remaining_laps--;
-        }
+        count_lap(car, start.distance + grid_distance(i) - grid_distance(agent_),
+                  start.distance == 0.0);
         measure_distance(car);
         world_->records[i].start_distance = car.race.distance_raced;
     }
     sort();
+}
+
+// A car of a field that is spread over the start line is a lap ahead of those behind it. Laps
+// count from the agent's; where it starts on the line itself, its lap has begun.
+void Race::count_lap(CarElement& car, double distance, bool lap_has_begun) {
+    const double shift = distance - car.race.distance_from_start;
+    const int lap = (lap_has_begun ? 1 : 0) + static_cast<int>(std::lround(shift / track_->length));
+    car.race.crossings = std::max(lap, 0);
+    car.race.remaining_laps -= car.race.crossings;
+    world_->records[car.index].backwards = std::max(-lap, 0);
 }
 
 const Segment* Race::segment_at(double distance) const {

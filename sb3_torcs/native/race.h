@@ -113,6 +113,7 @@ private:
         float top_speed, lowest_speed;
         int lane_state;            // of race_rules.cpp
         double start_distance;     // [m] by the race's count, where the episode began
+        bool finished;             // drove all its laps
         bool flying;               // began on the way: the first crossing starts the clock
         LapRecord* laps;
         int laps_number, laps_room;
@@ -152,6 +153,7 @@ private:
     void assign_pits();
     void prepare();
     void settle(int steps);
+    void count_lap(CarElement& car, double distance, bool lap_has_begun);
     const Segment* segment_at(double distance) const;
     int gear_for(const CarElement& car, double speed) const;
     void give_speed(CarElement& car, double speed);

@@ -101,9 +101,11 @@ bool Race::cross_line(CarElement& car, Record& record) {
         record.lap_began = situation.time;
     }
     record.top_speed = record.lowest_speed = race.lowest_speed = car.pub.local.vel.x;
-    if (race.remaining_laps < 0 || situation.state == FINISHING) {
+    // With an agent nobody is flagged off: its environment says when it is over.
+    if (agent_ < 0 && (race.remaining_laps < 0 || situation.state == FINISHING)) {
         car.pub.status |= FINISHED;
         situation.state = FINISHING;
+        record.finished = true;
     }
     return true;
 }
@@ -357,7 +359,8 @@ std::vector<Result> Race::results() const {
         results.push_back({car.index, std::max(laps_of(car), 0),
                            car.race.total_time + standing.penalty, car.race.best_lap_time,
                            car.priv.damage,
-                           (car.pub.status & (BROKEN | OUT_OF_FUEL | ELIMINATED)) != 0});
+                           !world_->records[car.index].finished &&
+                               (car.pub.status & (BROKEN | OUT_OF_FUEL | ELIMINATED)) != 0});
     }
     return results;
 }
