@@ -5,7 +5,7 @@ SI units and radians throughout. Left is positive for steering, lateral position
 
 from __future__ import annotations
 
-import sys
+import math
 from numbers import Integral, Real
 from typing import Any, NamedTuple
 
@@ -35,9 +35,10 @@ MAX_DAMAGE = 10000.0
 
 def is_number(value: Any) -> bool:
     """Whether a value is a finite real number, NumPy's included; a bool is none."""
-    if isinstance(value, bool) or not isinstance(value, Real):
+    try:
+        return not isinstance(value, bool) and isinstance(value, Real) and math.isfinite(value)
+    except OverflowError:  # a whole number beyond all floats
         return False
-    return -sys.float_info.max <= value <= sys.float_info.max
 
 
 def is_count(value: Any) -> bool:
