@@ -49,11 +49,12 @@ test: native game ## run every test
 pytest: native game ## run the tests that do not train
 	$(BIN)/python -m pytest -n 2 -m 'not slow'
 
-# Python itself leaks by design and is built without the sanitizers: they are loaded before it.
+# Python itself leaks by design and is built without the sanitizers and without C++: they are loaded
+# before it.
 sanitize: install game ## run the engine's tests under AddressSanitizer and UBSan
 	@rm -f $(BUILT)
 	SB3_TORCS_SANITIZE=1 $(BIN)/python -m pip install --verbose --no-deps --editable .
-	LD_PRELOAD="$$($${CXX:-c++} -print-file-name=libasan.so)" \
+	LD_PRELOAD="$$($${CXX:-c++} -print-file-name=libasan.so) $$($${CXX:-c++} -print-file-name=libstdc++.so)" \
 	  ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=halt_on_error=1:print_stacktrace=1 \
 	  $(BIN)/python -m pytest -p no:xdist tests/test_native*.py
 	@echo "the engine is built with the sanitizers now; type: make native"

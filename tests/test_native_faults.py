@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import re
 import sys
 import threading
@@ -699,6 +700,9 @@ class TestGoodManners:
         assert length == engine.track_summary()["length"]
         assert raced == engine.read(0).distance_raced
 
+    @pytest.mark.skipif(
+        "libasan" in os.environ.get("LD_PRELOAD", ""), reason="the sanitizer's own heap grows"
+    )
     def test_opening_and_closing_leaves_nothing(self, tmp_path):
         """No file, no descriptor, no mapping, and no more memory than a few races need."""
         code = BEGIN + (
