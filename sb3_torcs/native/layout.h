@@ -345,7 +345,7 @@ struct Simulation {
     void (*shutdown)();
 };
 
-// ---- The simulation's own car, behind its exported `SimCarTable` ---------------------------------
+// ---- The simulation's own car, behind its exported `SimCarTable` --------------------------------
 
 struct SimulatedWheel {
     Unused<156> a_;
@@ -377,7 +377,7 @@ struct SimulatedCar {
     Unused<80> f_;
 };
 
-// ---- Offsets -------------------------------------------------------------------------------------
+// ---- Offsets ------------------------------------------------------------------------------------
 
 static_assert(offsetof(Segment, length) == 24 && offsetof(Segment, center) == 60);
 static_assert(offsetof(Segment, vertex) == 72 && offsetof(Segment, heading) == 120);

@@ -36,7 +36,7 @@ const char* const REINSTALL = "; install the game again with: sb3-torcs install-
 thread_local Host* current = nullptr;
 thread_local std::string messages;  // what was printed since they were forgotten
 
-// ---- What the modules' imports become ------------------------------------------------------------
+// ---- What the modules' imports become -----------------------------------------------------------
 
 void* allocate(std::size_t size) { return current ? current->arena->allocate(size) : malloc(size); }
 
@@ -208,7 +208,7 @@ const std::unordered_map<std::string, void*>& replacements() {
     return *table;
 }
 
-// ---- Loading -------------------------------------------------------------------------------------
+// ---- Loading ------------------------------------------------------------------------------------
 
 std::string loader_message() {
     const char* text = dlerror();
@@ -472,7 +472,7 @@ void Library::restore(const Variables& saved) {
         std::memcpy(variables_[i].begin, saved[i].data(), saved[i].size());
 }
 
-// ---- Driving -------------------------------------------------------------------------------------
+// ---- Driving ------------------------------------------------------------------------------------
 
 Hosted::Hosted(Host& host) : previous_(current) {
     static const locale_t plain = newlocale(LC_ALL_MASK, "C", nullptr);

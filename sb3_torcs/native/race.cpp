@@ -38,7 +38,8 @@ std::vector<Arena*>& spare_arenas(std::size_t size) {
     return size == RACE_MEMORY ? *race : *track;
 }
 
-Arena& take_arena(std::size_t size) {
+Arena& take_arena(Game& game, std::size_t size) {
+    std::lock_guard<std::mutex> lock(game.mutex);
     auto& spare = spare_arenas(size);
     if (spare.empty()) return *new Arena(size);
     Arena* arena = spare.back();
@@ -79,8 +80,8 @@ Robot agent_robot() {
 Race::Race(Game& game, RaceOptions options)
     : game_(game),
       options_(std::move(options)),
-      arena_(take_arena(RACE_MEMORY)),
-      track_arena_(take_arena(TRACK_MEMORY)),
+      arena_(take_arena(game, RACE_MEMORY)),
+      track_arena_(take_arena(game, TRACK_MEMORY)),
       session_(game, nullptr) {
     static std::atomic<std::uint64_t> races{0};
     number_ = ++races;
@@ -128,7 +129,7 @@ void Race::close() {
     give_back(track_arena_, TRACK_MEMORY);
 }
 
-// ---- Loading -------------------------------------------------------------------------------------
+// ---- Loading ------------------------------------------------------------------------------------
 
 void Race::load_track() {
     Hosted hosted(track_host_);
@@ -298,7 +299,7 @@ void Race::set_rules() {
     situation.type = type == "practice" ? PRACTICE : type == "qualifications" ? QUALIFYING : RACE;
 }
 
-// ---- The grid ------------------------------------------------------------------------------------
+// ---- The grid -----------------------------------------------------------------------------------
 
 // A track's own settings come before the session's.
 float Race::grid_number(const char* name, float fallback) const {
@@ -395,7 +396,7 @@ void Race::assign_pits() {
     }
 }
 
-// ---- The start -----------------------------------------------------------------------------------
+// ---- The start ----------------------------------------------------------------------------------
 
 void Race::prepare() {
     Hosted hosted(host_);
@@ -438,21 +439,19 @@ void Race::start() { restore(on_grid_); }
 void Race::start(const Start& start) {
     restore(ready_);
     Hosted hosted(host_);
-    const double ahead = start.distance - grid_distance(agent_);
     for (int i = 0; i < cars_number(); i++) {
         CarElement& car = world_->cars[i];
         world_->records[i].flying = true;
-        double distance = std::fmod(grid_distance(i) + ahead, track_->length);
+        double distance = std::fmod(field_distance(i, start), track_->length);
         if (distance < 0.0) distance += track_->length;
+        float to_right = grid_to_right(i), heading_error = 0.0f;
         if (i == agent_) {
-            distance = start.distance;
             const double half_width = 0.5 * segment_at(distance)->width;
-            place(car, static_cast<float>(distance),
-                  static_cast<float>((1.0 + start.track_position) * half_width),
-                  static_cast<float>(start.heading_error), rest_heights_[static_cast<std::size_t>(i)]);
-        } else {
-            place(car, static_cast<float>(distance), grid_to_right(i), 0.0f, rest_heights_[static_cast<std::size_t>(i)]);
+            to_right = static_cast<float>((1.0 + start.track_position) * half_width);
+            heading_error = static_cast<float>(start.heading_error);
         }
+        place(car, static_cast<float>(distance), to_right, heading_error,
+              rest_heights_[static_cast<std::size_t>(i)]);
         car.control.gear = gear_for(car, start.speed);  // engages while the car settles
     }
     settle(SETTLING_STEPS_AT_REST);
@@ -472,12 +471,17 @@ void Race::start(const Start& start) {
         give_speed(car, start.speed);
         world_->records[i].previous = car.pub.track;  // it may have settled across the line
         manage(car);
-        count_lap(car, start.distance + grid_distance(i) - grid_distance(agent_),
-                  start.distance == 0.0);
+        count_lap(car, field_distance(i, start), start.distance == 0.0);
         measure_distance(car);
         world_->records[i].start_distance = car.race.distance_raced;
     }
     sort();
+}
+
+// Where a car is when the whole field is moved so that the agent is where it starts; it can be
+// before the start line, or a lap further.
+double Race::field_distance(int index, const Start& start) const {
+    return start.distance + (grid_distance(index) - grid_distance(agent_));
 }
 
 // A car of a field that is spread over the start line is a lap ahead of those behind it. Laps
@@ -529,7 +533,7 @@ void Race::give_speed(CarElement& car, double speed) {
     car.pub.speed = static_cast<float>(speed);
 }
 
-// ---- Driving -------------------------------------------------------------------------------------
+// ---- Driving ------------------------------------------------------------------------------------
 
 void Race::drive(const Controls& controls, int ticks) {
     Hosted hosted(host_);
@@ -621,7 +625,7 @@ int Race::automatic_gear(const CarPrivate& car) {
     return gear;
 }
 
-// ---- Reading and keeping -------------------------------------------------------------------------
+// ---- Reading and keeping ------------------------------------------------------------------------
 
 float Race::height(int index) const {
     TrackPosition position = world_->cars[index].pub.track;

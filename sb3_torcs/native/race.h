@@ -153,6 +153,7 @@ private:
     void assign_pits();
     void prepare();
     void settle(int steps);
+    double field_distance(int index, const Start& start) const;
     void count_lap(CarElement& car, double distance, bool lap_has_begun);
     const Segment* segment_at(double distance) const;
     int gear_for(const CarElement& car, double speed) const;

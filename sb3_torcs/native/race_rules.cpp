@@ -57,7 +57,7 @@ void Race::measure_distance(CarElement& car) {
         static_cast<float>(whole) * track_->length + car.race.distance_from_start;
 }
 
-// ---- Laps ----------------------------------------------------------------------------------------
+// ---- Laps ---------------------------------------------------------------------------------------
 
 // Returns whether the car still takes part.
 bool Race::cross_line(CarElement& car, Record& record) {
@@ -139,7 +139,7 @@ void Race::sort() {
     if (all_finished) situation.state = ENDED;
 }
 
-// ---- Pits ----------------------------------------------------------------------------------------
+// ---- Pits ---------------------------------------------------------------------------------------
 
 void Race::manage_pit(CarElement& car, Record& record) {
     Pit& pit = *car.race.pit;
@@ -204,7 +204,7 @@ void Race::stop_in_pit(CarElement& car, Record& record) {
     }
 }
 
-// ---- Rules ---------------------------------------------------------------------------------------
+// ---- Rules --------------------------------------------------------------------------------------
 
 void Race::apply_rules(CarElement& car, Record& record) {
     // Whoever hangs about is taken out; ten metres a second and a long pit stop are allowed.
@@ -299,7 +299,7 @@ void Race::check_pit_lane(CarElement& car, Record& record) {
     }
 }
 
-// ---- Results -------------------------------------------------------------------------------------
+// ---- Results ------------------------------------------------------------------------------------
 
 namespace {
 
