@@ -24,6 +24,14 @@ GAS = np.array([0.0, 1.0, 0.0], np.float32)
 MILD = np.array([0.3, 1.0, 0.3], np.float32)  # of random actions: some races last, some do not
 
 
+@pytest.fixture(autouse=True)
+def gymnasiums_own_time_limit(monkeypatch):
+    """Once imported, the RL Zoo has put one of its own there, which adds a key to infos."""
+    classes = gym.wrappers.TimeLimit.__mro__
+    own = next(cls for cls in classes if cls.__module__.startswith("gymnasium."))
+    monkeypatch.setattr(gym.wrappers, "TimeLimit", own)
+
+
 @pytest.fixture
 def make():
     """Make vector environments, and close them afterwards."""

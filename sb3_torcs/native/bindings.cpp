@@ -66,9 +66,10 @@ py::object as_state(const Reading& reading) {
 
 Controls controls_of(double steering, double throttle, double brake, std::optional<int> gear) {
     if (!std::isfinite(steering) || !std::isfinite(throttle) || !std::isfinite(brake))
-        throw Error("InvalidAction", "steering, throttle and brake are " + std::to_string(steering) +
-                                         ", " + std::to_string(throttle) + ", " +
-                                         std::to_string(brake) + "; expected finite numbers");
+        throw Error("InvalidAction",
+                    "steering, throttle and brake are " + std::to_string(steering) + ", " +
+                        std::to_string(throttle) + ", " + std::to_string(brake) +
+                        "; expected finite numbers");
     return {static_cast<float>(steering), static_cast<float>(throttle), static_cast<float>(brake),
             gear.value_or(AUTOMATIC_GEAR)};
 }
@@ -86,7 +87,8 @@ std::array<double, RANGE_FINDERS> angles_of(const std::vector<double>& angles) {
 class Fleet {
 public:
     Fleet(const std::vector<Engine*>& engines, int threads)
-        : tasks_(engines.size()), pool_(threads, tasks_.size(), [this](std::size_t i) { work(i); }) {
+        : tasks_(engines.size()),
+          pool_(threads, tasks_.size(), [this](std::size_t i) { work(i); }) {
         for (std::size_t i = 0; i < engines.size(); i++) {
             if (!engines[i]) throw py::type_error("engine is None; expected an Engine");
             tasks_[i].engine = engines[i];
@@ -146,7 +148,8 @@ PYBIND11_MODULE(_engine, module) {
         try {
             if (pointer) std::rethrow_exception(pointer);
         } catch (const Error& error) {
-            const py::object type = py::module_::import("sb3_torcs.errors").attr(error.python_class);
+            const py::object type =
+                py::module_::import("sb3_torcs.errors").attr(error.python_class);
             PyErr_SetString(type.ptr(), error.what());
         }
     });

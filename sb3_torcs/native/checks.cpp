@@ -109,7 +109,8 @@ void check_track(const TrackData* track, const Params& file, const std::string& 
                                               std::to_string(next.length) + " m long");
     }
     if (address != data.last)
-        disagree("the number of segments", "that of the ring", std::to_string(data.segments_number));
+        disagree("the number of segments", "that of the ring",
+                 std::to_string(data.segments_number));
     if (!(std::fabs(length - data.length) <= 1e-3f * length))
         disagree("the track's length", std::to_string(length), std::to_string(data.length));
 }

@@ -106,7 +106,8 @@ int keep_message(const char* format, va_list arguments) {
     const int length = vsnprintf(line, sizeof line, format, arguments);
     std::string text = line;
     while (!text.empty() && (text.back() == '\n' || text.back() == ' ')) text.pop_back();
-    if (!text.empty() && messages.size() < ENOUGH) messages += (messages.empty() ? "" : "; ") + text;
+    if (!text.empty() && messages.size() < ENOUGH)
+        messages += (messages.empty() ? "" : "; ") + text;
     return length;
 }
 

@@ -278,7 +278,9 @@ void Race::load_driver(CarElement& car, const Entry& entry) {
 
 void Race::set_rules() {
     const char* race = race_name_.c_str();
-    const auto enabled = [&](const char* name) { return session_.text(race, name, "yes") == "yes"; };
+    const auto enabled = [&](const char* name) {
+        return session_.text(race, name, "yes") == "yes";
+    };
     const auto at_least = [&](const char* name, float fallback, float least) {
         return std::max(session_.number(race, name, fallback), least);
     };
@@ -536,6 +538,9 @@ void Race::give_speed(CarElement& car, double speed) {
 // ---- Driving ------------------------------------------------------------------------------------
 
 void Race::drive(const Controls& controls, int ticks) {
+    if (ticks < 1)
+        throw Error("InvalidOption",
+                    "ticks is " + std::to_string(ticks) + "; expected a whole number >= 1");
     Hosted hosted(host_);
     world_->controls = controls;
     // Who has an agent decides himself when it is over.

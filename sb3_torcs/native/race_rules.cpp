@@ -186,7 +186,8 @@ void Race::stop_in_pit(CarElement& car, Record& record) {
     const PitCommand& command = car.pit_command;
     const double now = world_->situation.time;
     if (command.stop_type == 0) {
-        record.pit_time = rules_.pit_base_time + std::fabs(double(command.fuel)) / rules_.fuel_flow +
+        record.pit_time = rules_.pit_base_time +
+                          std::fabs(double(command.fuel)) / rules_.fuel_flow +
                           float(std::fabs(double(command.repair))) * rules_.repair_factor +
                           car.race.penalty_time;
         const bool free_setup = world_->situation.type != RACE;
