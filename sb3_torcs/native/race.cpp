@@ -538,9 +538,9 @@ void Race::give_speed(CarElement& car, double speed) {
 // ---- Driving ------------------------------------------------------------------------------------
 
 void Race::drive(const Controls& controls, int ticks) {
-    if (ticks < 1)
+    if (ticks < 0)
         throw Error("InvalidOption",
-                    "ticks is " + std::to_string(ticks) + "; expected a whole number >= 1");
+                    "ticks is " + std::to_string(ticks) + "; expected a whole number >= 0");
     Hosted hosted(host_);
     world_->controls = controls;
     // Who has an agent decides himself when it is over.
