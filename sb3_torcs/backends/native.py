@@ -12,7 +12,7 @@ import numpy as np
 
 from sb3_torcs.car import CarState, Controls, FloatArray, Start, is_count
 from sb3_torcs.errors import BackendUnavailable, InvalidOption
-from sb3_torcs.game import Game, find_game
+from sb3_torcs.game import BUILD, Game, find_game
 from sb3_torcs.sensors import range_finder_angles
 from sb3_torcs.tracks import Track, load_track
 
@@ -24,11 +24,8 @@ __all__ = ["AGENT", "Fleet", "NativeBackend", "check_layout", "make_engine"]
 AGENT = ("", 0)
 """The agent's entry in a starting list; robots have a name and an index."""
 
-PRACTICE = "practice"
-RACE = "quickrace"
-SESSIONS = {"practice": PRACTICE, "race": RACE}
+SESSIONS = {"practice": "practice", "race": "quickrace"}  # by the names of the game's files
 
-BUILD = "make native (in a clone), or: pip install --force-reinstall --no-deps sb3-torcs"
 MIN_SHIFT = 1.0  # [m] between the game's frame and the track's, from which positions are moved
 
 
@@ -146,16 +143,17 @@ class NativeBackend:
             "grid_place": grid_place,
             "sensor_noise": sensor_noise,
         }
+        path = track_path(game, track)
         self.engine = make_engine(
             game,
-            track,
+            path,
             entries,
             car=car,
             session="race" if opponents else "practice",
             laps=laps if opponents and laps else 0,
             angles=self.range_finder_angles,
         )
-        self.track: Track = load_track(track_path(game, track))
+        self.track: Track = load_track(path)
         self._agent = place - 1
         self._noise = sensor_noise
         self._align()

@@ -15,7 +15,7 @@ from typing import Any
 
 from sb3_torcs.cli.common import print_json, quiet_output
 from sb3_torcs.errors import BackendUnavailable, Sb3TorcsError
-from sb3_torcs.game import find_game, linker_knows
+from sb3_torcs.game import BUILD, find_game, linker_knows
 
 __all__ = ["Check", "add_parser", "checks", "run"]
 
@@ -35,7 +35,6 @@ PACKAGES = {
 """Distributions, and what is imported of them."""
 
 EXTENSION = "sb3_torcs._engine"
-BUILD = "make native (in a clone), or: pip install --force-reinstall --no-deps sb3-torcs"
 COMPILERS = ("c++", "g++", "clang++")
 DEFAULT_CAR = "car1-trb1"
 REINSTALL = "sudo apt-get install --reinstall torcs torcs-data"
