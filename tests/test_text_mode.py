@@ -21,8 +21,9 @@ from sb3_torcs.errors import (
     UnknownRobot,
 )
 from sb3_torcs.game import find_game
+from sb3_torcs.game_process import game_environment
 from sb3_torcs.race_results import Lap
-from sb3_torcs.text_mode import game_environment, missing_libraries, run
+from sb3_torcs.text_mode import missing_libraries, run
 
 
 @pytest.fixture(autouse=True)
@@ -129,7 +130,7 @@ class TestRefusals:
             ([("racer", 3), ("racer", 10)], {}, r"a practice is for one robot, 2 are named"),
             ([], {"session": "race"}, r"robots are none; expected at least one"),
             ([("racer", 3)] * 2, {"session": "race"}, r"racer:3, racer:3; expected .* twice"),
-            ([("racer", 3)], {"laps": 0}, r"laps is 0; expected at least 1"),
+            ([("racer", 3)], {"laps": 0}, r"laps is 0; expected a whole number >= 1"),
             ([("racer", 3)], {"session": "duel"}, r"session is 'duel'; expected practice or race"),
         ],
     )

@@ -13,6 +13,7 @@ import numpy as np
 from sb3_torcs.car import CarState, Controls, FloatArray, Start, is_count
 from sb3_torcs.errors import BackendUnavailable, InvalidOption
 from sb3_torcs.game import BUILD, Game, find_game
+from sb3_torcs.race_file import SESSIONS
 from sb3_torcs.sensors import range_finder_angles
 from sb3_torcs.tracks import Track, load_track
 
@@ -23,8 +24,6 @@ __all__ = ["AGENT", "Fleet", "NativeBackend", "check_layout", "make_engine"]
 
 AGENT = ("", 0)
 """The agent's entry in a starting list; robots have a name and an index."""
-
-SESSIONS = {"practice": "practice", "race": "quickrace"}  # by the names of the game's files
 
 MIN_SHIFT = 1.0  # [m] between the game's frame and the track's, from which positions are moved
 
