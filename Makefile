@@ -37,8 +37,8 @@ $(BUILT): $(STAMP) $(SOURCES)
 	SB3_TORCS_REQUIRE_NATIVE=1 $(BIN)/python -m pip install --verbose --no-deps --editable .
 	@touch $@
 
-game: install ## get TORCS, if it is not here
-	$(BIN)/sb3-torcs install-torcs
+game: install ## get TORCS and Xvfb, if they are not here
+	$(BIN)/sb3-torcs install-torcs --film
 
 # A skipped test hides a missing engine: here it has to be built.
 test pytest sanitize: export SB3_TORCS_REQUIRE_NATIVE = 1

@@ -38,7 +38,10 @@ elif "download" in args:
         pathlib.Path(f"{name}_1.deb").write_text("12345678")
 elif "install" in args:
     fail("no-install") if flag("known") else sys.exit(100)
-    shutil.copytree(folder / "game", os.environ["SYSTEM"])
+    if "xvfb" in args:
+        (folder / "bin" / "Xvfb").symlink_to(sys.argv[0])
+    else:
+        shutil.copytree(folder / "game", os.environ["SYSTEM"])
 """
 APT_CACHE = """
 print("Package: torcs") if flag("known") else sys.exit(100)
@@ -113,6 +116,28 @@ def test_with_root_apt_installs(machine, own, tmp_path, monkeypatch, capsys):
     (install,) = [line for line in log(machine) if line.startswith("apt-get")]
     assert install.startswith("apt-get install --yes --no-install-recommends torcs torcs-data")
     assert not own.exists()
+
+
+def test_film_gets_a_display_too_and_only_once(machine, monkeypatch, capsys):
+    monkeypatch.setattr(os, "geteuid", lambda: 0)
+    for _ in range(2):
+        assert main(["install-torcs", "--film"]) == 0
+        assert f"Xvfb is installed: {machine}/bin/Xvfb" in capsys.readouterr().out
+    game, display = [line for line in log(machine) if line.startswith("apt-get install")]
+    assert "torcs torcs-data" in game
+    assert "xvfb libgl1-mesa-dri" in display
+
+
+def test_a_display_is_for_root_alone_to_install(machine, tmp_path, monkeypatch, capsys):
+    write_game(tmp_path / "usr")
+    assert main(["install-torcs", "--film"]) == 1
+    assert "type: sudo apt-get install xvfb libgl1-mesa-dri" in capsys.readouterr().err
+    monkeypatch.setattr(os, "geteuid", lambda: 0)
+    assert main(["install-torcs", "--film", "--check"]) == 1
+    assert log(machine) == []
+    (machine / "no-install").touch()
+    assert main(["install-torcs", "--film"]) == 1
+    assert "could not install xvfb" in capsys.readouterr().err
 
 
 def test_root_can_choose_to_leave_the_system_alone(machine, own, tmp_path, monkeypatch):

@@ -21,6 +21,7 @@ from sb3_torcs.game import HOME_VARIABLE, Game, find_game, user_folder
 __all__ = ["add_parser", "run"]
 
 PACKAGES = ("torcs", "torcs-data")
+FILM_PACKAGES = ("xvfb", "libgl1-mesa-dri")  # a display without a screen, and what draws on it
 LOOK_AGAIN = 0.1  # [s] between two looks at a running program
 LAST_LINES = 5  # of what a failed program said
 LOCK_PATIENCE = 120  # [s] to wait for another apt
@@ -31,6 +32,9 @@ Get TORCS, if it is not here yet.
 Debian and Ubuntu: as root by apt-get; otherwise, or with --user, its packages and those of the
 libraries that this system lacks are downloaded and unpacked into your own data folder, which
 needs no root and changes nothing else.
+
+With --film also Xvfb, as root only: a film or a picture of the game needs it where there is no
+display.
 """
 ELSEWHERE = """\
 sb3-torcs: apt-get and dpkg-deb, which this command uses, are not here. Get TORCS 1.3.7 by hand:
@@ -54,6 +58,7 @@ def add_parser(subparsers: Any) -> None:
     add = parser.add_argument
     add("--check", action="store_true", help="only say whether it is here; 1 if it is not")
     add("--user", action="store_true", help="unpack it for this user, even as root")
+    add("--film", action="store_true", help="also get Xvfb, to film where there is no display")
     parser.set_defaults(run=run)
 
 
@@ -63,19 +68,44 @@ def run(args: argparse.Namespace) -> int:
     :return: the exit status: 1 when the game is not there at the end
     """
     try:
-        _tell(find_game())
-        return 0
-    except BackendUnavailable as error:
-        absent = error
-    if args.check:
-        print(f"sb3-torcs: {absent}", file=sys.stderr)
-        return 1
-    try:
-        _tell(_install(absent, for_user=args.user or os.geteuid() != 0))
+        _tell(_found_or_installed(args))
+        if args.film:
+            _get_display(args.check)
     except (BackendUnavailable, InstallFailed) as error:
         print(f"sb3-torcs: {error}", file=sys.stderr)
         return 1
     return 0
+
+
+def _found_or_installed(args: argparse.Namespace) -> Game:
+    """
+    Find the game, and install it if it is not there and may be.
+
+    :param args: from the command line
+    """
+    try:
+        return find_game()
+    except BackendUnavailable as absent:
+        if args.check:
+            raise
+        return _install(absent, for_user=args.user or os.geteuid() != 0)
+
+
+def _get_display(check: bool) -> None:
+    """
+    Install Xvfb, if it is not there.
+
+    :param check: whether only to look
+    :raises InstallFailed: if it is not there at the end
+    """
+    if shutil.which("Xvfb"):
+        print(f"Xvfb is installed: {shutil.which('Xvfb')}")
+        return
+    by_hand = f"sudo apt-get install {' '.join(FILM_PACKAGES)}"
+    if check or os.geteuid() != 0 or not shutil.which("apt-get"):
+        raise InstallFailed(f"Xvfb is not installed, and only root can; type: {by_hand}")
+    _apt_install(FILM_PACKAGES, by_hand)
+    _get_display(check=True)
 
 
 def _tell(game: Game) -> None:
@@ -101,17 +131,26 @@ def _install(absent: BackendUnavailable, for_user: bool) -> Game:
         return _unpack_for_user(user_folder())
     if not _apt_knows(()):
         _shown(["apt-get", "update"])
-    install = ["apt-get", "install", "--yes", "--no-install-recommends", *PACKAGES]
+    _apt_install(PACKAGES, "sb3-torcs install-torcs --user")
+    return find_game()
+
+
+def _apt_install(packages: Sequence[str], otherwise: str) -> None:
+    """
+    Install packages, as root.
+
+    :param packages: their names
+    :param otherwise: what to type if that fails
+    """
+    install = ["apt-get", "install", "--yes", "--no-install-recommends", *packages]
     install += ["-o", f"DPkg::Lock::Timeout={LOCK_PATIENCE}"]
     if _shown(install) != 0:
         # An old list names versions that the server has no more.
         _shown(["apt-get", "update"])
         if _shown(install) != 0:
             raise InstallFailed(
-                "apt-get could not install TORCS (see above); without it: "
-                "sb3-torcs install-torcs --user"
+                f"apt-get could not install {packages[0]} (see above); type: {otherwise}"
             )
-    return find_game()
 
 
 def _shown(call: Sequence[str]) -> int:
