@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 BUILT := $(VENV)/.built
-SOURCES := setup.py $(wildcard sb3_torcs/native/*)
+SOURCES := setup.py $(wildcard sb3_torcs/native/*.* sb3_torcs/native/*/*)
 SHELL := /bin/bash
 
 # One thread per process: on few cores torch's own threads get in each other's way.

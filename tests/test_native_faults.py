@@ -517,7 +517,7 @@ class TestCalls:
             lambda: engine.car_name(0), lambda: engine.laps(0), lambda: engine.set_noise(1),
             lambda: engine.set_origin(0, 0), lambda: engine.update_physics(1),
             lambda: engine.replay(np.zeros((1, 3)), True), lambda: engine.agent,
-            lambda: engine.ended, lambda: engine.focus(0, 0.0),
+            lambda: engine.ended, lambda: engine.focus(0, 0.0), engine.appearance,
         ]  # fmt: skip
         for call in calls:
             with pytest.raises(EnvClosed, match="closed; make a new environment"):

@@ -13,14 +13,22 @@ import numpy as np
 from sb3_torcs.car import CarState, Controls, FloatArray, Start, is_count
 from sb3_torcs.errors import BackendUnavailable, InvalidOption
 from sb3_torcs.game import BUILD, Game, find_game
-from sb3_torcs.race_file import SESSIONS
+from sb3_torcs.race_file import MANY_LAPS, SCR_SERVER, SESSIONS, RaceSetup
 from sb3_torcs.sensors import range_finder_angles
 from sb3_torcs.tracks import Track, load_track
 
 if TYPE_CHECKING:
     from sb3_torcs._engine import Engine
 
-__all__ = ["AGENT", "Fleet", "NativeBackend", "check_layout", "make_engine"]
+__all__ = [
+    "AGENT",
+    "Fleet",
+    "NativeBackend",
+    "check_layout",
+    "make_engine",
+    "starting_list",
+    "track_path",
+]
 
 AGENT = ("", 0)
 """The agent's entry in a starting list; robots have a name and an index."""
@@ -97,6 +105,31 @@ def track_path(game: Game, track: str | os.PathLike[str]) -> Path:
     return game.tracks()[game.find_track(os.fspath(track))].absolute()
 
 
+def starting_list(
+    game: Game, opponents: Sequence[str], grid_place: int | None
+) -> list[tuple[str, int]]:
+    """
+    Say who starts where.
+
+    :param game: the installation
+    :param opponents: robots, e.g. ``("inferno", "berniw:3")``
+    :param grid_place: of the agent among them, 1 in front; ``None`` is behind them all
+    :return: names and indices, and :data:`AGENT`
+    :raises InvalidOption: if there is no such place, or the opponents are no list
+    :raises UnknownRobot: if there is no such robot
+    """
+    if isinstance(opponents, str):
+        raise InvalidOption(f"opponents is {opponents!r}; expected a list of names")
+    entries = [game.parse_robot(name) for name in opponents]
+    place = len(entries) + 1 if grid_place is None else grid_place
+    if not is_count(place) or place > len(entries) + 1:
+        raise InvalidOption(
+            f"grid_place is {grid_place!r}; expected 1 to {len(entries) + 1}, or None"
+        )
+    entries.insert(place - 1, AGENT)
+    return entries
+
+
 class NativeBackend:
     """
     One agent in the real game, alone or among its robots.
@@ -121,16 +154,8 @@ class NativeBackend:
         grid_place: int | None = None,
         sensor_noise: bool = False,
     ) -> None:
-        if isinstance(opponents, str):
-            raise InvalidOption(f"opponents is {opponents!r}; expected a list of names")
         game = find_game()
-        entries = [game.parse_robot(name) for name in opponents]
-        place = len(entries) + 1 if grid_place is None else grid_place
-        if not is_count(place) or place > len(entries) + 1:
-            raise InvalidOption(
-                f"grid_place is {grid_place!r}; expected 1 to {len(entries) + 1}, or None"
-            )
-        entries.insert(place - 1, AGENT)
+        entries = starting_list(game, opponents, grid_place)
         self.car = car
         self.range_finder_angles = range_finder_angles(range_finders)
         self._settings: dict[str, Any] = {
@@ -142,6 +167,7 @@ class NativeBackend:
             "grid_place": grid_place,
             "sensor_noise": sensor_noise,
         }
+        self._entries = entries
         path = track_path(game, track)
         self.engine = make_engine(
             game,
@@ -153,10 +179,25 @@ class NativeBackend:
             angles=self.range_finder_angles,
         )
         self.track: Track = load_track(path)
-        self._agent = place - 1
+        self._agent = entries.index(AGENT)
         self._noise = sensor_noise
         self._align()
         self._drive: list[Any] = []  # since the reset, so that a copy can follow
+
+    def race_setup(self) -> RaceSetup:
+        """
+        Describe the same race for the game itself, with a driver of our module as the agent.
+
+        :raises InvalidOption: if the game cannot run it
+        """
+        drivers = [(SCR_SERVER, 0) if entry == AGENT else entry for entry in self._entries]
+        return RaceSetup(
+            self._settings["track"],
+            drivers,
+            self._settings["laps"] or MANY_LAPS,
+            "race" if self._settings["opponents"] else "practice",
+            self.car,
+        )
 
     def _align(self) -> None:
         """Move positions into the track's frame: the game counts one track's origin otherwise."""

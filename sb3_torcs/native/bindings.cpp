@@ -6,10 +6,13 @@
 #include <unistd.h>
 
 #include <cmath>
+#include <cstring>
+#include <string_view>
 
 #include "engine.h"
 #include "errors.h"
 #include "pool.h"
+#include "scr/messages.h"
 
 namespace py = pybind11;
 using namespace py::literals;
@@ -138,6 +141,38 @@ private:
     Pool pool_;  // last, so that its threads end first
 };
 
+// The game's side of the SCR protocol, so that its client can be held to it.
+void bind_scr(py::module_& module) {
+    module.def(
+        "scr_format_state",
+        [](const std::array<double, scr::STATE_NUMBERS>& numbers) {
+            scr::State state;
+            std::memcpy(&state, numbers.data(), sizeof state);
+            char text[scr::LONGEST_STATE];
+            return py::bytes(text, scr::format_state(state, text));
+        },
+        "numbers"_a, "Write a state: its numbers in the order of the protocol, SI.");
+    module.def(
+        "scr_parse_action",
+        [](const py::bytes& text) {
+            const scr::Action action = scr::parse_action(std::string_view(text));
+            return py::make_tuple(action.throttle, action.brake, action.gear, action.steering,
+                                  action.clutch, action.restart, action.focus, action.lap_time);
+        },
+        "text"_a, "Read an action: throttle, brake, gear, steering, clutch, restart, focus, time.");
+    module.def(
+        "scr_parse_init",
+        [](const py::bytes& text) {
+            const scr::Init init = scr::parse_init(std::string_view(text));
+            py::object start = py::none();
+            if (init.start)
+                start = py::make_tuple(init.start->distance, init.start->track_position,
+                                       init.start->heading_error, init.start->speed);
+            return py::make_tuple(init.angles, start);
+        },
+        "text"_a, "Read how a client introduces itself: its angles, and its start or None.");
+}
+
 }  // namespace
 
 PYBIND11_MODULE(_engine, module) {
@@ -212,6 +247,7 @@ PYBIND11_MODULE(_engine, module) {
              [](Engine& engine, int car, double direction) {
                  return read_only(engine.focus(car, direction));
              })
+        .def("appearance", [](Engine& engine) { return py::bytes(engine.appearance()); })
         .def("close", &Engine::close)
         .def("controls",
              [](Engine& engine, int car) {
@@ -303,6 +339,8 @@ PYBIND11_MODULE(_engine, module) {
             const WithoutPython released;
             fleet.finish();
         });
+
+    bind_scr(module);
 }
 
 }  // namespace torcs

@@ -75,8 +75,8 @@ void check_plausible(const CarElement& car, const SimulatedCar& simulated) {
             refuse(car, "has a wheel of radius " + std::to_string(wheel.radius) + " m");
     if (!(car.priv.fuel > 0.0f)) refuse(car, "has no fuel");
     if (!(car.priv.red_line > 10.0f)) refuse(car, "has no rev limiter");
-    if (car.priv.gears_number < 3 || car.priv.gears_number > MAX_GEARS)
-        refuse(car, "has " + std::to_string(car.priv.gears_number - 2) + " gears");
+    if (car.priv.gears_number < 2 || car.priv.gears_number >= MAX_GEARS)
+        refuse(car, "has " + std::to_string(car.priv.gears_number - 1) + " gears");
     if (!(car.priv.gear_ratio[car.priv.gear_offset + 1] > 0.0f))
         refuse(car, "has a first gear of ratio 0");
 }

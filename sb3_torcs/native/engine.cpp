@@ -4,7 +4,9 @@
 
 #include <algorithm>
 #include <cmath>
+#include <cstring>
 
+#include "appearance.h"
 #include "errors.h"
 
 namespace torcs {
@@ -20,6 +22,28 @@ int count_forks() {
 }
 
 double wrapped(double angle) { return std::remainder(angle, 2.0 * M_PI); }
+
+template <typename Record>
+void append(std::string& to, const Record& record) {
+    to.append(reinterpret_cast<const char*>(&record), sizeof record);
+}
+
+CarAppearance appearance_of(const CarElement& car) {
+    CarAppearance looks;
+    std::memset(&looks, 0, sizeof looks);  // also what lies between the members
+    looks.index = car.index;
+    looks.segment = car.pub.track.segment->id;
+    looks.pub = car.pub;
+    looks.race = car.race;
+    looks.priv = car.priv;
+    looks.control = car.control;
+    looks.pub.track.segment = nullptr;
+    looks.race.pit = nullptr;
+    looks.race.penalties = {nullptr, nullptr};
+    looks.priv.driver_params = looks.priv.car_params = nullptr;
+    for (WheelState& wheel : looks.priv.wheel) wheel.segment = nullptr;
+    return looks;
+}
 
 }  // namespace
 
@@ -64,11 +88,7 @@ void Engine::start(const Start& start) {
     Access race(*this);
     check_agent(*race);
     const double length = race->track().length;
-    // A car may stand a little beyond the last centimetre: lengths are added up in other ways.
-    if (!(start.distance >= 0.0 && start.distance <= length + 1.0) ||
-        !(std::fabs(start.track_position) <= 5.0) ||
-        !(std::fabs(start.heading_error) <= 2.0 * M_PI) ||
-        !(start.speed >= 0.0 && start.speed <= 200.0))
+    if (!is_valid(start, length))
         throw Error("InvalidOption",
                     "start at " + std::to_string(start.distance) + " m, place across " +
                         std::to_string(start.track_position) + ", heading error " +
@@ -123,6 +143,15 @@ void Engine::check_car(const Race& race, int car) {
                                          std::to_string(race.cars_number() - 1));
 }
 
+std::string Engine::appearance() {
+    Access race(*this);
+    std::string looks;
+    append(looks, SceneAppearance{race->situation().time, race->cars_number(),
+                                  sizeof(CarAppearance)});
+    for (int i = 0; i < race->cars_number(); i++) append(looks, appearance_of(*race->cars()[i]));
+    return looks;
+}
+
 Reading Engine::read(int car) {
     Access race(*this);
     check_car(*race, car);
@@ -134,12 +163,8 @@ std::array<double, FOCUS_BEAMS> Engine::focus(int car, double direction) {
     check_car(*race, car);
     if (!std::isfinite(direction))
         throw Error("InvalidOption", "direction is no finite number; expected radians");
-    std::array<double, RANGE_FINDERS> angles{}, distances;
-    for (int i = 0; i < FOCUS_BEAMS; i++)
-        angles[static_cast<std::size_t>(i)] = direction + (i - FOCUS_BEAMS / 2) * M_PI / 180.0;
-    range_finders(race->car(car), angles.data(), distances.data());
     std::array<double, FOCUS_BEAMS> beams;
-    std::copy_n(distances.begin(), beams.size(), beams.begin());
+    focused_range_finders(race->car(car), direction, beams.data());
     return beams;
 }
 
@@ -147,10 +172,6 @@ Reading Engine::read(Race& race, int index) {
     const CarElement& car = race.car(index);
     const Motion& motion = car.pub.local;
     const TrackPosition& position = car.pub.track;
-    const double length = race.track().length;
-    double from_start = std::fmod(distance_from_start(car), length);
-    if (from_start < 0.0) from_start += length;
-    if (from_start >= length) from_start = 0.0;
     Reading reading;
     reading.scalars = {
         race.situation().time,
@@ -165,7 +186,7 @@ Reading Engine::read(Race& race, int index) {
         heading_error(car),
         position.to_middle,
         position.segment->width,
-        from_start,
+        distance_along(car, race.track().length),
         race.distance_raced(index),
         car.priv.engine_speed,
         static_cast<double>(car.priv.gear),

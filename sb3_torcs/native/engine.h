@@ -6,6 +6,7 @@
 #include <cfenv>
 #include <memory>
 #include <optional>
+#include <string>
 #include <vector>
 
 #include "race.h"
@@ -31,8 +32,6 @@ struct Moment {
     Snapshot race;
     std::optional<Generator> noise;
 };
-
-constexpr int FOCUS_BEAMS = 5;
 
 // Libraries of the process may have set how numbers are rounded, or that tiny ones become zero: a
 // race is computed as in a process of its own.
@@ -68,6 +67,8 @@ public:
     // The SCR server's `focus`: distances at 1 degree from each other around a direction [rad]
     // against the car's axis, left negative.
     std::array<double, FOCUS_BEAMS> focus(int car, double direction);
+    // What the game needs to draw the present moment; see appearance.h.
+    std::string appearance();
     void close();
 
     // Drives what a list of controls says, one tick each, with or without sensors; for measuring.

@@ -238,13 +238,15 @@ struct CarPrivate {
     float red_line;        // [rad/s] at which the limiter cuts in
     Unused<20> b_;
     float gear_ratio[MAX_GEARS];  // reverse, neutral, first and up
-    int gears_number;             // with reverse and neutral
+    int gears_number;             // forward ones and neutral
     int gear_offset;
     Unused<36> c_;
     int collision;
     Unused<28> d_;
     int damage;            // [points]
-    Unused<32> e_;
+    Unused<4> e_;
+    int dents;             // to be made in the body that is drawn
+    Unused<24> f_;
 };
 
 struct Control {
@@ -309,13 +311,7 @@ struct Situation {
     CarElement** cars; // in the order of the race
 };
 
-// The simulation's `config` is handed the game's race manager and reads only its track.
-struct RaceManager {
-    CarElement* cars;
-    Situation* situation;
-    TrackData* track;
-    Unused<376> a_;
-};
+struct RaceManager;
 
 // ---- Modules -----------------------------------------------------------------------------------
 
@@ -343,6 +339,50 @@ struct Simulation {
     void (*reconfig)(CarElement*);
     void (*update)(Situation*, double step, int telemetry);
     void (*shutdown)();
+};
+
+struct Graphics {
+    void* init_track;
+    int (*init_view)(int x, int y, int width, int height, int flag, void* screen);
+    void* unused_;
+    int (*refresh)(Situation*);
+    void* unused_too_[3];
+};
+
+enum EngineState : int { LOAD_EVENT = 1 };
+
+// What the race engine keeps about a car beside the shared record.
+struct CarProgress {
+    TrackPosition previous;
+    float lap_began;      // [s]
+    int backwards;        // crossings of the line that have to be made up for
+    Unused<40> a_;
+};
+
+// What the game's exported `ReInfo` points to. The simulation's `config` reads only its track.
+struct RaceManager {
+    CarElement* cars;
+    Situation* situation;
+    TrackData* track;
+    void* params;         // of the race's file
+    void* results;
+    Unused<16> a_;
+    int state;            // EngineState
+    Unused<8> b_;
+    TrackInterface tracks;
+    Graphics graphics;
+    Simulation simulation;
+    Unused<16> c_;
+    char* file_name;      // of the race, without folder and ending
+    const char* name;
+    const char* race_name;
+    CarProgress* progress;  // of each car, in the order of `cars`
+    double time;          // [s] on the game's clock that the simulation has come to
+    double robots_time;   // [s] since the start, when the robots were called
+    double time_factor;
+    int running;          // 0 while paused
+    int display_mode;
+    Unused<80> e_;
 };
 
 // ---- The simulation's own car, behind its exported `SimCarTable` --------------------------------
@@ -405,7 +445,8 @@ static_assert(offsetof(WheelState, condition) == 64 && sizeof(WheelState) == 88)
 static_assert(offsetof(CarPrivate, module) == 20 && offsetof(CarPrivate, wheel) == 56);
 static_assert(offsetof(CarPrivate, gear) == 504 && offsetof(CarPrivate, gear_ratio) == 540);
 static_assert(offsetof(CarPrivate, gears_number) == 580 && offsetof(CarPrivate, collision) == 624);
-static_assert(offsetof(CarPrivate, damage) == 656 && sizeof(CarPrivate) == 696);
+static_assert(offsetof(CarPrivate, damage) == 656 && offsetof(CarPrivate, dents) == 664);
+static_assert(sizeof(CarPrivate) == 696);
 static_assert(offsetof(Control, message) == 24 && sizeof(Control) == 172);
 static_assert(sizeof(PitCommand) == 948);
 static_assert(offsetof(CarElement, info) == 4 && offsetof(CarElement, pub) == 328);
@@ -414,7 +455,13 @@ static_assert(offsetof(CarElement, control) == 1536 && offsetof(CarElement, robo
 static_assert(sizeof(CarElement) == 2672 && sizeof(Penalty) == 24);
 static_assert(offsetof(Situation, max_damage) == 16 && offsetof(Situation, delta_time) == 32);
 static_assert(offsetof(Situation, cars) == 56 && sizeof(Situation) == 64);
-static_assert(offsetof(RaceManager, track) == 16 && sizeof(RaceManager) == 400);
+static_assert(offsetof(RaceManager, track) == 16 && offsetof(RaceManager, state) == 56);
+static_assert(offsetof(RaceManager, graphics) == 144 && offsetof(RaceManager, simulation) == 200);
+static_assert(offsetof(CarProgress, lap_began) == 32 && sizeof(CarProgress) == 80);
+static_assert(offsetof(RaceManager, progress) == 280);
+static_assert(offsetof(RaceManager, file_name) == 256 && offsetof(RaceManager, time) == 288);
+static_assert(offsetof(RaceManager, running) == 312 && sizeof(RaceManager) == 400);
+static_assert(offsetof(Graphics, refresh) == 24 && sizeof(Graphics) == 56);
 static_assert(sizeof(ModuleInfo) == 40 && sizeof(TrackInterface) == 72);
 static_assert(sizeof(Simulation) == 40 && sizeof(Robot) == 56);
 static_assert(offsetof(SimulatedWheel, spin) == 156 && offsetof(SimulatedWheel, radius) == 280);

@@ -13,19 +13,14 @@ namespace torcs {
 
 namespace {
 
-constexpr double PI = 3.14159265358979323846;
 constexpr std::size_t RACE_MEMORY = std::size_t{128} << 20;  // reserved; a full grid uses 17
 constexpr std::size_t TRACK_MEMORY = std::size_t{64} << 20;
 
 constexpr double COUNTDOWN = -2.0;   // [s]
 constexpr int SETTLING_STEPS = 500;  // of standing on the brake, so that the springs come to rest
-constexpr int SETTLING_STEPS_AT_REST = 300;  // of a car put down at the height at which it stands
-constexpr int AGAINST_RIGHT = 0;     // of to_global
 constexpr int MANY_LAPS = 1 << 30;
 
-// Shift points of the SCR car, 8500 and 7500 rpm of the 9152 at which its limiter cuts in, as
-// shares of any car's.
-constexpr float SHIFT_UP = 8500.0f / 9152.0f;
+// Beside SHIFT_UP: of the SCR car 7500 rpm.
 constexpr float SHIFT_DOWN = 7500.0f / 9152.0f;
 
 const char* const SKILLS[] = {"rookie", "amateur", "semi-pro", "pro"};
@@ -334,31 +329,13 @@ float Race::grid_to_right(int index) const {
 }
 
 void Race::place_on_grid(CarElement& car) {
-    place(car, grid_distance(car.index), grid_to_right(car.index), 0.0f,
+    place(field(), car, grid_distance(car.index), grid_to_right(car.index), 0.0f,
           grid_number("initial height", 0.3f));
 }
 
-void Race::place(CarElement& car, float distance, float to_right, float heading_error,
-                 float height) {
-    Segment* segment = track_->last;
-    while (distance < segment->from_start) segment = segment->prev;
-    const float along = distance - segment->from_start;
-    car.pub.local = Motion{};
-    Pose& pose = car.pub.local.pos;
-    TrackPosition& position = car.pub.track;
-    position.segment = segment;
-    position.type = 0;
-    position.to_right = to_right;
-    position.to_start = segment->type == STRAIGHT ? along : along / segment->radius;
-    game_.to_global(&position, &pose.x, &pose.y, AGAINST_RIGHT);
-    pose.az = segment->heading;
-    if (segment->type == RIGHT_TURN) pose.az = segment->heading - position.to_start;
-    if (segment->type == LEFT_TURN) pose.az = segment->heading + position.to_start;
-    pose.az -= heading_error;
-    pose.z = game_.road_height(&position) + height;
-    while (pose.az > 2 * PI) pose.az -= 2 * PI;
-    while (pose.az < 0) pose.az += 2 * PI;
-    simulation_.config(&car, &world_->manager);
+Field Race::field() const {
+    return {world_->cars, cars_number(),    agent_,          &world_->manager,
+            &simulation_, simulated_,       game_.to_global, game_.road_height};
 }
 
 void Race::assign_pits() {
@@ -407,8 +384,11 @@ void Race::prepare() {
         car.robot->new_race(car.robot->index, &car, &world_->situation);
     }
     ready_ = save();
-    settle(SETTLING_STEPS);
-    for (int i = 0; i < cars_number(); i++) rest_heights_.push_back(height(i));
+    simulation_.update(&world_->situation, PHYSICS_STEP, -1);
+    for (int i = 0; i < cars_number(); i++) world_->records[i].previous = world_->cars[i].pub.track;
+    settle(field(), world_->situation, SETTLING_STEPS, false);
+    for (int i = 0; i < cars_number(); i++)
+        rest_heights_.push_back(height_over_road(field(), world_->cars[i]));
     check_simulation(*simulated_, world_->cars, cars_number());
     Situation& situation = world_->situation;
     world_->last_call = -1.0;
@@ -422,117 +402,37 @@ void Race::prepare() {
     on_grid_ = save();
 }
 
-void Race::settle(int steps) {
-    simulation_.update(&world_->situation, PHYSICS_STEP, -1);
-    for (int i = 0; i < cars_number(); i++) {
-        CarElement& car = world_->cars[i];
-        world_->records[i].previous = car.pub.track;
-        const int gear = car.control.gear;
-        car.control = Control{};
-        car.control.brake = 1.0f;
-        car.control.gear = world_->records[i].flying ? gear : 0;
-    }
-    for (int i = 0; i < steps; i++)
-        simulation_.update(&world_->situation, PHYSICS_STEP, -1);
-}
-
 void Race::start() { restore(on_grid_); }
 
 void Race::start(const Start& start) {
     restore(ready_);
     Hosted hosted(host_);
-    for (int i = 0; i < cars_number(); i++) {
-        CarElement& car = world_->cars[i];
-        world_->records[i].flying = true;
-        double distance = std::fmod(field_distance(i, start), track_->length);
-        if (distance < 0.0) distance += track_->length;
-        float to_right = grid_to_right(i), heading_error = 0.0f;
-        if (i == agent_) {
-            const double half_width = 0.5 * segment_at(distance)->width;
-            to_right = static_cast<float>((1.0 + start.track_position) * half_width);
-            heading_error = static_cast<float>(start.heading_error);
-        }
-        place(car, static_cast<float>(distance), to_right, heading_error,
-              rest_heights_[static_cast<std::size_t>(i)]);
-        car.control.gear = gear_for(car, start.speed);  // engages while the car settles
-    }
-    settle(SETTLING_STEPS_AT_REST);
-    // The collision library finds no way out of what was never apart: not a number comes of it.
-    for (int i = 0; i < cars_number(); i++)
-        if (car(i).priv.collision & COLLISION_WITH_BODY || !std::isfinite(car(i).pub.local.pos.z))
-            throw Error("InvalidOption", std::string(car(i).info.name) +
-                                             " would stand in a wall or in another car; start "
-                                             "elsewhere, or nearer to the middle of the road");
     Situation& situation = world_->situation;
+    const std::vector<double> distances = put_down(field(), situation, start, rest_heights_);
+    if (const CarElement* car = stuck_car(field()))
+        throw Error("InvalidOption", std::string(car->info.name) +
+                                         " would stand in a wall or in another car; start "
+                                         "elsewhere, or nearer to the middle of the road");
     situation.state = RUNNING;
     situation.time = 0.0;
     situation.delta_time = ROBOT_STEP;
     world_->last_call = -ROBOT_STEP;
     for (int i = 0; i < cars_number(); i++) {
         CarElement& car = world_->cars[i];
-        give_speed(car, start.speed);
-        world_->records[i].previous = car.pub.track;  // it may have settled across the line
+        Record& record = world_->records[i];
+        give_speed(field(), car, start.speed);
+        record.flying = true;
+        record.previous = car.pub.track;  // it may have settled across the line
         manage(car);
-        count_lap(car, field_distance(i, start), start.distance == 0.0);
+        const int ahead = crossings_of(car, distances[static_cast<std::size_t>(i)], track_->length,
+                                       start.distance == 0.0);
+        car.race.crossings = std::max(ahead, 0);
+        car.race.remaining_laps -= car.race.crossings;
+        record.backwards = std::max(-ahead, 0);
         measure_distance(car);
-        world_->records[i].start_distance = car.race.distance_raced;
+        record.start_distance = car.race.distance_raced;
     }
     sort();
-}
-
-// Where a car is when the whole field is moved so that the agent is where it starts; it can be
-// before the start line, or a lap further.
-double Race::field_distance(int index, const Start& start) const {
-    return start.distance + (grid_distance(index) - grid_distance(agent_));
-}
-
-// A car of a field that is spread over the start line is a lap ahead of those behind it. Laps
-// count from the agent's; where it starts on the line itself, its lap has begun.
-void Race::count_lap(CarElement& car, double distance, bool lap_has_begun) {
-    const double shift = distance - car.race.distance_from_start;
-    const int lap = (lap_has_begun ? 1 : 0) + static_cast<int>(std::lround(shift / track_->length));
-    car.race.crossings = std::max(lap, 0);
-    car.race.remaining_laps -= car.race.crossings;
-    world_->records[car.index].backwards = std::max(-lap, 0);
-}
-
-const Segment* Race::segment_at(double distance) const {
-    const Segment* segment = track_->last;
-    while (distance < segment->from_start) segment = segment->prev;
-    return segment;
-}
-
-int Race::gear_for(const CarElement& car, double speed) const {
-    const double spin = speed / (*simulated_)[car.index].wheel[REAR_RIGHT].radius;
-    const int highest = car.priv.gears_number - 1 - car.priv.gear_offset;
-    int gear = 1;
-    while (gear < highest &&
-           spin * car.priv.gear_ratio[gear + car.priv.gear_offset] > SHIFT_UP * car.priv.red_line)
-        gear++;
-    return gear;
-}
-
-void Race::give_speed(CarElement& car, double speed) {
-    SimulatedCar& simulated = (*simulated_)[car.index];
-    simulated.damage = car.priv.damage = 0;  // of being put down level on a slope
-    if (speed == 0.0) return;
-    const double yaw = simulated.global.pos.az;
-    simulated.local.vel.x = static_cast<float>(speed);
-    simulated.global.vel.x = static_cast<float>(speed * std::cos(yaw));
-    simulated.global.vel.y = static_cast<float>(speed * std::sin(yaw));
-    for (int i = 0; i < 4; i++) {
-        SimulatedWheel& wheel = simulated.wheel[i];
-        wheel.spin = wheel.previous_spin = wheel.axle_spin =
-            static_cast<float>(speed / wheel.radius);
-        car.priv.wheel[i].spin = wheel.spin;
-    }
-    const float ratio = car.priv.gear_ratio[car.priv.gear + car.priv.gear_offset];
-    simulated.engine_speed =
-        std::max(simulated.engine_speed, simulated.wheel[REAR_RIGHT].spin * ratio);
-    car.priv.engine_speed = simulated.engine_speed;
-    car.pub.local = simulated.local;
-    car.pub.global = simulated.global;
-    car.pub.speed = static_cast<float>(speed);
 }
 
 // ---- Driving ------------------------------------------------------------------------------------
@@ -623,7 +523,7 @@ int Race::automatic_gear(const CarPrivate& car) {
     const int gear = car.gear;
     if (gear < 1) return 1;
     const float* ratio = car.gear_ratio + car.gear_offset;
-    if (car.engine_speed > SHIFT_UP * car.red_line && gear < car.gears_number - 1 - car.gear_offset)
+    if (car.engine_speed > SHIFT_UP * car.red_line && gear < car.gears_number - 1)
         return gear + 1;
     if (gear > 1 && car.engine_speed * ratio[gear - 1] / ratio[gear] < SHIFT_DOWN * car.red_line)
         return gear - 1;
@@ -632,10 +532,7 @@ int Race::automatic_gear(const CarPrivate& car) {
 
 // ---- Reading and keeping ------------------------------------------------------------------------
 
-float Race::height(int index) const {
-    TrackPosition position = world_->cars[index].pub.track;
-    return world_->cars[index].pub.local.pos.z - game_.road_height(&position);
-}
+float Race::height(int index) const { return height_over_road(field(), car(index)); }
 
 double Race::distance_raced(int index) const {
     return world_->cars[index].race.distance_raced - world_->records[index].start_distance;

@@ -15,6 +15,7 @@
 #include "game.h"
 #include "layout.h"
 #include "library.h"
+#include "placing.h"
 
 namespace torcs {
 
@@ -30,13 +31,6 @@ struct RaceOptions {
     std::string car;      // the agent's
     std::vector<Entry> entries;
     int laps = 0;         // 0 drives on
-};
-
-struct Start {
-    double distance;        // [m] along the road from the start line
-    double track_position;  // [-] of the agent: 1 is the left edge, -1 the right
-    double heading_error;   // [rad] of the agent: positive if it points to the right
-    double speed;           // [m/s] of all cars
 };
 
 struct Controls {
@@ -107,7 +101,7 @@ private:
     // What the race engine keeps about a car beside the shared record.
     struct Record {
         TrackPosition previous;
-        double lap_began;          // [s]
+        float lap_began;           // [s]
         int backwards;             // crossings of the line that have to be made up for
         double pit_time;           // [s] of the present stop
         float top_speed, lowest_speed;
@@ -149,15 +143,9 @@ private:
     float grid_distance(int index) const;
     float grid_to_right(int index) const;
     void place_on_grid(CarElement& car);
-    void place(CarElement& car, float distance, float to_right, float heading_error, float height);
+    Field field() const;
     void assign_pits();
     void prepare();
-    void settle(int steps);
-    double field_distance(int index, const Start& start) const;
-    void count_lap(CarElement& car, double distance, bool lap_has_begun);
-    const Segment* segment_at(double distance) const;
-    int gear_for(const CarElement& car, double speed) const;
-    void give_speed(CarElement& car, double speed);
 
     void step();
     bool call_is_due() const;

@@ -95,10 +95,10 @@ bool Race::cross_line(CarElement& car, Record& record) {
             race.laps_behind_leader = 0;
             race.behind_previous = 0.0;
         }
-        record.lap_began = situation.time;
+        record.lap_began = static_cast<float>(situation.time);
         record_lap(car, record);
     } else if (record.flying) {
-        record.lap_began = situation.time;
+        record.lap_began = static_cast<float>(situation.time);
     }
     record.top_speed = record.lowest_speed = race.lowest_speed = car.pub.local.vel.x;
     // With an agent nobody is flagged off: its environment says when it is over.

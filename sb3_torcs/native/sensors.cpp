@@ -166,6 +166,12 @@ double distance_from_start(const CarElement& car) {
     return segment.from_start + car.pub.track.to_start * scale;
 }
 
+double distance_along(const CarElement& car, double length) {
+    double distance = std::fmod(distance_from_start(car), length);
+    if (distance < 0.0) distance += length;
+    return distance < length ? distance : 0.0;
+}
+
 void range_finders(const CarElement& car, const double* angles, double* distances) {
     const TrackPosition& track = car.pub.track;
     if (std::abs(2.0 * track.to_middle) > track.segment->width) {
@@ -180,6 +186,14 @@ void range_finders(const CarElement& car, const double* angles, double* distance
         const Vector direction = {std::cos(yaw - angles[i]), std::sin(yaw - angles[i])};
         distances[i] = Ray(origin, direction, dot(direction, along) >= 0.0).cast(*track.segment);
     }
+}
+
+void focused_range_finders(const CarElement& car, double direction, double* distances) {
+    double angles[RANGE_FINDERS] = {}, all[RANGE_FINDERS];
+    for (int i = 0; i < FOCUS_BEAMS; i++)
+        angles[i] = direction + (i - FOCUS_BEAMS / 2) * PI / 180.0;
+    range_finders(car, angles, all);
+    std::copy_n(all, FOCUS_BEAMS, distances);
 }
 
 // ---- Opponents ---------------------------------------------------------------------------------

@@ -13,6 +13,7 @@ namespace torcs {
 
 constexpr double SENSOR_RANGE = 200.0;  // [m] of range finders and of opponent sensors
 constexpr int RANGE_FINDERS = 19;
+constexpr int FOCUS_BEAMS = 5;
 constexpr int OPPONENT_SECTORS = 36;
 constexpr double OFF_TRACK = -1.0;      // what range finders read beside the road
 
@@ -24,11 +25,18 @@ double heading_error(const CarElement& car);
 // than the track's length can come out at the line.
 double distance_from_start(const CarElement& car);
 
+// The same in [0, length).
+double distance_along(const CarElement& car, double length);
+
 // Distances [m] to the road's edge in RANGE_FINDERS directions: SENSOR_RANGE where nothing is
 // nearer, all OFF_TRACK when the car's mass centre is beside the road. The edges are those of the
 // road itself: kerbs and verges lie beyond. `angles` [rad] are against the car's axis, left
 // negative, and may point backwards.
 void range_finders(const CarElement& car, const double* angles, double* distances);
+
+// The SCR server's `focus`: FOCUS_BEAMS distances [m], 1 degree from each other, around a
+// direction [rad] against the car's axis, left negative.
+void focused_range_finders(const CarElement& car, double direction, double* distances);
 
 // Distances [m], centre to centre, to the nearest car in each of OPPONENT_SECTORS sectors of 10
 // degrees: clockwise, the first one begins straight behind and ends over the left shoulder.

@@ -1,0 +1,194 @@
+#include "client.h"
+
+#include <arpa/inet.h>
+#include <poll.h>
+#include <sys/socket.h>
+#include <unistd.h>
+
+#include <algorithm>
+#include <cerrno>
+#include <cstdio>
+#include <cstdlib>
+#include <cstring>
+#include <string>
+
+#include "../owner.h"
+
+namespace torcs::scr {
+namespace {
+
+using namespace std::chrono_literals;
+
+constexpr int FIRST_PORT = 3001;
+constexpr auto DEADLINE = 10ms;  // the server's usual one
+constexpr auto WATCH = 500ms;    // how often a wait looks for the game's owner
+
+Owner& owner() {
+    static Owner owner;
+    return owner;
+}
+
+[[noreturn]] void fail(int index, const char* what, const char* hint) {
+    std::printf("scr_server %d: %s (%s); %s\n", index, what, std::strerror(errno), hint);
+    std::fflush(stdout);
+    std::exit(1);
+}
+
+// The k-th of the descriptors in the list "5,6"; -1 if there is none.
+int inherited_socket(const char* list, int k) {
+    while (k-- > 0 && list) {
+        list = std::strchr(list, ',');
+        if (list) list++;
+    }
+    return list && *list >= '0' && *list <= '9' ? std::atoi(list) : -1;
+}
+
+int bound_socket(int index) {
+    const int bound = socket(AF_INET, SOCK_DGRAM | SOCK_CLOEXEC, 0);
+    sockaddr_in address{};
+    address.sin_family = AF_INET;
+    address.sin_addr.s_addr = htonl(INADDR_ANY);
+    address.sin_port = htons(static_cast<std::uint16_t>(FIRST_PORT + index));
+    if (bound < 0 || bind(bound, reinterpret_cast<sockaddr*>(&address), sizeof address) != 0)
+        fail(index, ("UDP port " + std::to_string(FIRST_PORT + index) + " cannot be had").c_str(),
+             "end the program that has it");
+    std::printf("scr_server %d: waits for its client at UDP port %d\n", index, FIRST_PORT + index);
+    std::fflush(stdout);
+    return bound;
+}
+
+std::chrono::microseconds deadline_of(int index) {
+    const char* text = std::getenv("SB3_TORCS_SCR_DEADLINE");
+    if (!text) return DEADLINE;
+    if (std::strcmp(text, "wait") == 0) return 0us;
+    char* end;
+    const long microseconds = std::strtol(text, &end, 10);
+    if (*end != '\0' || microseconds <= 0)
+        fail(index, "SB3_TORCS_SCR_DEADLINE is no time", "set it to wait or to microseconds");
+    return std::chrono::microseconds(microseconds);
+}
+
+}  // namespace
+
+void watch_owner() { owner().check(); }
+
+Client::~Client() { dismiss(SHUTDOWN); }
+
+void Client::open(int index) {
+    if (opened_) return;
+    opened_ = true;
+    deadline_ = deadline_of(index);
+    const char* inherited = std::getenv("SB3_TORCS_SCR_SOCKETS");
+    socket_ = inherited ? inherited_socket(inherited, index) : bound_socket(index);
+}
+
+Init Client::identify() {
+    identified_ = false;
+    while (!identified_) {
+        watch_owner();
+        if (!wait(Clock::now() + WATCH)) continue;
+        // Of several that wait the newest is the one that still listens.
+        while (const auto text = receive()) {
+            if (is_init(*text))
+                adopt(*text);
+            else if (is_from_client() && parse_action(*text).restart)
+                send(RESTART);  // it missed that
+        }
+    }
+    send(IDENTIFIED);
+    return init_;
+}
+
+std::optional<Action> Client::ask(const State& state) {
+    late_answer_.reset();
+    read_all(false);
+    tell(state);
+    decisions_++;
+    answer_.reset();
+    const bool forever = deadline_ == Clock::duration::zero();
+    const Clock::time_point until = Clock::now() + deadline_;
+    while (!answer_) {
+        watch_owner();
+        const Clock::time_point next = Clock::now() + WATCH;
+        if (wait(forever ? next : std::min(until, next))) read_all(true);
+        if (!answer_ && !forever && Clock::now() >= until) {
+            late_++;
+            return late_answer_;
+        }
+    }
+    return answer_;
+}
+
+void Client::tell(const State& state) {
+    state_size_ = format_state(state, state_);
+    lap_time_ = as_written(state.lap_time);
+    send_state();
+}
+
+void Client::dismiss(std::string_view reason) {
+    if (identified_) send(reason);
+    identified_ = false;
+}
+
+// ---- Datagrams ----------------------------------------------------------------------------------
+
+bool Client::wait(Clock::time_point until) const {
+    const auto left = std::chrono::ceil<std::chrono::nanoseconds>(until - Clock::now());
+    const auto nanoseconds = std::max<long>(left.count(), 0);
+    const timespec timeout{nanoseconds / 1'000'000'000, nanoseconds % 1'000'000'000};
+    pollfd waiting{socket_, POLLIN, 0};
+    return ppoll(&waiting, 1, &timeout, nullptr) > 0;
+}
+
+std::optional<std::string_view> Client::receive() {
+    sender_size_ = sizeof sender_;
+    const ssize_t size = recvfrom(socket_, message_, sizeof message_, MSG_DONTWAIT,
+                                  reinterpret_cast<sockaddr*>(&sender_), &sender_size_);
+    if (size < 0) return {};
+    return std::string_view(message_, static_cast<std::size_t>(size));
+}
+
+bool Client::is_from_client() const {
+    return sender_size_ == client_size_ && std::memcmp(&sender_, &client_, client_size_) == 0;
+}
+
+void Client::read_all(bool answers) {
+    while (const auto text = receive()) read(*text, answers);
+}
+
+void Client::read(std::string_view text, bool answers) {
+    if (is_init(text)) {
+        adopt(text);
+        send(IDENTIFIED);
+        if (answers) send_state();
+        return;
+    }
+    if (!is_from_client()) return;
+    const Action action = parse_action(text);
+    if (answers && action.lap_time.value_or(lap_time_) == lap_time_) {
+        answer_ = action;
+        return;
+    }
+    late_answer_ = action;
+    if (answers && deadline_ == Clock::duration::zero()) send_state();
+}
+
+void Client::adopt(std::string_view text) {
+    init_ = parse_init(text);
+    client_ = sender_;
+    client_size_ = sender_size_;
+    identified_ = true;
+}
+
+void Client::send(std::string_view text) const {
+    // The texts are literals: the zero that closes them goes along.
+    sendto(socket_, text.data(), text.size() + 1, MSG_DONTWAIT,
+           reinterpret_cast<const sockaddr*>(&client_), client_size_);
+}
+
+void Client::send_state() {
+    sendto(socket_, state_, state_size_, MSG_DONTWAIT, reinterpret_cast<const sockaddr*>(&client_),
+           client_size_);
+}
+
+}  // namespace torcs::scr

@@ -1,0 +1,76 @@
+// The conversation with one client, over UDP.
+//
+// Datagrams get lost, doubled and late. A client that comes back introduces itself again and is
+// taken up where the race is. One that missed a state says its last action again; if it tells which
+// state that was for (see Action::lap_time), the newest state is sent once more.
+#pragma once
+
+#include <netinet/in.h>
+
+#include <chrono>
+#include <optional>
+#include <string_view>
+
+#include "messages.h"
+
+namespace torcs::scr {
+
+class Client {
+public:
+    ~Client();  // tells it that the game ends
+
+    // Takes the socket that was handed to this process for a driver, or binds one. Calling it
+    // again does no harm. Ends the game if the port is taken.
+    void open(int index);
+    bool has_network() const { return socket_ >= 0; }
+
+    // Waits until a client introduces itself, however long it takes.
+    Init identify();
+
+    // Sends a state and waits for what the client answers. Past the deadline that is nothing, or
+    // its late answer to an older state.
+    std::optional<Action> ask(const State& state);
+
+    // Sends a state that needs no answer.
+    void tell(const State& state);
+
+    // Says why no more states come. Only the first time after it was identified.
+    void dismiss(std::string_view reason);
+
+    // How the client that is there now introduced itself.
+    const Init& init() const { return init_; }
+
+    long decisions() const { return decisions_; }  // states that were sent
+    long late() const { return late_; }            // of them, answered too late
+
+private:
+    using Clock = std::chrono::steady_clock;
+
+    bool wait(Clock::time_point until) const;  // whether a datagram came
+    std::optional<std::string_view> receive();  // the next one that has come
+    bool is_from_client() const;
+    // Everything that has come; `answers` is whether to the state that was sent last.
+    void read_all(bool answers);
+    void read(std::string_view text, bool answers);
+    void adopt(std::string_view text);
+    void send(std::string_view text) const;
+    void send_state();
+
+    int socket_ = -1;
+    bool opened_ = false, identified_ = false;
+    Clock::duration deadline_{};  // zero waits for ever
+    sockaddr_storage client_{}, sender_{};
+    socklen_t client_size_ = 0, sender_size_ = 0;
+    Init init_{};
+    char state_[LONGEST_STATE];
+    std::size_t state_size_ = 0;
+    double lap_time_ = 0.0;  // [s] of that state, as it was written
+    std::optional<Action> answer_, late_answer_;
+    char message_[LONGEST_MESSAGE];
+    long decisions_ = 0, late_ = 0;
+};
+
+// Ends the game when nobody is left for whom it runs. Looks only now and then.
+void watch_owner();
+
+}  // namespace torcs::scr

@@ -1,0 +1,130 @@
+#include "driver.h"
+
+#include <algorithm>
+#include <cmath>
+#include <cstdio>
+
+#include "../sensors.h"
+#include "engine.h"
+#include "loop.h"
+
+namespace torcs::scr {
+namespace {
+
+constexpr double FOCUS_COOL_DOWN = 1.0;  // [s] the focused range finders rest
+constexpr float WHITE[] = {1.0f, 1.0f, 1.0f, 1.0f};
+
+}  // namespace
+
+void Driver::new_track(int index, const TrackData* track) {
+    index_ = index;
+    track_ = track;
+    client_.open(index);
+}
+
+void Driver::new_race(CarElement* car, const Situation* situation) {
+    car_ = car;
+    situation_ = situation;
+    next_focus_ = 0.0;
+    told_crossings_ = 0;
+    started_ = false;
+    action_ = Action{};
+    action_.focus.reset();  // nobody has asked for it yet
+    if (client_.has_network() && leaving() != Leaving::UNNOTICED) client_.identify();
+}
+
+bool Driver::drive() {
+    if (!client_.has_network()) return false;
+    const State state = sense();
+    const auto answer = client_.ask(state);
+    if (!answer) return false;  // the car goes on with what it was told last
+    action_ = *answer;
+    Control& control = car_->control;
+    control.throttle = static_cast<float>(action_.throttle);
+    control.brake = static_cast<float>(action_.brake);
+    control.clutch = static_cast<float>(action_.clutch);
+    control.steering = static_cast<float>(action_.steering);
+    control.gear = action_.gear;
+    if (ReInfo->display_mode != TEXT_MODE) show_board(state);
+    return action_.restart;
+}
+
+bool Driver::watch() {
+    if (!car_ || !client_.has_network() || !(car_->pub.status & NOT_SIMULATED)) return false;
+    const auto answer = client_.ask(sense());
+    return answer && answer->restart;
+}
+
+void Driver::leave() {
+    if (!car_) return;
+    const bool for_good = leaving() == Leaving::FOR_GOOD;
+    if (for_good && client_.has_network()) {
+        // The race may end at the line, before a client hears of its last lap.
+        if (car_->race.crossings != told_crossings_) client_.tell(sense());
+        std::printf("scr_server %d: %ld decisions, %ld late\n", index_, client_.decisions(),
+                    client_.late());
+        std::fflush(stdout);
+    }
+    if (leaving() != Leaving::UNNOTICED) client_.dismiss(for_good ? SHUTDOWN : RESTART);
+    car_ = nullptr;
+}
+
+std::array<Driver, MODULE_INTERFACES>& drivers() {
+    static std::array<Driver, MODULE_INTERFACES> drivers;
+    return drivers;
+}
+
+// ---- Sensors ------------------------------------------------------------------------------------
+
+State Driver::sense() {
+    const Motion& motion = car_->pub.local;
+    TrackPosition position = car_->pub.track;
+    if (!started_) raced_before_ = car_->race.distance_raced;
+    started_ = situation_->state != PRESTART;
+    told_crossings_ = car_->race.crossings;
+    State state{};
+    state.heading_error = heading_error(*car_);
+    state.lap_time = car_->race.lap_time;
+    state.damage = car_->priv.damage;
+    state.distance = distance_along(*car_, track_->length);
+    state.distance_raced = car_->race.distance_raced - raced_before_;
+    state.fuel = car_->priv.fuel;
+    state.gear = car_->priv.gear;
+    state.last_lap_time = car_->race.last_lap_time;
+    opponents(*car_, situation_->cars, situation_->cars_number, state.opponents);
+    state.position = car_->race.position;
+    state.engine_speed = car_->priv.engine_speed;
+    state.velocity[0] = motion.vel.x;
+    state.velocity[1] = motion.vel.y;
+    state.velocity[2] = motion.vel.z;
+    range_finders(*car_, client_.init().angles.data(), state.range_finders);
+    state.track_position = 2.0 * position.to_middle / position.segment->width;
+    for (int i = 0; i < 4; i++) state.wheel_speeds[i] = car_->priv.wheel[i].spin;
+    state.height = motion.pos.z - road_height(&position);
+    sense_focus(state);
+    return state;
+}
+
+void Driver::sense_focus(State& state) {
+    std::fill_n(state.focus, FOCUS_BEAMS, OFF_TRACK);
+    const double now = situation_->time;
+    if (!action_.focus || now < next_focus_ || state.range_finders[0] == OFF_TRACK) return;
+    next_focus_ = now + FOCUS_COOL_DOWN;
+    focused_range_finders(*car_, *action_.focus, state.focus);
+}
+
+// ---- The game's board ---------------------------------------------------------------------------
+
+void Driver::show_board(const State& state) const {
+    Control& control = car_->control;
+    std::snprintf(control.message[0], NAME_LENGTH, "steer %+.2f  gas %3.0f  brake %3.0f",
+                  action_.steering, 100.0 * action_.throttle, 100.0 * action_.brake);
+    std::snprintf(control.message[1], NAME_LENGTH, "left %.0f ahead %.0f right %.0f m",
+                  state.range_finders[0], state.range_finders[9], state.range_finders[18]);
+    const int minutes = static_cast<int>(std::max(state.lap_time, 0.0) / 60.0);
+    std::snprintf(control.message[3], NAME_LENGTH, "lap %d:%05.2f", minutes,
+                  std::max(state.lap_time, 0.0) - 60.0 * minutes);
+    std::copy_n(WHITE, 4, control.message_color);
+}
+
+}  // namespace torcs::scr

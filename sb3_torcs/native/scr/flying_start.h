@@ -1,0 +1,51 @@
+// A race that begins where a client asks for, not on the grid: as Race::start does it.
+//
+// The engine puts the cars on the grid, lets them settle and counts down. The field is moved
+// instead of the settling, and drives off instead of the countdown.
+#pragma once
+
+#include <vector>
+
+#include "../placing.h"
+
+namespace torcs::scr {
+
+class FlyingStart {
+public:
+    // Moves the field, if a client asks for it; for cars on the grid that have not settled yet.
+    void put_down(const Simulation& simulation, Situation& situation);
+
+    // Whether the field was moved and waits to drive off.
+    bool stands() const { return stands_; }
+
+    // Whether the cars are not where the race shall begin, and must be put on the grid once more.
+    // To be asked when they have settled: it also learns how high they stand.
+    bool misses_grid();
+
+    void drive_off(Situation& situation);
+
+    // The first crossing of the line starts the clock. To be called before the engine counts laps.
+    void start_clocks(const Situation& situation);
+
+    // A place that was refused may be free when the next race begins.
+    void forget_refusal() { refused_ = false; }
+
+private:
+    // Finds who asks for a start, if it is one that can be had.
+    bool find_start();
+    void refuse(const char* reason);
+
+    Field field_{};
+    Simulation simulation_{};
+    SimulatedCar** simulated_ = nullptr;
+    Start start_{};
+    bool wanted_ = false, stands_ = false, flying_ = false, refused_ = false, again_ = false;
+    std::vector<double> distances_;
+    std::vector<Control> controls_;      // with which the field drives off
+    std::vector<float> rest_heights_;    // [m] of each car's mass centre over the road, standing
+    const TrackData* track_ = nullptr;   // on which these were measured
+};
+
+FlyingStart& flying_start();
+
+}  // namespace torcs::scr

@@ -1,0 +1,63 @@
+#include "loop.h"
+
+#include "client.h"
+#include "driver.h"
+#include "engine.h"
+#include "flying_start.h"
+
+namespace torcs::scr {
+namespace {
+
+constexpr int SETTLING = 0;       // of Situation::state, before a race begins
+constexpr int WATCH_STEPS = 250;  // between two looks for the game's owner: half a second of race
+
+Simulation simulation;  // the engine's own
+bool restart_wanted, settling;
+Leaving why = Leaving::FOR_GOOD;
+
+void restart(Leaving reason) {
+    restart_wanted = false;
+    why = reason;
+    clean_race_up();
+    // No menu before a start that nobody has asked for by hand.
+    set_text(ReInfo->params, ReInfo->race_name, "splash menu", "no");
+    prepare_race();
+    start_race();
+    why = Leaving::FOR_GOOD;
+}
+
+void step(Situation* situation, double duration, int telemetry) {
+    static int steps = 0;
+    if (++steps % WATCH_STEPS == 0) watch_owner();
+    FlyingStart& start = flying_start();
+    if (situation->state == SETTLING) {
+        if (settling) start.put_down(simulation, *situation);
+        settling = false;
+        if (!start.stands()) simulation.update(situation, duration, telemetry);
+        return;
+    }
+    if (start.misses_grid()) return restart(Leaving::UNNOTICED);
+    if (start.stands()) return start.drive_off(*situation);
+    if (ReInfo->robots_time == situation->time)
+        for (Driver& driver : drivers())
+            if (driver.watch()) request_restart();
+    if (restart_wanted) return restart(Leaving::TO_RESTART);
+    simulation.update(situation, duration, telemetry);
+    start.start_clocks(*situation);
+}
+
+}  // namespace
+
+void enter_loop() {
+    if (why != Leaving::UNNOTICED) flying_start().forget_refusal();
+    if (ReInfo->simulation.update == step) return;
+    settling = true;
+    simulation = ReInfo->simulation;
+    ReInfo->simulation.update = step;
+}
+
+void request_restart() { restart_wanted = true; }
+
+Leaving leaving() { return why; }
+
+}  // namespace torcs::scr

@@ -1,0 +1,24 @@
+// A place of ours in the race engine's loop, from which a race can begin anew or elsewhere.
+//
+// The engine calls its simulation through a pointer that it exports. Ours stands in its place, is
+// called at every step after the drivers were, and passes the step on. Instead of that it can do
+// what the game's own "Restart Race" does; the engine then goes on as after any start.
+#pragma once
+
+namespace torcs::scr {
+
+// To be called whenever a race begins: the engine gets its simulation anew for each.
+void enter_loop();
+
+// At the next step.
+void request_restart();
+
+// Why drivers are shut down.
+enum class Leaving {
+    FOR_GOOD,
+    TO_RESTART,
+    UNNOTICED,  // the clients know nothing of this restart
+};
+Leaving leaving();
+
+}  // namespace torcs::scr

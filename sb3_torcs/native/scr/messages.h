@@ -1,0 +1,82 @@
+// The texts of the SCR protocol (Loiacono, Cardamone and Lanzi 2013, arXiv:1304.1672): what they
+// say in, what they mean out. Nothing here knows of sockets or of the game.
+//
+// Everything is SI; the protocol's km/h, degrees and revolutions stay inside messages.cpp.
+#pragma once
+
+#include <array>
+#include <cstddef>
+#include <optional>
+#include <string_view>
+
+#include "../placing.h"
+#include "../sensors.h"
+
+namespace torcs::scr {
+
+constexpr int STATE_NUMBERS = 79;
+constexpr std::size_t LONGEST_STATE = 2048;    // [bytes] 79 numbers of 13 characters, and 19 tags
+constexpr std::size_t LONGEST_MESSAGE = 4096;  // [bytes] that a client may send
+
+constexpr std::string_view IDENTIFIED = "***identified***";
+constexpr std::string_view SHUTDOWN = "***shutdown***";
+constexpr std::string_view RESTART = "***restart***";
+
+// What a driver senses, in the order of the protocol.
+struct State {
+    double heading_error;      // [rad] positive if the car points to the right of the road
+    double lap_time;           // [s] negative during the countdown
+    double damage;             // [points]
+    double distance;           // [m] from the start line
+    double distance_raced;     // [m]
+    double fuel;               // [l]
+    double gear;               // -1 reverse, 0 neutral
+    double last_lap_time;      // [s]
+    double opponents[36];      // [m]
+    double position;           // in the race, from 1
+    double engine_speed;       // [rad/s]
+    double velocity[3];        // [m/s] along, to the left of, and above the car
+    double range_finders[19];  // [m]
+    double track_position;     // [-] 1 is the left edge, -1 the right
+    double wheel_speeds[4];    // [rad/s]
+    double height;             // [m]
+    double focus[FOCUS_BEAMS];  // [m]
+};
+static_assert(sizeof(State) == STATE_NUMBERS * sizeof(double));
+
+// What a client wants; defaults are those of tags that it leaves out. All numbers are finite and
+// within their ranges.
+struct Action {
+    double throttle = 0.0;  // [0, 1]
+    double brake = 0.0;     // [0, 1]
+    int gear = 1;           // [-1, 8]
+    double steering = 0.0;  // [-1, 1] left positive
+    double clutch = 0.0;    // [0, 1] 1 is pressed
+    bool restart = false;
+    std::optional<double> focus = 0.0;  // [rad] left negative; none outside of a quarter turn
+    // Of the state that it answers, if the client repeats it (an extension): [s].
+    std::optional<double> lap_time{};
+};
+
+// How a client introduces itself.
+struct Init {
+    std::array<double, 19> angles;  // [rad] of range finders, left negative
+    std::optional<Start> start{};  // not on the grid (an extension)
+};
+
+// Writes the state with its closing zero; returns the length with it. Six significant digits, as
+// C++ streams write them.
+std::size_t format_state(const State& state, char (&text)[LONGEST_STATE]);
+
+// What a client reads where a number is written.
+double as_written(double number);
+
+// Every text has a meaning: tags in any order, what is missing or no number takes its default,
+// what is out of range is clipped, what is unknown is ignored.
+Action parse_action(std::string_view text);
+Init parse_init(std::string_view text);
+
+// The server has always looked at the first three characters only.
+inline bool is_init(std::string_view text) { return text.substr(0, 3) == "SCR"; }
+
+}  // namespace torcs::scr

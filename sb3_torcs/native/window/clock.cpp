@@ -1,0 +1,61 @@
+// The game's clock. Real time, but for films: there it goes from frame to frame, however long
+// the drawing takes.
+
+#include <cmath>
+#include <cstdlib>
+
+#include "window.h"
+
+namespace window {
+namespace {
+
+constexpr double FIRST_FRAME = -1.0;  // [s] before the start: the cars stand on the grid
+constexpr double RUN_OUT = 1.0;       // [s] after the end: the last crossing of the line is seen
+
+double now = 0;         // [s] what the game's clock shows
+double origin = 0;      // [s] simulated time of the first frame
+long frames = 0;        // since then
+double last_time = 0;   // [s] simulated, of the last frame
+double over_since = 0;  // [s] simulated time of the race's end
+
+double frame_time() {
+    static const char* text = std::getenv("SB3_TORCS_FRAME_TIME");
+    static const double seconds = text ? std::strtod(text, nullptr) : 0;
+    return seconds;
+}
+
+// Frames are counted, not summed up: the error of one never reaches the next.
+double time_of_next_frame(double time) {
+    if (frames == 0 || time < last_time) {  // a race that begins, or begins again
+        origin = std::fmax(FIRST_FRAME, time);
+        frames = 0;
+    }
+    return origin + static_cast<double>(frames++) * frame_time();
+}
+
+}  // namespace
+
+// The game does steps while its clock is more than one of them ahead, so half a step more than
+// the number wanted makes it do exactly that number.
+void advance_clock() {
+    const double time = ReInfo->situation->time;
+    double steps = 0;
+    if (frame_time() > 0) {
+        steps = std::fmax(0, std::round((time_of_next_frame(time) - time) / torcs::PHYSICS_STEP));
+        last_time = time;
+    }
+    now = ReInfo->time + (steps + 0.5) * torcs::PHYSICS_STEP;
+}
+
+bool run_out() {
+    if (frame_time() <= 0) return false;
+    if (over_since == 0) over_since = ReInfo->situation->time;
+    return ReInfo->situation->time < over_since + RUN_OUT - torcs::PHYSICS_STEP / 2;
+}
+
+}  // namespace window
+
+INSTEAD double GfTimeClock() {
+    static auto* const real = window::original<double()>("_Z11GfTimeClockv");
+    return window::filming() ? window::now : real();
+}

@@ -1,0 +1,106 @@
+// The pictures of a race, sent to whoever films it.
+
+#include <cerrno>
+#include <cstdint>
+#include <cstdlib>
+#include <cstring>
+#include <utility>
+#include <vector>
+
+#include "window.h"
+
+// Of the game's libraries and of OpenGL.
+void GfScrGetSize(int* width, int* height, int* view_width, int* view_height);
+void GfuiDisplay();
+extern "C" void glPixelStorei(unsigned name, int value);
+extern "C" void glReadBuffer(unsigned buffer);
+extern "C" void glReadPixels(int, int, int, int, unsigned format, unsigned type, void* pixels);
+
+namespace window {
+namespace {
+
+constexpr unsigned PACK_ROW_LENGTH = 0x0D02, PACK_ALIGNMENT = 0x0D05;
+constexpr unsigned BACK = 0x0405, RGB = 0x1907, UNSIGNED_BYTE = 0x1401;
+
+// Before the pixels of each frame: 8 bits each of red, green and blue, from the top left.
+struct Header {
+    char mark[4] = {'S', 'B', '3', 'F'};
+    std::uint32_t width = 0, height = 0;
+    std::uint32_t number = 0;
+    double time = 0;  // [s] simulated
+};
+static_assert(sizeof(Header) == 24);
+
+int (*draw)(torcs::Situation*) = nullptr;
+bool drawn = false;  // the picture in the making is that of the race, complete
+Header header;
+
+int frames_descriptor() {
+    static const char* text = std::getenv("SB3_TORCS_FRAMES");
+    static const int number = text ? std::atoi(text) : -1;
+    return number;
+}
+
+void send(const void* data, std::size_t size) {
+    const char* rest = static_cast<const char*>(data);
+    while (size > 0) {
+        const ssize_t written = write(frames_descriptor(), rest, size);
+        if (written < 0 && errno == EINTR) continue;
+        if (written <= 0) owner().lost_contact();
+        rest += written;
+        size -= static_cast<std::size_t>(written);
+    }
+}
+
+// OpenGL's first row is the lowest.
+void send_picture() {
+    static std::vector<char> pixels, flipped;
+    int window_width, window_height, width, height;
+    GfScrGetSize(&window_width, &window_height, &width, &height);
+    const std::size_t row = static_cast<std::size_t>(width) * 3;
+    pixels.resize(row * static_cast<std::size_t>(height));
+    flipped.resize(pixels.size());
+    glPixelStorei(PACK_ROW_LENGTH, 0);
+    glPixelStorei(PACK_ALIGNMENT, 1);
+    glReadBuffer(BACK);
+    glReadPixels((window_width - width) / 2, (window_height - height) / 2, width, height, RGB,
+                 UNSIGNED_BYTE, pixels.data());
+    for (std::size_t from = 0, to = pixels.size(); to > 0; from += row) {
+        to -= row;
+        std::memcpy(&flipped[to], &pixels[from], row);
+    }
+    header.width = static_cast<std::uint32_t>(width);
+    header.height = static_cast<std::uint32_t>(height);
+    send(&header, sizeof header);
+    send(flipped.data(), flipped.size());
+    ++header.number;
+}
+
+// The game draws its messages only before the next picture, over this one: here they come at once,
+// so that a frame is of one time.
+int draw_and_send(torcs::Situation* situation) {
+    const int result = draw(situation);
+    header.time = situation->time;
+    drawn = true;
+    GfuiDisplay();
+    drawn = false;
+    return result;
+}
+
+}  // namespace
+
+bool filming() { return frames_descriptor() >= 0; }
+
+void send_frames() { draw = std::exchange(ReInfo->graphics.refresh, draw_and_send); }
+
+}  // namespace window
+
+// Nobody looks at the window of a film: it is not shown, which takes time.
+extern "C" INSTEAD void glutSwapBuffers() {
+    static auto* const real = window::original<void()>("glutSwapBuffers");
+    if (!window::filming()) {
+        real();
+    } else if (window::drawn) {
+        window::send_picture();
+    }
+}

@@ -1,0 +1,167 @@
+// Pictures of a race that goes on elsewhere: the cars are put where they are there, and nothing
+// of the game's own moves them.
+//
+// A picture shows a moment and nothing of what was before it, so that it does not matter which
+// moments were drawn before: see also the settings in game_view.py.
+
+#include <algorithm>
+#include <cerrno>
+#include <cstdlib>
+#include <poll.h>
+#include <string>
+#include <vector>
+
+#include "../appearance.h"
+#include "window.h"
+
+namespace window {
+namespace {
+
+using namespace torcs;
+
+constexpr int LOOK_AROUND = 500;    // [ms] between two looks after the owner
+constexpr int MANY_LAPS = 1 << 30;  // of a race without an end
+
+// Of the game's graphics, what remembers the picture before: the camera behind a car, and the
+// needles of its instruments.
+struct Camera {
+    Unused<136> a_;
+    float heading;  // [rad] in the picture before
+};
+
+struct Screen {
+    Unused<8> a_;
+    CarElement* car;  // that is looked at
+    Unused<176> b_;
+    Camera* camera;
+};
+
+struct Instrument {
+    Unused<32> a_;
+    float value, range;        // at the lower end of the scale, and from there to the upper one
+    float angle, angle_range;  // [degrees] of the needle there
+    const float* shown;
+    float needle;              // [degrees] in the picture before
+    Unused<12> b_;
+};
+
+struct DrawnCar {
+    Unused<552> a_;
+    Instrument instrument[2];
+    Unused<32> b_;
+};
+
+static_assert(offsetof(Camera, heading) == 136 && offsetof(Screen, camera) == 192);
+static_assert(offsetof(Instrument, needle) == 56 && sizeof(Instrument) == 72);
+static_assert(sizeof(DrawnCar) == 728);
+
+// The camera turns by a share of what is left per picture. In the game's usual 60 pictures a
+// second that leaves it behind in a steady turn by what the car turns in this time.
+constexpr float TURN_PER_PICTURE = 0.1f;
+constexpr float CAMERA_LAG = 0.15f;     // [s]
+constexpr float MAX_CAMERA_LAG = 0.5f;  // [rad] when the car spins
+
+int appearances_descriptor() {
+    static const char* text = std::getenv("SB3_TORCS_APPEARANCES");
+    static const int number = text ? std::atoi(text) : -1;
+    return number;
+}
+
+template <typename Record>
+Record receive() {
+    Record record;
+    char* rest = reinterpret_cast<char*>(&record);
+    std::size_t size = sizeof record;
+    while (size > 0) {
+        const ssize_t got = read(appearances_descriptor(), rest, size);
+        if (got < 0 && errno == EINTR) continue;
+        if (got <= 0) owner().lost_contact();
+        rest += got;
+        size -= static_cast<std::size_t>(got);
+    }
+    return record;
+}
+
+Segment* segment(int id) {
+    static const std::vector<Segment*> segments = [] {
+        std::vector<Segment*> all(static_cast<std::size_t>(ReInfo->track->segments_number));
+        Segment* next = ReInfo->track->last;
+        for (std::size_t i = 0; i < all.size(); i++, next = next->next)
+            all.at(static_cast<std::size_t>(next->id)) = next;
+        return all;
+    }();
+    return segments.at(static_cast<std::size_t>(id));
+}
+
+// Addresses, and what names the car here, stay.
+void put(CarElement& car, const CarAppearance& looks) {
+    const CarRace race = car.race;
+    const CarPrivate priv = car.priv;
+    car.pub = looks.pub;
+    car.race = looks.race;
+    car.priv = looks.priv;
+    car.control = looks.control;
+    car.pub.track.segment = segment(looks.segment);
+    car.race.pit = race.pit;
+    car.race.penalties = race.penalties;
+    car.priv.driver_params = priv.driver_params;
+    car.priv.car_params = priv.car_params;
+    car.priv.driver_index = priv.driver_index;
+    std::copy(std::begin(priv.module), std::end(priv.module), car.priv.module);
+    for (int i = 0; i < 4; i++) car.priv.wheel[i].segment = priv.wheel[i].segment;
+    // A body would keep its dents in pictures of earlier moments.
+    car.priv.dents = 0;
+}
+
+// What the game's graphics module calls by a name.
+template <typename Thing>
+Thing& drawn(const char* name) {
+    static void* const library = [] {
+        Dl_info module;
+        dladdr(ReInfo->graphics.init_track, &module);
+        return dlopen(module.dli_fname, RTLD_LAZY | RTLD_NOLOAD);
+    }();
+    return *static_cast<Thing*>(dlsym(library, name));
+}
+
+// As if the pictures before had been of a drive that led to this moment.
+void pretend_a_past(const CarElement& car, Screen& screen) {
+    const float lag =
+        std::clamp(CAMERA_LAG * car.pub.local.vel.az, -MAX_CAMERA_LAG, MAX_CAMERA_LAG);
+    screen.camera->heading = car.pub.local.pos.az - lag / (1 - TURN_PER_PICTURE);
+    for (Instrument& it : drawn<DrawnCar*>("grCarInfo")[car.index].instrument) {
+        const float share = std::clamp((*it.shown - it.value) / it.range, 0.0f, 1.0f);
+        it.needle = it.angle + share * it.angle_range;
+    }
+}
+
+}  // namespace
+
+bool acting() { return appearances_descriptor() >= 0; }
+
+void take_appearance() {
+    pollfd waiting{appearances_descriptor(), POLLIN, 0};
+    while (poll(&waiting, 1, LOOK_AROUND) <= 0) owner().check();
+    const auto scene = receive<SceneAppearance>();
+    Situation& situation = *ReInfo->situation;
+    if (scene.car_size != sizeof(CarAppearance)) give_up("the engine is of another build");
+    if (scene.cars_number != situation.cars_number)
+        give_up("the race has " + std::to_string(scene.cars_number) + " cars, the game drew up " +
+                std::to_string(situation.cars_number));
+    static const bool endless = situation.laps >= MANY_LAPS;
+    situation.time = scene.time;
+    for (int i = 0; i < scene.cars_number; i++) {
+        const auto looks = receive<CarAppearance>();
+        CarElement& car = ReInfo->cars[looks.index];
+        put(car, looks);
+        situation.cars[i] = &car;
+    }
+    // Shining lights are drawn turned at random.
+    std::srand(1);
+    Screen& screen = *drawn<Screen*>("grScreens");
+    pretend_a_past(*screen.car, screen);
+    // Without an end the board counts up to the lap that is driven.
+    if (endless) situation.laps = std::max(situation.cars[0]->race.crossings, 1);
+}
+
+}  // namespace window

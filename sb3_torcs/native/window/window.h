@@ -1,0 +1,54 @@
+// What the parts of this library share: it is loaded before the game's own libraries, and stands
+// in for those of their functions that are marked `INSTEAD`.
+#pragma once
+
+#include <dlfcn.h>
+
+#include <string>
+
+#include "../layout.h"
+#include "../owner.h"
+
+#define INSTEAD __attribute__((visibility("default")))
+
+// The game's race, null before it is set up.
+extern torcs::RaceManager* ReInfo;
+
+namespace window {
+
+// The function that the game would have called without this library.
+template <typename Function>
+Function* original(const char* symbol) {
+    return reinterpret_cast<Function*>(dlsym(RTLD_NEXT, symbol));
+}
+
+torcs::Owner& owner();
+
+// End the game, with a reason for its owner to read.
+[[noreturn]] void give_up(const std::string& message);
+
+// ---- clock.cpp: how fast the game runs ----------------------------------------------------------
+
+// Let the clock go on by exactly as much as there is between two frames.
+void advance_clock();
+
+// Whether the film goes on although the race is over.
+bool run_out();
+
+// ---- frames.cpp: what comes out -----------------------------------------------------------------
+
+// Whether frames are sent to somebody, not shown.
+bool filming();
+
+// Send a frame after every picture of the race that is drawn.
+void send_frames();
+
+// ---- puppet.cpp: a race that goes on elsewhere --------------------------------------------------
+
+// Whether the cars are put where somebody says, and not moved by the game.
+bool acting();
+
+// Wait for a moment of that race, and put the cars where they are in it.
+void take_appearance();
+
+}  // namespace window

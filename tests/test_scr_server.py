@@ -1,0 +1,649 @@
+"""The game's driver module, by what goes over the wire: clients here are bare UDP sockets.
+
+They wait in lock-step for the game, so that nothing here depends on the speed of a machine, but for
+what is about deadlines.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import math
+import os
+import random
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from sb3_torcs import _engine
+from sb3_torcs.backends.native import AGENT, make_engine
+from sb3_torcs.game_process import GameProcess
+from sb3_torcs.race_file import RaceSetup
+from sb3_torcs.scr_game import open_ports, start_server
+
+PATIENCE = 20.0  # [s] for an answer on a busy machine
+INIT = "SCR(init " + " ".join(str(angle) for angle in range(-90, 91, 10)) + ")"
+STAND = "(accel 0)(brake 1)(gear 0)(steer 0)"  # as cars do before a start
+DRIVER = ("scr_server", 0)
+
+
+class Client:
+    """One end of the conversation."""
+
+    def __init__(self, port):
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.settimeout(PATIENCE)
+        self.socket.connect(("127.0.0.1", port))
+
+    def send(self, text):
+        self.socket.send(text if isinstance(text, bytes) else text.encode())
+
+    def receive(self):
+        return self.socket.recv(4096)
+
+    def ask(self, text):
+        self.send(text)
+        return self.receive()
+
+    def identify(self, start=""):
+        assert self.ask(INIT + start) == b"***identified***\0"
+
+    def restart(self):
+        assert self.ask("(meta 1)") == b"***restart***\0"
+        self.identify()
+        return self.receive()
+
+    def nothing_comes(self, seconds=0.05):
+        self.socket.settimeout(seconds)
+        try:
+            with pytest.raises(TimeoutError):
+                self.socket.recv(4096)
+        finally:
+            self.socket.settimeout(PATIENCE)
+
+
+@pytest.fixture
+def serve(game):
+    """Start a game and its clients, in the order of the drivers."""
+    started = []
+
+    def start(drivers=(DRIVER,), track="aalborg", deadline=None, **race):
+        clients = [index for name, index in drivers if name == "scr_server"]
+        session = "practice" if len(drivers) == 1 else "race"
+        sockets = open_ports(len(clients))
+        setup = RaceSetup(track, drivers, session=session, **race)
+        process = start_server(game, setup, sockets, deadline=deadline)
+        ends = [Client(bound.getsockname()[1]) for bound in sockets]
+        started.extend([*sockets, *(end.socket for end in ends), process])
+        return process, *ends
+
+    yield start
+    for each in started:
+        each.stop() if isinstance(each, GameProcess) else each.close()
+
+
+def numbers(state, tag):
+    """Read the numbers of a tag."""
+    found = re.search(rf"\({tag} ([^()]*)\)", state.decode())
+    assert found, f"no {tag} in {state!r}"
+    return [float(word) for word in found[1].split()]
+
+
+def number(state, tag):
+    (value,) = numbers(state, tag)
+    return value
+
+
+def controls(state):
+    """Drive by what is seen: steering, throttle, brake and gear."""
+    speed, ahead = number(state, "speedX"), numbers(state, "track")[9]
+    steering = 1.5 * number(state, "angle") - 0.3 * number(state, "trackPos")
+    gear, rpm = int(number(state, "gear")), number(state, "rpm")
+    if gear < 1:
+        gear = 1
+    elif rpm > 8500 and gear < 6:
+        gear += 1
+    elif rpm < 4000 and gear > 1:
+        gear -= 1
+    target = min(250.0, 40.0 + ahead)
+    return max(-1.0, min(1.0, steering)), float(speed < target), 0.5 * (speed > target + 10), gear
+
+
+def action(state):
+    steering, throttle, brake, gear = controls(state)
+    return f"(accel {throttle!r})(brake {brake!r})(gear {gear})(steer {steering!r})"
+
+
+def skip_countdown(client):
+    state = client.receive()
+    while number(state, "curLapTime") < 0.0:
+        state = client.ask(STAND)
+    return state
+
+
+def drive(client, state, ticks):
+    """Return the states of so many decisions."""
+    states = []
+    for _ in range(ticks):
+        states.append(state)
+        state = client.ask(action(state))
+    client.send(action(state))
+    return states
+
+
+# ---- The texts ----------------------------------------------------------------------------------
+
+
+class TestTexts:
+    def test_a_state(self):
+        si = [0.1, 12.345678, 3.0, 100.0, 1234.567, 94.0, -1.0, 81.474]
+        si += [200.0] * 35 + [7.5]
+        si += [2.0, 915.2, 10.0, -1.0, 0.0]
+        si += [-1.0] * 19
+        si += [-0.25, 1.0, 2.0, 3.0, 4e-7, 0.345, *[-1.0] * 5]
+        opponents = " ".join(["200"] * 35 + ["7.5"])
+        assert _engine.scr_format_state(si).decode() == (
+            "(angle 0.1)(curLapTime 12.3457)(damage 3)(distFromStart 100)(distRaced 1234.57)"
+            f"(fuel 94)(gear -1)(lastLapTime 81.474)(opponents {opponents})(racePos 2)(rpm 9152)"
+            f"(speedX 36)(speedY -3.6)(speedZ 0)(track {' '.join(['-1'] * 19)})(trackPos -0.25)"
+            "(wheelSpinVel 1 2 3 4e-07)(z 0.345)(focus -1 -1 -1 -1 -1)\0"
+        )
+
+    def test_every_number_as_c_prints_it(self):
+        source = random.Random(1)
+        for _ in range(300):
+            values = [source.uniform(-1, 1) * 10 ** source.uniform(-12, 12) for _ in range(79)]
+            scaled = list(values)
+            scaled[45] *= 10.0
+            for i in (46, 47, 48):
+                scaled[i] *= 3.6
+            text = _engine.scr_format_state(values).decode()
+            assert re.findall(r" ([^ ()]+)", text) == [f"{value:g}" for value in scaled]
+
+    def test_it_takes_microseconds(self):
+        values = [math.pi * i for i in range(79)]
+        began = time.process_time()
+        for _ in range(10000):
+            _engine.scr_format_state(values)
+        assert (time.process_time() - began) / 10000 < 20e-6
+
+    @pytest.mark.parametrize(
+        ("text", "expected"),
+        [
+            (b"", (0.0, 0.0, 1, 0.0, 0.0, False, 0.0, None)),
+            (
+                b"(accel 0.5)(brake 0.25)(gear 3)(steer -0.1)(clutch 0.75)(focus 90)(meta 1)\0",
+                (0.5, 0.25, 3, -0.1, 0.75, True, math.pi / 2, None),
+            ),
+            (b"(meta 0)(steer 1e-3) (gear -1)\n", (0.0, 0.0, -1, 1e-3, 0.0, False, 0.0, None)),
+            (b"(accel 7)(brake -1)(steer -3)(clutch 2)(gear 99)",
+             (1.0, 0.0, 8, -1.0, 1.0, False, 0.0, None)),
+            (b"(accel nan)(brake inf)(steer x)(gear)", (0.0, 0.0, 1, 0.0, 0.0, False, 0.0, None)),
+            (b"(accel +1)(steer .5)(gear 2.0)", (1.0, 0.0, 2, 0.5, 0.0, False, 0.0, None)),
+            (b"(focus -91)", (0.0, 0.0, 1, 0.0, 0.0, False, None, None)),
+            (b"(focus -90 -45 0)", (0.0, 0.0, 1, 0.0, 0.0, False, -math.pi / 2, None)),
+            (b"(accel 1)\0(brake 1)", (1.0, 0.0, 1, 0.0, 0.0, False, 0.0, None)),
+            (b"((accel 1)(steering 1)(Accel 0", (1.0, 0.0, 1, 0.0, 0.0, False, 0.0, None)),
+            (b"(accel 1)(curLapTime 12.34)", (1.0, 0.0, 1, 0.0, 0.0, False, 0.0, 12.34)),
+        ],
+    )  # fmt: skip
+    def test_an_action(self, text, expected):
+        assert _engine.scr_parse_action(text) == expected
+
+    def test_an_introduction(self):
+        angles, start = _engine.scr_parse_init(
+            b"SCR(init " + b" ".join(b"%d" % i for i in range(19)) + b")"
+        )
+        assert angles == [math.radians(i) for i in range(19)]
+        assert start is None
+
+    @pytest.mark.parametrize("text", [b"SCR", b"SCR(init)", b"SCR(init 1 2 3)", b"SCR(init x)"])
+    def test_an_introduction_without_angles(self, text):
+        angles, _ = _engine.scr_parse_init(text)
+        assert angles == [math.radians(i) for i in range(-90, 91, 10)]
+
+    def test_an_introduction_with_a_start(self):
+        assert _engine.scr_parse_init(b"SCR(init) (start 1.5 -0.5 0.1 20)")[1] == (
+            1.5, -0.5, 0.1, 20.0,
+        )  # fmt: skip
+
+    def test_whatever_comes_has_a_meaning(self):
+        source = random.Random(2)
+        words = [b"(", b")", b" ", b"accel", b"steer", b"gear", b"focus", b"init", b"start", b"\0",
+                 b"1e999", b"-nan", b"0.5", b"-", b"+", b"\xff", b"1" * 400]  # fmt: skip
+        for _ in range(20000):
+            text = b"".join(source.choices(words, k=source.randrange(40)))
+            throttle, brake, gear, steering, clutch, *_ = _engine.scr_parse_action(text)
+            assert 0.0 <= throttle <= 1.0
+            assert 0.0 <= brake <= 1.0
+            assert 0.0 <= clutch <= 1.0
+            assert -1.0 <= steering <= 1.0
+            assert -1 <= gear <= 8
+            angles, _start = _engine.scr_parse_init(text)
+            assert len(angles) == 19
+            assert all(math.isfinite(angle) for angle in angles)
+
+
+# ---- A race -------------------------------------------------------------------------------------
+
+
+class TestRace:
+    def test_the_countdown(self, serve):
+        _, client = serve()
+        client.identify()
+        state = client.receive()
+        assert state.startswith(b"(angle ")
+        assert state.endswith(b")\0")
+        assert number(state, "curLapTime") == pytest.approx(-0.98, abs=0.021)
+        assert number(state, "distFromStart") == pytest.approx(2487.54, abs=0.1)
+        assert (number(state, "gear"), number(state, "racePos")) == (0, 1)
+        assert number(state, "fuel") == 94
+        assert len(numbers(state, "track")) == 19
+        assert len(numbers(state, "opponents")) == 36
+        before = number(state, "distFromStart")
+        for _ in range(20):
+            state = client.ask("(accel 1)(gear 1)")
+        assert number(state, "distFromStart") == before
+
+    def test_the_angles_of_the_range_finders(self, serve):
+        _, client = serve()
+        half = "SCR(init " + " ".join(str(angle / 2) for angle in range(-90, 91, 10)) + ")"
+        assert client.ask(half) == b"***identified***\0"
+        narrow = numbers(client.receive(), "track")
+        wide = numbers(client.restart(), "track")
+        assert narrow[1::2] == wide[5:14]  # -40, -30, ... degrees
+
+    @pytest.mark.parametrize(
+        ("track", "ticks"), [("aalborg", 5000), ("corkscrew", 1500), ("michigan", 3500)]
+    )
+    def test_its_senses_are_those_of_the_engine(self, serve, game, track, ticks):
+        _, client = serve(track=track)
+        client.identify()
+        follow(client, make_engine(game, track, [AGENT]), 0, ticks)
+
+    def test_among_robots_too(self, serve, game):
+        robots = [("inferno", 3), ("berniw", 3), ("bt", 2)]
+        _, client = serve([*robots, DRIVER])
+        client.identify()
+        engine = make_engine(game, "aalborg", [*robots, AGENT], session="race")
+        follow(client, engine, 3, 800)
+
+    def test_focus_rests_for_a_second(self, serve):
+        _, client = serve()
+        client.identify()
+        assert numbers(client.receive(), "focus") == [-1] * 5  # nobody has asked yet
+        seen = []
+        state = client.ask(STAND)
+        for _ in range(160):
+            if numbers(state, "focus") != [-1] * 5:
+                seen.append((number(state, "curLapTime"), numbers(state, "focus")))
+            state = client.ask(STAND + "(focus 30)")
+        assert len(seen) == 3
+        assert seen[0][0] == pytest.approx(0.0, abs=0.021)
+        assert seen[1][0] - seen[0][0] == pytest.approx(1.0, abs=0.021)
+        assert seen[0][1][2] == pytest.approx(numbers(state, "track")[12], rel=1e-3)
+        for _ in range(120):
+            state = client.ask(STAND + "(focus 91)")
+        assert numbers(state, "focus") == [-1] * 5
+
+    def test_off_the_road(self, serve):
+        _, client = serve()
+        client.identify(" (start 300 1.2 0 0)")
+        state = client.ask(STAND)
+        assert numbers(state, "track") == [-1] * 19
+        assert numbers(state, "focus") == [-1] * 5
+
+    def test_two_drivers(self, serve):
+        _, first, second = serve([("scr_server", 1), DRIVER])
+        first.send(INIT)  # driver 0, at the second place: its turn comes last
+        second.identify()
+        assert first.receive() == b"***identified***\0"
+        states = []
+        for _ in range(60):
+            states = [second.receive()]
+            second.send(STAND)
+            states.append(first.receive())
+            first.send(STAND)
+        assert [number(state, "racePos") for state in states] == [1, 2]
+        assert min(numbers(states[0], "opponents")) == min(numbers(states[1], "opponents")) < 20
+
+    def test_the_end(self, serve):
+        process, client = serve(track="michigan", laps=1)
+        client.identify()
+        states = [client.receive()]
+        while not states[-1].startswith(b"***"):
+            states.append(client.ask(action(states[-1])))
+        assert states[-1] == b"***shutdown***\0"
+        assert number(states[-2], "lastLapTime") > 60
+        client.nothing_comes()
+        process.wait(PATIENCE)
+        told = re.search(r"scr_server 0: (\d+) decisions, 0 late", process.words())
+        assert told
+        assert int(told[1]) == pytest.approx(len(states), abs=2)
+
+    def test_a_car_that_is_out_still_sees(self, serve):
+        """Who is too slow is taken out of the race; its client may ask for another one."""
+        _, client = serve()
+        client.identify()
+        first = state = client.receive()
+        while number(state, "z") < 1.0:  # until a crane lifts it
+            state = client.ask(STAND)
+            assert not state.startswith(b"***")
+        assert client.restart() == first
+
+
+def follow(client, engine, car, ticks, start=None):
+    """Drive the same in the game and in the engine; all that is sensed must be written the same."""
+    engine.start_at(*start) if start else engine.start()
+    state = skip_countdown(client)
+    for tick in range(ticks):
+        expected, seen = as_text(engine.read(car)), state.decode().split("(focus")[0]
+        assert seen == expected, f"at tick {tick}"
+        steering, throttle, brake, gear = controls(state)
+        engine.step(steering, throttle, brake, gear, 1)
+        state = client.ask(action(state))
+
+
+def as_text(car):
+    """What the SCR server would say of a car, but for the focus."""
+    km_per_hour = 3.6
+    values = {
+        "angle": [car.heading_error], "curLapTime": [car.lap_time], "damage": [car.damage],
+        "distFromStart": [car.distance_from_start], "distRaced": [car.distance_raced],
+        "fuel": [car.fuel], "gear": [car.gear], "lastLapTime": [car.last_lap_time],
+        "opponents": car.opponents, "racePos": [car.race_position],
+        "rpm": [10 * car.engine_speed], "speedX": [km_per_hour * car.speed_x],
+        "speedY": [km_per_hour * car.speed_y], "speedZ": [km_per_hour * car.speed_z],
+        "track": car.range_finders,
+        "trackPos": [2 * car.distance_from_axis / car.track_width],
+        "wheelSpinVel": car.wheel_speeds, "z": [car.height],
+    }  # fmt: skip
+    return "".join(
+        f"({name} {' '.join(f'{value:g}' for value in row)})" for name, row in values.items()
+    )
+
+
+class TestStarts:
+    STARTS = (
+        (500.0, 0.0, 0.0, 0.0),
+        (1200.0, 0.4, 0.1, 25.0),
+        (0.0, 0.0, 0.0, 30.0),
+        (2580.0, -0.2, -0.1, 40.0),  # the line is crossed at once
+    )
+
+    @pytest.mark.parametrize("start", STARTS)
+    @pytest.mark.parametrize("robots", [[], [("inferno", 3), ("bt", 2)]])
+    def test_as_the_engine_does_it(self, serve, game, start, robots):
+        _, client = serve([*robots, DRIVER])
+        client.identify(" (start " + " ".join(repr(value) for value in start) + ")")
+        session = "race" if robots else "practice"
+        engine = make_engine(game, "aalborg", [*robots, AGENT], session=session)
+        follow(client, engine, len(robots), 300, start)
+
+    def test_by_turns(self, serve):
+        _, client = serve()
+        client.identify()
+        grid = client.receive()
+        places = []
+        for start in ("(start 700 0 0 20)", "", "(start 700 0 0 20)"):
+            assert client.ask("(meta 1)") == b"***restart***\0"
+            client.identify(start)
+            places.append(client.receive())
+        assert places[0] == places[2]
+        assert places[1] == grid
+        assert number(places[0], "distFromStart") == pytest.approx(700, abs=0.1)
+        assert number(places[0], "speedX") == pytest.approx(72)
+        assert number(places[0], "curLapTime") == 0
+
+    @pytest.mark.parametrize("start", ["(start 99999 0 0 0)", "(start 300 4.9 0 0)"])
+    def test_a_place_that_cannot_be_had(self, serve, start):
+        process, client = serve()
+        client.identify(start)
+        state = client.receive()
+        assert number(state, "curLapTime") < 0
+        assert number(state, "damage") == 0
+        assert number(state, "distFromStart") == pytest.approx(2487.54, abs=0.1)
+        assert "no start at" in process.words()
+        assert client.restart() == state
+
+
+class TestRestart:
+    ROBOTS = (("inferno", 3), ("berniw", 3), ("bt", 2))
+
+    @pytest.mark.parametrize("robots", [(), ROBOTS])
+    def test_the_same_drive_again(self, serve, robots):
+        _, client = serve([*robots, DRIVER])
+        client.identify()
+        first = drive(client, client.receive(), 400)
+        client.receive()
+        for _ in range(2):
+            assert drive(client, client.restart(), 400) == first
+            client.receive()
+        _, fresh = serve([*robots, DRIVER])
+        fresh.identify()
+        assert drive(fresh, fresh.receive(), 400) == first
+
+    def test_often(self, serve):
+        process, client = serve()
+        client.identify()
+        first = client.receive()
+        for i in range(300):
+            assert client.restart() == first
+            if i == 50:
+                before = memory(process.pid)
+        assert memory(process.pid) - before < 500
+        assert process.poll() is None
+
+    def test_one_asks_and_all_begin_anew(self, serve):
+        _, first, second = serve([DRIVER, ("scr_server", 1)])
+        first.identify()
+        second.identify()
+        began = [first.receive()]
+        first.send(STAND)
+        began.append(second.receive())
+        second.send("(meta 1)")
+        assert first.receive() == second.receive() == b"***restart***\0"
+        second.send(INIT)  # in any order
+        first.identify()
+        assert second.receive() == b"***identified***\0"
+        assert first.receive() == began[0]
+        first.send(STAND)
+        assert second.receive() == began[1]
+
+    def test_who_missed_the_word_asks_again(self, serve):
+        _, client = serve()
+        client.identify()
+        client.receive()
+        assert client.ask("(meta 1)") == client.ask("(meta 1)") == b"***restart***\0"
+        client.identify()
+
+
+def memory(pid):
+    """Read what a process has in memory [kB]."""
+    return int(re.search(r"VmRSS:\s+(\d+)", Path(f"/proc/{pid}/status").read_text())[1])
+
+
+# ---- What goes wrong ----------------------------------------------------------------------------
+
+
+class TestLostAndDoubled:
+    def test_introductions_that_queued_are_one(self, serve):
+        process, client = serve()
+        os.kill(process.pid, signal.SIGSTOP)
+        for _ in range(3):
+            client.send(INIT)
+        os.kill(process.pid, signal.SIGCONT)
+        assert client.receive() == b"***identified***\0"
+        assert client.receive().startswith(b"(angle ")
+
+    def test_a_doubled_action_is_taken_once(self, serve):
+        """By a client that says which state it answers."""
+        _, client = serve()
+        client.identify()
+        state = skip_countdown(client)
+        for _ in range(50):
+            answer = f"{STAND}(curLapTime {number(state, 'curLapTime'):g})"
+            client.send(answer)
+            client.send(answer)
+            following = client.receive()
+            while following == state:  # was sent again, to who seemed to have missed it
+                following = client.receive()
+            step = number(following, "curLapTime") - number(state, "curLapTime")
+            assert 0.019 < step < 0.023
+            state = following
+
+    def test_a_lost_state_is_sent_again(self, serve):
+        _, client = serve()
+        client.identify()
+        state = client.receive()
+        answer = f"{STAND}(curLapTime {number(state, 'curLapTime'):g})"
+        lost = client.ask(answer)
+        assert client.ask(answer) == lost
+
+    def test_strangers_are_not_heard(self, serve):
+        _, client = serve()
+        client.identify()
+        client.receive()
+        stranger = Client(client.socket.getpeername()[1])
+        stranger.send("(meta 1)")
+        client.nothing_comes()
+        assert client.ask(STAND).startswith(b"(angle ")
+        stranger.socket.close()
+
+    def test_a_client_that_comes_back(self, serve):
+        _, client = serve()
+        client.identify()
+        before = drive(client, client.receive(), 30)[-1]
+        last = client.receive()
+        other = Client(client.socket.getpeername()[1])
+        other.identify()
+        assert other.receive() == last != before
+        assert other.ask(STAND).startswith(b"(angle ")
+        client.nothing_comes()
+        other.socket.close()
+
+    def test_garbage(self, serve):
+        process, client = serve()
+        client.send(b"\xff" * 900)
+        client.send("hello")
+        client.identify()
+        state = client.receive()
+        for text in (b"\xff\0(" * 300, b"", b"(" * 1000, b"(steer " * 1000, b"\0"):
+            state = client.ask(text)
+            assert state.startswith(b"(angle ")
+        assert process.poll() is None
+
+
+class TestDeadline:
+    def test_answers_that_are_missing_are_counted(self, serve):
+        process, client = serve(deadline=0.5, track="michigan", laps=1)
+        client.identify()
+        drive(client, client.receive(), 100)
+        for _ in range(3):
+            client.receive()
+        state = client.receive()
+        while not state.startswith(b"***"):
+            state = client.ask(action(state))
+        process.wait(PATIENCE)
+        assert re.search(r"\d+ decisions, 3 late", process.words())
+
+    def test_late_answers_are_counted_and_used(self, serve):
+        """A client that thinks for three deadlines: the game goes on meanwhile."""
+        process, client = serve(deadline=0.02)
+        client.identify()
+        times, speeds = [], []
+        state = client.receive()
+        for _ in range(12):
+            time.sleep(0.06)
+            state = newest(client, state)
+            times.append(number(state, "curLapTime"))
+            speeds.append(number(state, "rpm"))
+            client.send(f"(accel 1)(gear 1)(curLapTime {times[-1]:g})")
+        steps = [after - before for before, after in itertools.pairwise(times)]
+        assert min(steps) > 0.03
+        assert speeds[0] < 1000
+        assert max(speeds) > 3000
+        assert process.poll() is None
+
+    def test_a_silent_client_stands_on_the_brake(self, serve):
+        _, client = serve(deadline=0.001)
+        client.identify()
+        state = client.receive()
+        before = number(state, "distFromStart")
+        while number(state, "curLapTime") < 2.0:
+            state = client.receive()
+        assert number(state, "distFromStart") == pytest.approx(before, abs=0.1)
+
+
+def newest(client, state):
+    """Read all that has come."""
+    client.socket.setblocking(False)
+    try:
+        while True:
+            state = client.receive()
+    except BlockingIOError:
+        return state
+    finally:
+        client.socket.settimeout(PATIENCE)
+
+
+START_AND_WAIT = """
+import sys, time
+from sb3_torcs.game import find_game
+from sb3_torcs.race_file import RaceSetup
+from sb3_torcs.scr_game import open_ports, start_server
+sockets = open_ports(1)
+game = start_server(find_game(), RaceSetup("aalborg", [("scr_server", 0)]), sockets)
+print(game.pid, game.folder, sockets[0].getsockname()[1], flush=True)
+time.sleep(60)
+"""
+
+
+class TestOrphans:
+    @pytest.mark.parametrize("racing", [False, True])
+    def test_a_game_ends_with_who_started_it(self, game, racing):
+        owner = subprocess.Popen([sys.executable, "-c", START_AND_WAIT], stdout=subprocess.PIPE)
+        pid, folder, port = owner.stdout.readline().split()
+        client = Client(int(port))
+        if racing:
+            client.identify()
+            client.receive()
+        owner.kill()
+        owner.wait()
+        owner.stdout.close()
+        client.socket.close()
+        until = time.monotonic() + PATIENCE
+        while Path(folder.decode()).exists() or Path(f"/proc/{int(pid)}/fd").exists():
+            assert time.monotonic() < until, "it left something behind"
+            time.sleep(0.05)
+
+
+class TestAlone:
+    """The module as a user's own game has it: it binds the usual ports itself."""
+
+    def test_a_port_that_is_taken(self, game):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+            with contextlib.suppress(OSError):  # then somebody else has it: just as well
+                taken.bind(("0.0.0.0", 3001))
+            with GameProcess(game, RaceSetup("aalborg", [DRIVER])) as process:
+                until = time.monotonic() + PATIENCE
+                while process.poll() is None and time.monotonic() < until:
+                    time.sleep(0.01)
+                assert process.poll() == 1
+                assert "UDP port 3001 cannot be had" in process.words()
+
+    @pytest.mark.parametrize("deadline", ["soon", "-1", "0", "10ms", ""])
+    def test_a_deadline_that_is_none(self, game, deadline):
+        variables = {"SB3_TORCS_SCR_DEADLINE": deadline}
+        race = RaceSetup("aalborg", [DRIVER])
+        with GameProcess(game, race, environment=variables) as process:
+            until = time.monotonic() + PATIENCE
+            while process.poll() is None and time.monotonic() < until:
+                time.sleep(0.01)
+            assert "set it to wait or to microseconds" in process.words()
