@@ -11,6 +11,7 @@ from collections.abc import Iterable
 __all__ = [
     "BackendUnavailable",
     "CarFileError",
+    "DisplayUnavailable",
     "EngineBusy",
     "EngineForked",
     "EnvClosed",
@@ -22,11 +23,15 @@ __all__ = [
     "InvalidAction",
     "InvalidOption",
     "LayoutMismatch",
+    "MessageBroken",
     "ModelMismatch",
     "NoiseNotBound",
     "OutputNotWritable",
+    "PortTaken",
     "RobotUnavailable",
     "Sb3TorcsError",
+    "ServerLost",
+    "ServerNotFound",
     "TrackFileError",
     "TrackNotFound",
     "UnknownCar",
@@ -84,6 +89,10 @@ class RobotUnavailable(BackendUnavailable):
     """A robot's module does not load, or its set-up does not fit its car."""
 
 
+class DisplayUnavailable(BackendUnavailable):
+    """There is no display for the game's window."""
+
+
 class EngineBusy(Sb3TorcsError, RuntimeError):
     """Two threads drive one engine."""
 
@@ -102,6 +111,22 @@ class GameTimeout(Sb3TorcsError, TimeoutError):
 
 class InstallFailed(Sb3TorcsError, RuntimeError):
     """TORCS cannot be installed here; the message says why and what to do."""
+
+
+class PortTaken(Sb3TorcsError, OSError):
+    """A port for the game's clients is not free, or may not be used."""
+
+
+class ServerNotFound(Sb3TorcsError, ConnectionError):
+    """No SCR server answers at this address."""
+
+
+class ServerLost(Sb3TorcsError, ConnectionError):
+    """An SCR server that did answer has ended, or says nothing any more."""
+
+
+class MessageBroken(Sb3TorcsError, ValueError):
+    """A datagram is not what the SCR protocol says; the message shows the part of it."""
 
 
 class UnknownCar(Sb3TorcsError, LookupError):

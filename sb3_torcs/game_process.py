@@ -42,6 +42,7 @@ class GameProcess:
     :param environment: variables for our own code inside the game
     :param descriptors: open files that the game inherits
     :param preload: a library of ours that the game's program loads first, instead of text mode
+    :param files: texts for the private folder, by their place in it
     :raises TrackNotFound: if the game has no such track
     :raises UnknownRobot: if the game has no such robot
     :raises UnknownCar: if the game has not the car of a driver
@@ -58,6 +59,7 @@ class GameProcess:
         environment: Mapping[str, str] | None = None,
         descriptors: Sequence[int] = (),
         preload: Path | None = None,
+        files: Mapping[str, str] | None = None,
     ) -> None:
         if game.program is None:
             raise GameIncomplete(
@@ -74,6 +76,8 @@ class GameProcess:
             data, race = _data(game, self.folder, race)
             libraries = _libraries(game, self.folder, race)
             self.race_name = write_race(game, self.folder, race)
+            for file, text in (files or {}).items():
+                (self.folder / file).write_text(text, encoding="UTF-8")
             call = [str(game.program), "-l", str(self.folder), "-L", str(libraries)]
             call += ["-D", str(data)]
             variables = {

@@ -22,6 +22,7 @@ __all__ = [
     "SESSIONS",
     "RaceSetup",
     "Session",
+    "session_for",
     "write_race",
 ]
 
@@ -36,6 +37,16 @@ ENGINE_SETTINGS = "config/raceengine.xml"
 SCR_SERVER = "scr_server"
 """The module whose drivers are clients of the SCR protocol."""
 SCR_DRIVERS = 10  # of the module, as that of the championship had
+
+
+def session_for(drivers: Sequence[tuple[str, int]]) -> Session:
+    """
+    Say which session a number of drivers calls for.
+
+    :param drivers: names and indices
+    :return: ``"practice"`` for one, ``"race"`` for several
+    """
+    return "race" if len(drivers) > 1 else "practice"
 
 
 @dataclass(frozen=True)

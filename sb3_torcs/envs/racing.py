@@ -62,7 +62,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
     :param action_repeat: control ticks of 0.02 s per decision
     :param start: ``"grid"``, or ``"random"``: anywhere on the track, moving
     :param laps: whole laps after which the episode is truncated; ``None`` drives on
-    :param render_mode: ``None``, ``"rgb_array"`` or ``"human"``
+    :param render_mode: ``None``, or one of ``metadata["render_modes"]``
     :raises InvalidOption: if an option has a value that is not allowed
     """
 
@@ -83,9 +83,8 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         if laps is not None and not is_count(laps):
             raise InvalidOption(f"laps is {laps!r}; expected a whole number >= 1, or None")
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
-            raise InvalidOption(
-                f"render_mode is {render_mode!r}; expected None, 'rgb_array' or 'human'"
-            )
+            modes = ", ".join(repr(mode) for mode in self.metadata["render_modes"])
+            raise InvalidOption(f"render_mode is {render_mode!r}; expected None or one of {modes}")
         self.backend = backend
         self._encode: Callable[[CarState], Observation] = getattr(backend, "encode", encode)
         self.action_repeat = int(action_repeat)

@@ -1,0 +1,119 @@
+"""Displays: the user's, and the virtual one, which leaves nothing behind."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from sb3_torcs.display import VirtualDisplay, find_display
+from sb3_torcs.errors import BackendUnavailable, DisplayUnavailable
+
+SIZE = (160, 120)
+
+
+def traces(name):
+    """The files of a display's server, those of a crashed one included."""
+    number = name[1:]
+    files = [Path(f"/tmp/.X{number}-lock"), Path(f"/tmp/.X11-unix/X{number}")]
+    return [file for file in files if file.exists()]
+
+
+def runs(pid):
+    """Whether a process runs: one that waits to be reaped by somebody else does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def gone_within(seconds, *conditions):
+    """Wait until nothing is there any more."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end and any(condition() for condition in conditions):
+        time.sleep(0.05)
+    return not any(condition() for condition in conditions)
+
+
+def program(folder, script):
+    """Put an Xvfb of our own in front of the real one."""
+    file = folder / "Xvfb"
+    file.write_text(f"#!/bin/sh\n{script}\n")
+    file.chmod(0o755)
+    return str(folder) + os.pathsep + os.environ["PATH"]
+
+
+class TestTheUsersDisplay:
+    def test_it_is_found_by_its_name(self, monkeypatch):
+        with VirtualDisplay(SIZE) as display:
+            monkeypatch.setenv("DISPLAY", f"{display.name}.0")
+            assert find_display() == f"{display.name}.0"
+
+    def test_none_is_an_error_that_offers_film(self, monkeypatch):
+        monkeypatch.delenv("DISPLAY", raising=False)
+        with pytest.raises(DisplayUnavailable, match=r"DISPLAY is not set.*--film FILE\.mp4"):
+            find_display()
+
+    @pytest.mark.parametrize("name", [":2999", "unix:2999", "localhost:2999"])
+    def test_one_that_does_not_answer_is_an_error(self, monkeypatch, name):
+        monkeypatch.setenv("DISPLAY", name)
+        with pytest.raises(DisplayUnavailable, match=rf"no X server answers at .*{name}.*--film"):
+            find_display()
+
+    def test_what_is_no_name_is_an_error(self, monkeypatch):
+        monkeypatch.setenv("DISPLAY", "the big one")
+        with pytest.raises(DisplayUnavailable, match="expected a name such as :0"):
+            find_display()
+
+
+class TestTheVirtualDisplay:
+    def test_closing_it_leaves_nothing(self):
+        with VirtualDisplay(SIZE) as display:
+            assert runs(display.pid)
+            assert traces(display.name)
+        assert not runs(display.pid)
+        assert not traces(display.name)
+        display.close()  # does no harm
+
+    def test_there_can_be_several(self):
+        with VirtualDisplay(SIZE) as one, VirtualDisplay(SIZE) as other:
+            assert one.name != other.name
+
+    def test_one_that_is_killed_leaves_nothing_either(self):
+        with VirtualDisplay(SIZE) as display:
+            os.kill(display.pid, signal.SIGKILL)
+        assert not traces(display.name)
+
+    def test_it_goes_with_the_process_that_has_it(self):
+        code = (
+            "from sb3_torcs.display import VirtualDisplay\n"
+            f"display = VirtualDisplay({SIZE})\n"
+            "print(display.name, display.pid, flush=True)\n"
+            "input()\n"
+        )
+        call = [sys.executable, "-c", code]
+        with subprocess.Popen(call, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as owner:
+            name, pid = owner.stdout.readline().decode().split()
+            owner.kill()
+        assert gone_within(10, lambda: runs(pid), lambda: traces(name))
+
+    def test_without_the_program_the_error_says_what_to_type(self, monkeypatch, tmp_path):
+        monkeypatch.setenv("PATH", str(tmp_path))
+        with pytest.raises(DisplayUnavailable, match="sudo apt install xvfb") as caught:
+            VirtualDisplay(SIZE)
+        assert isinstance(caught.value, BackendUnavailable)
+
+    def test_a_program_that_fails_is_quoted(self, monkeypatch, tmp_path):
+        monkeypatch.setenv("PATH", program(tmp_path, "echo 'no memory' >&2; exit 1"))
+        with pytest.raises(DisplayUnavailable, match="does not start; it said: no memory"):
+            VirtualDisplay(SIZE)
+
+    def test_a_program_that_does_not_answer_is_an_error(self, monkeypatch, tmp_path):
+        monkeypatch.setenv("PATH", program(tmp_path, 'echo 2999 >/dev/fd/"$2"; exec sleep 60'))
+        with pytest.raises(DisplayUnavailable, match="does not answer"):
+            VirtualDisplay(SIZE)

@@ -1,0 +1,224 @@
+"""The game's window: straight into the race, and out again."""
+
+from __future__ import annotations
+
+import ctypes
+import dataclasses
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from test_display import gone_within, runs
+
+from sb3_torcs import game_window
+from sb3_torcs.display import VirtualDisplay
+from sb3_torcs.errors import GameFailed, GameIncomplete, InvalidOption
+from sb3_torcs.game_process import GameProcess
+from sb3_torcs.game_window import VIEWS, Window, window_arguments, window_files
+from sb3_torcs.race_file import RaceSetup
+
+SIZE = (320, 240)
+LAP = RaceSetup("aalborg", [("inferno", 3)], laps=1)
+ESCAPE = 9  # the key's code
+KEY_PRESS, KEY_PRESS_MASK, FULL_PICTURE = 2, 1, 2
+
+
+@pytest.fixture(autouse=True)
+def nothing_is_left(tmp_path, monkeypatch):
+    """Whatever happens, the private folders of the game are gone afterwards."""
+    private = tmp_path / "private"
+    private.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(private))
+    yield
+    assert list(private.iterdir()) == []
+
+
+def shown(game, display, race=LAP, **options):
+    window = Window(SIZE, display=display.name, **options)
+    return GameProcess(game, race, **window_arguments(game, window))
+
+
+class XKeyEvent(ctypes.Structure):
+    """As Xlib lays it out."""
+
+    _fields_ = [
+        ("type", ctypes.c_int), ("serial", ctypes.c_ulong), ("send_event", ctypes.c_int),
+        ("display", ctypes.c_void_p), ("window", ctypes.c_ulong), ("root", ctypes.c_ulong),
+        ("subwindow", ctypes.c_ulong), ("time", ctypes.c_ulong), ("x", ctypes.c_int),
+        ("y", ctypes.c_int), ("x_root", ctypes.c_int), ("y_root", ctypes.c_int),
+        ("state", ctypes.c_uint), ("keycode", ctypes.c_uint), ("same_screen", ctypes.c_int),
+        ("rest_of_an_event", ctypes.c_long * 24),
+    ]  # fmt: skip
+
+
+class XImage(ctypes.Structure):
+    """The beginning of what Xlib returns."""
+
+    _fields_ = [
+        ("width", ctypes.c_int), ("height", ctypes.c_int), ("xoffset", ctypes.c_int),
+        ("format", ctypes.c_int), ("data", ctypes.c_void_p),
+    ]  # fmt: skip
+
+
+class Viewer:
+    """Somebody who sits before a display."""
+
+    def __init__(self, name):
+        self.x = ctypes.CDLL("libX11.so.6")
+        for function in ("XOpenDisplay", "XDefaultRootWindow"):
+            getattr(self.x, function).restype = ctypes.c_void_p
+        self.x.XGetImage.restype = ctypes.POINTER(XImage)
+        self.display = ctypes.c_void_p(self.x.XOpenDisplay(name.encode()))
+        self.root = ctypes.c_ulong(self.x.XDefaultRootWindow(self.display))
+
+    def look(self):
+        """Take a picture, (height, width, 3)."""
+        every_plane = ctypes.c_ulong(2**32 - 1)
+        image = self.x.XGetImage(
+            self.display, self.root, 0, 0, *SIZE, every_plane, FULL_PICTURE
+        ).contents
+        data = ctypes.string_at(image.data, SIZE[0] * SIZE[1] * 4)
+        return np.frombuffer(data, np.uint8).reshape(SIZE[1], SIZE[0], 4)[..., :3].astype(int)
+
+    def wait_for_a_race(self):
+        """Wait for a picture with the sky above the road."""
+        for _ in range(600):
+            picture = self.look()
+            if picture[:60].mean() > 120 > picture[-60:].mean() > 30:
+                return picture
+            time.sleep(0.05)
+        raise AssertionError("there is no race to be seen")
+
+    def press(self, code):
+        """Press a key in the only window there is."""
+        window, children, number = ctypes.c_ulong(), ctypes.POINTER(ctypes.c_ulong)(), 0
+        number = ctypes.c_uint()
+        self.x.XQueryTree(
+            self.display, self.root, ctypes.byref(window), ctypes.byref(window),
+            ctypes.byref(children), ctypes.byref(number),
+        )  # fmt: skip
+        target = ctypes.c_ulong(children[number.value - 1])
+        event = XKeyEvent(
+            type=KEY_PRESS, window=target.value, root=self.root.value, keycode=code, same_screen=1
+        )
+        self.x.XSendEvent(self.display, target, 1, KEY_PRESS_MASK, ctypes.byref(event))
+        self.x.XSync(self.display, 0)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        self.x.XCloseDisplay(self.display)
+
+
+class TestSettings:
+    def values(self, game, window, file, section):
+        root = ElementTree.fromstring(window_files(game, window)[file])
+        for name in section.split("/"):
+            root = root.find(f"section[@name='{name}']")
+        return {value.get("name"): value.get("val") for value in root if value.tag != "section"}
+
+    def test_the_window_has_its_size_and_is_no_whole_screen(self, game):
+        values = self.values(game, Window((640, 360)), "config/screen.xml", "Screen Properties")
+        assert (values["x"], values["y"]) == ("640", "360")
+        assert (values["window width"], values["window height"]) == ("640", "360")
+        assert values["fullscreen"] == "no"
+
+    @pytest.mark.parametrize("view", VIEWS)
+    def test_a_view_is_one_of_the_games_cameras(self, game, view):
+        window = Window(view=view, driver="scr_server 0")
+        values = self.values(game, window, "config/graph.xml", "Display Mode/0")
+        assert (int(values["camera head list"]), int(values["camera"])) == VIEWS[view]
+        assert values["current driver"] == "scr_server 0"
+        assert values["driver board"] == "2"  # the one with the driver's messages
+
+    def test_a_film_is_silent(self, game, monkeypatch):
+        monkeypatch.setenv("PULSE_SERVER", "somewhere")
+        for window, state in ((Window(), "openal"), (Window(frames=5), "disabled")):
+            values = self.values(game, window, "config/sound.xml", "Sound Settings")
+            assert values["state"] == state
+
+    def test_without_a_device_there_is_no_sound(self, game, monkeypatch):
+        monkeypatch.setattr(game_window, "_has_sound", lambda: False)
+        values = self.values(game, Window(), "config/sound.xml", "Sound Settings")
+        assert values["state"] == "disabled"
+
+    def test_the_game_finds_the_users_display(self, game, monkeypatch, tmp_path):
+        monkeypatch.delenv("XAUTHORITY", raising=False)
+        monkeypatch.setenv("HOME", str(tmp_path))
+        (tmp_path / ".Xauthority").touch()
+        environment = window_arguments(game, Window(display=":7"))["environment"]
+        assert environment["DISPLAY"] == ":7"
+        assert environment["XAUTHORITY"] == str(tmp_path / ".Xauthority")
+        assert "SB3_TORCS_FRAMES" not in environment
+
+    def test_an_unknown_view_is_an_error_that_names_the_others(self):
+        with pytest.raises(InvalidOption, match=r"no view 'behnd'; did you mean 'behind'\?"):
+            Window(view="behnd")
+
+    @pytest.mark.parametrize("size", [(0, 480), (640, -1), (100_000, 480)])
+    def test_a_size_that_cannot_be_drawn_is_an_error(self, size):
+        with pytest.raises(InvalidOption, match=r"expected 64 to 4096 pixels"):
+            Window(size)
+
+    @pytest.mark.parametrize("fps", [0.0, -30.0, 1000.0, float("nan")])
+    def test_a_frame_rate_that_cannot_be_had_is_an_error(self, fps):
+        with pytest.raises(InvalidOption, match="expected 1 to 500"):
+            Window(frames=5, fps=fps)
+
+    def test_a_game_without_its_settings_is_an_error(self, game, tmp_path):
+        (tmp_path / "config").mkdir()
+        (tmp_path / "config" / "screen.xml").write_text("<params")
+        with pytest.raises(GameIncomplete, match=r"screen\.xml cannot be read.*install-torcs"):
+            window_files(dataclasses.replace(game, data=tmp_path), Window())
+
+
+class TestTheWindow:
+    def test_it_opens_in_the_race_and_escape_ends_it(self, game):
+        with (
+            VirtualDisplay(SIZE) as display,
+            shown(game, display) as process,
+            Viewer(display.name) as viewer,
+        ):
+            first = viewer.wait_for_a_race()
+            for _ in range(600):
+                time.sleep(0.05)
+                if np.abs(viewer.look() - first).mean() > 10:  # the car drives
+                    break
+            else:
+                raise AssertionError("nothing moves")
+            viewer.press(ESCAPE)
+            process.wait(20)
+            assert list((process.folder / "results" / "race").glob("*.xml"))
+
+    def test_without_a_display_it_says_so(self, game):
+        window = Window(SIZE, display=":2999")
+        with GameProcess(game, LAP, **window_arguments(game, window)) as process:
+            with pytest.raises(GameFailed, match="failed to open display ':2999'"):
+                process.wait(20)
+
+    def test_it_goes_with_the_process_that_started_it(self):
+        code = (
+            "import sys; sys.path.insert(0, 'tests')\n"
+            "from test_window import shown, Viewer\n"
+            "from sb3_torcs.display import VirtualDisplay\n"
+            "from sb3_torcs.game import find_game\n"
+            f"display = VirtualDisplay({SIZE})\n"
+            "process = shown(find_game(), display)\n"
+            "Viewer(display.name).wait_for_a_race()\n"
+            "print(process.pid, process.folder, display.pid, flush=True)\n"
+            "input()\n"
+        )
+        call = [sys.executable, "-c", code]
+        root = Path(__file__).parent.parent
+        with subprocess.Popen(
+            call, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=root
+        ) as owner:
+            game, folder, server = owner.stdout.readline().decode().split()
+            owner.kill()
+        assert gone_within(10, lambda: runs(game), Path(folder).exists, lambda: runs(server))
