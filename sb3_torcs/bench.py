@@ -34,6 +34,7 @@ KEYS = (
     "torcs_vector2_ratio",
     "scr_ticks_per_s",
     "scr_reset_ms",
+    "game_frames_per_s",
     "policy_updates_per_s",
     "policy_plain_updates_per_s",
     "policy_fast_updates_per_s",
@@ -58,9 +59,9 @@ def stages(seconds: float) -> dict[str, Callable[[], Figures]]:
     :param seconds: to spend on all of them, about [s]
     :return: by name; each returns some of the figures
     """
-    from sb3_torcs import bench_torcs
+    from sb3_torcs import bench_scr, bench_torcs
 
-    share = seconds / 5.0
+    share = seconds / 6.0
     return {
         "environments": lambda: environments(share),
         "resets": resets,
@@ -68,6 +69,9 @@ def stages(seconds: float) -> dict[str, Callable[[], Figures]]:
         "game resets": _where_it_is(bench_torcs.resets),
         "game loads": _where_it_is(bench_torcs.loads),
         "game threads": _where_it_is(lambda: bench_torcs.vector(share)),
+        "SCR": _where_it_is(lambda: bench_scr.ticks(share)),
+        "SCR resets": _where_it_is(bench_scr.resets),
+        "pictures": _where_it_is(bench_scr.pictures),
         "policy": lambda: _policy(share),
         "training": lambda: training_share(max(int(40.0 * share), 100)),
     }

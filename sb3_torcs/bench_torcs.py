@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from sb3_torcs.car import FloatArray
 
-__all__ = ["loads", "resets", "ticks", "vector"]
+__all__ = ["REPEAT", "TORCS", "Figures", "loads", "resets", "scripted_actions", "ticks", "vector"]
 
 TORCS = "sb3_torcs:Torcs-v0"
 REPEAT = 5  # control ticks per decision, the default
@@ -43,8 +43,8 @@ def ticks(seconds: float) -> Figures:
     :return: the medians over the turns
     """
     single, repeated = (gym.make(TORCS, action_repeat=repeat) for repeat in (1, REPEAT))
-    actions = _scripted_actions(single, TICKS_PER_TURN)
-    decisions = _scripted_actions(repeated, TICKS_PER_TURN // REPEAT)
+    actions = scripted_actions(single, TICKS_PER_TURN)
+    decisions = scripted_actions(repeated, TICKS_PER_TURN // REPEAT)
     controls = np.array(actions, np.float64)
     engine = single.get_wrapper_attr("backend").engine
     measurements: dict[str, Callable[[], float]] = {
@@ -63,8 +63,13 @@ def ticks(seconds: float) -> Figures:
     return {name: statistics.median(values) for name, values in rates.items()}
 
 
-def _scripted_actions(env: gym.Env[Any, Any], number: int) -> Actions:
-    """Let the scripted driver choose actions from the grid on, and end before the episode does."""
+def scripted_actions(env: gym.Env[Any, Any], number: int) -> Actions:
+    """
+    Let the scripted driver choose actions from the grid on, and end before the episode does.
+
+    :param env: to drive in
+    :param number: of actions, at most
+    """
     from sb3_torcs.drivers import ScriptedDriver
     from sb3_torcs.evaluation import drive
 

@@ -2,7 +2,7 @@ import os
 
 import pytest
 
-from sb3_torcs import bench, bench_torcs
+from sb3_torcs import bench, bench_scr, bench_torcs
 from sb3_torcs.errors import BackendUnavailable
 
 
@@ -12,7 +12,7 @@ def test_every_figure_is_measured_once_or_empty(monkeypatch):
     stages = bench.stages(0.01)
     figures = stages["resets"]()
     assert list(figures) == ["lite_reset_ms"]
-    assert len(set(bench.KEYS)) == len(bench.KEYS) == 16
+    assert len(set(bench.KEYS)) == len(bench.KEYS) == 17
 
 
 def test_the_environments_are_measured_in_the_same_run(monkeypatch):
@@ -44,6 +44,17 @@ def short(game, monkeypatch):
     monkeypatch.setattr(bench_torcs, "RACES", 2)
     monkeypatch.setattr(bench_torcs, "BATCHES", 5)
     monkeypatch.setattr(bench_torcs, "SLICE", 0.01)
+    monkeypatch.setattr(bench_scr, "TICKS_PER_TURN", 100)
+    monkeypatch.setattr(bench_scr, "RESETS", 2)
+    monkeypatch.setattr(bench_scr, "PICTURES", 2)
+    monkeypatch.setattr(bench_scr, "SIZE", (160, 120))
+
+
+@pytest.mark.usefixtures("short")
+def test_the_game_in_a_process_of_its_own_is_measured_by_its_names():
+    figures = {**bench_scr.ticks(0.0001), **bench_scr.resets(), **bench_scr.pictures()}
+    assert list(figures) == ["scr_ticks_per_s", "scr_reset_ms", "game_frames_per_s"]
+    assert min(figures.values()) > 0.0
 
 
 @pytest.mark.usefixtures("short")
@@ -76,7 +87,7 @@ def test_one_core_has_no_second_thread_to_measure(monkeypatch):
 def test_the_drive_of_the_limit_is_the_same_each_turn():
     """Saving and restoring in between leaves no trace in it."""
     env = bench_torcs.gym.make(bench_torcs.TORCS, action_repeat=1)
-    actions = bench_torcs._scripted_actions(env, 200)
+    actions = bench_torcs.scripted_actions(env, 200)
     engine = env.unwrapped.backend.engine
     controls = bench_torcs.np.array(actions, float)
     bench_torcs._limit(engine, controls)

@@ -7,7 +7,18 @@ import os
 import sys
 from collections.abc import Sequence
 
-from sb3_torcs.cli import bench, doctor, evaluate, install_torcs, robots, tracks, train
+from sb3_torcs.cli import (
+    bench,
+    compete,
+    doctor,
+    evaluate,
+    install_torcs,
+    robots,
+    serve,
+    tracks,
+    train,
+    watch,
+)
 from sb3_torcs.errors import Sb3TorcsError
 
 __all__ = ["main"]
@@ -15,7 +26,7 @@ __all__ = ["main"]
 USAGE_ERROR = 2
 INTERRUPTED = 130
 READER_LEFT = 141
-VERBS = (doctor, install_torcs, tracks, train, evaluate, robots, bench)
+VERBS = (doctor, install_torcs, tracks, train, evaluate, watch, robots, serve, compete, bench)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -1,0 +1,107 @@
+"""``sb3-torcs compete``: a trained agent as an ordinary SCR client in somebody else's race."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING, Any
+
+from sb3_torcs.cli.common import positive, print_json, quiet_output
+
+if TYPE_CHECKING:
+    from sb3_torcs.driving import Agent
+
+__all__ = ["add_parser", "run"]
+
+KEPT = ("track", "car", "action_repeat", "range_finders")
+"""What is taken from the training, unless the command line says otherwise."""
+
+DESCRIPTION = """\
+Drive a saved model in a race that runs elsewhere: `sb3-torcs serve`, a patched game, a league's
+server. The agent decides as often as in its training and answers every tick in between; it drives
+to the end of the race, whatever happens.
+
+The protocol does not tell the track and the car: --track and --car say what runs there. The track
+only serves to place the car on the map, the car for its gearbox.
+"""
+
+
+def add_parser(subparsers: Any) -> None:
+    """
+    :param subparsers: of the command
+    """
+    parser = subparsers.add_parser(
+        "compete",
+        help="drive a saved model in a race that runs elsewhere",
+        description=DESCRIPTION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add("model", metavar="MODEL", help="a saved .zip, a run's folder, or 'scripted'")
+    add("--host", default="127.0.0.1", metavar="H", help="default: 127.0.0.1")
+    add("--port", type=positive, default=3001, metavar="P", help="default: 3001")
+    add("--track", metavar="T", help="that runs there; default: that of the training, or aalborg")
+    add("--car", metavar="C", help="that one drives there; default: that of the training")
+    add("--algo", help="the model's algorithm, if it cannot be found out")
+    add("--json", action="store_true", help="print one JSON object and nothing else")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """
+    :param args: from the command line
+    :return: the exit status
+    """
+    from sb3_torcs.driving import Agent
+    from sb3_torcs.models import TrainingRecord, find_model, training_record
+
+    scripted = args.model == "scripted"
+    record = TrainingRecord() if scripted else training_record(find_model(args.model))
+    settings = {name: record.env_kwargs[name] for name in KEPT if name in record.env_kwargs}
+    given = {"track": args.track, "car": args.car, "host": args.host, "port": args.port}
+    settings |= {name: value for name, value in given.items() if value is not None}
+    with quiet_output(args.json):
+        agent = Agent(args.model, settings, args.algo)
+        agent.drive()
+    if args.json:
+        print_json(_figures(agent))
+    else:
+        _show(agent)
+    return 0
+
+
+def _figures(agent: Agent) -> dict[str, Any]:
+    """
+    Collect what is told.
+
+    :param agent: after its drive
+    """
+    import numpy as np
+
+    latencies = 1000.0 * np.array(agent.backend.latencies)
+    median, late, longest = np.percentile(latencies, (50, 99, 100)) if latencies.size else [0.0] * 3
+    return {
+        "laps": len(agent.lap_times),
+        "lap_times": agent.lap_times,
+        "distance": agent.distance,
+        "ticks": len(latencies),
+        "lost_ticks": agent.backend.lost_ticks,
+        "latency_ms": {"median": median, "p99": late, "longest": longest},
+    }
+
+
+def _show(agent: Agent) -> None:
+    """
+    Print what is told, for people.
+
+    :param agent: after its drive
+    """
+    figures = _figures(agent)
+    times = ", ".join(f"{seconds:.3f}" for seconds in agent.lap_times) or "none"
+    print(f"lap times s: {times}; {agent.distance:.0f} m")
+    total = figures["ticks"] + figures["lost_ticks"]
+    print(f"lost ticks: {figures['lost_ticks']} of {total}")
+    latency = figures["latency_ms"]
+    print(
+        f"answer ms: median {latency['median']:.2f}, 99 % within {latency['p99']:.2f}, "
+        f"longest {latency['longest']:.2f}; the server waits 10 unless it says otherwise"
+    )

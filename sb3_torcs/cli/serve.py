@@ -1,0 +1,114 @@
+"""``sb3-torcs serve``: the game as an SCR server, for clients of every language."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING, Any
+
+from sb3_torcs.cli.common import positive
+from sb3_torcs.cli.results import show_results
+
+if TYPE_CHECKING:
+    from sb3_torcs.game_process import GameProcess
+
+__all__ = ["add_parser", "run"]
+
+DEFAULT_DEADLINE = 10.0  # [ms] as the SCR server has it
+REPORT = "scr_server "  # begins the lines that our drivers print when a race is over
+
+DESCRIPTION = """\
+Start the installed game with drivers that are clients of the SCR protocol (arXiv:1304.1672), one
+UDP port each; robots of the game start behind them. The race begins when every client has said who
+it is, and the command ends with the race, or with Ctrl-C, and leaves nothing behind.
+
+A client has 10 ms of real time for an answer, or what --deadline says; who is later drives on as
+before. With --wait the game waits, however long it takes: the drive is the same at any speed.
+"""
+
+
+def add_parser(subparsers: Any) -> None:
+    """
+    :param subparsers: of the command
+    """
+    parser = subparsers.add_parser(
+        "serve",
+        help="start the game as an SCR server",
+        description=DESCRIPTION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add("--track", default="aalborg", metavar="T", help="default: aalborg")
+    add("--drivers", type=positive, default=1, metavar="N", help="clients, 1 to 10; default: 1")
+    add("--robots", metavar="NAME:I,…", help="of the game, who start behind the clients")
+    add("--car", default="car1-trb1", metavar="C", help="of the clients; default: car1-trb1")
+    add("--laps", type=positive, default=20, metavar="L", help="default: 20")
+    add("--host", default="127.0.0.1", metavar="H",
+        help="address to listen at; default: 127.0.0.1, 0.0.0.0 lets others in")  # fmt: skip
+    add("--port", type=positive, default=3001, metavar="P",
+        help="of the first client; the others follow; default: 3001")  # fmt: skip
+    time = parser.add_mutually_exclusive_group()
+    time.add_argument("--wait", action="store_true", help="wait for every answer")
+    time.add_argument("--deadline", type=float, default=DEFAULT_DEADLINE, metavar="MS",
+                      help="for an answer; default: 10")  # fmt: skip
+    add("--window", action="store_true", help="show the game's 3D view")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """
+    :param args: from the command line
+    :return: the exit status
+    """
+    from sb3_torcs.display import find_display
+    from sb3_torcs.errors import InvalidOption
+    from sb3_torcs.game import find_game
+    from sb3_torcs.game_results import read_results
+    from sb3_torcs.game_window import Window
+    from sb3_torcs.race_file import SCR_SERVER, RaceSetup, session_for
+    from sb3_torcs.scr_game import open_ports, start_server
+
+    if not args.deadline > 0.0:
+        raise InvalidOption(f"--deadline is {args.deadline:g} ms; expected more than 0, or --wait")
+    game = find_game()
+    robots = [game.parse_robot(name) for name in args.robots.split(",")] if args.robots else []
+    drivers = [(SCR_SERVER, number) for number in range(args.drivers)] + robots
+    race = RaceSetup(args.track, drivers, args.laps, session_for(drivers), args.car)
+    cars = [args.car] * args.drivers + [game.find_robot(*robot).car for robot in robots]
+    deadline = None if args.wait else args.deadline / 1000.0
+    window = Window(display=find_display(), driver="scr_server 0") if args.window else None
+    sockets = open_ports(args.drivers, args.port, args.host)
+    try:
+        process = start_server(game, race, sockets, deadline=deadline, window=window)
+    finally:
+        for bound in sockets:
+            bound.close()
+    with process:
+        _announce(args)
+        process.wait()
+        results = read_results(process, race, cars)
+        _report(process)
+    show_results(results, drivers[0], str(args.track))
+    return 0
+
+
+def _announce(args: argparse.Namespace) -> None:
+    """
+    Say where clients are awaited.
+
+    :param args: from the command line
+    """
+    last = args.port + args.drivers - 1
+    ports = f"port {args.port}" if last == args.port else f"ports {args.port} to {last}"
+    time = "the game waits for every answer" if args.wait else f"{args.deadline:g} ms per answer"
+    print(f"{args.track}: awaiting SCR clients at {args.host}, UDP {ports}; {time}", flush=True)
+
+
+def _report(process: GameProcess) -> None:
+    """
+    Pass on what our drivers counted.
+
+    :param process: of the game, at its end
+    """
+    for line in process.words().splitlines():
+        if line.startswith(REPORT):
+            print(line)

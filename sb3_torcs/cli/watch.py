@@ -1,0 +1,169 @@
+"""``sb3-torcs watch``: an agent or a robot in the game's own 3D window, or in a film of it."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sb3_torcs.cli.common import positive, writable_file
+from sb3_torcs.cli.results import show_results
+
+if TYPE_CHECKING:
+    from sb3_torcs.game import Game
+    from sb3_torcs.watching import Show
+
+__all__ = ["add_parser", "run"]
+
+KEPT = ("car", "action_repeat", "range_finders")
+"""What an agent drives with as in its training, unless the command line says otherwise."""
+
+DESCRIPTION = """\
+Open the game's own 3D view directly in a race: a saved model drives a car, or a robot of the game
+does. The game's keys work: F2 to F11 change the view, p pauses, + and - change the pace, Esc ends
+it.
+
+With --film the race is filmed instead, frame by frame in simulated time: no frame is dropped or
+doubled, however slow the machine, and no display is needed but Xvfb, which `sb3-torcs install-torcs
+--film` gets.
+
+The race ends after --laps laps; a model's also two seconds after it has left the road or stands.
+"""
+
+
+def add_parser(subparsers: Any) -> None:
+    """
+    :param subparsers: of the command
+    """
+    parser = subparsers.add_parser(
+        "watch",
+        help="see an agent or a robot in the game's own window, or film it",
+        description=DESCRIPTION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add("name", metavar="MODEL|ROBOT",
+        help="a saved .zip, a run's folder, 'scripted', or a robot, e.g. inferno")  # fmt: skip
+    add("--track", metavar="T", help="default: that of the training, or aalborg")
+    add("--car", metavar="C", help="of a model; default: that of its training")
+    add("--robots", metavar="NAME:I,…", help="of the game, who start behind")
+    add("--laps", type=positive, default=1, metavar="L", help="default: 1")
+    add("--view", default="behind", metavar="V", help="where the camera is; default: behind")
+    add("--size", type=_size, default=(1280, 720), metavar="WxH", help="default: 1280x720")
+    add("--film", metavar="FILE.mp4", help="film it")
+    add("--fps", type=float, default=30.0, metavar="N", help="of the film; default: 30")
+    add("--beside", metavar="MODEL|ROBOT", help="film this one, too, to the right")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """
+    :param args: from the command line
+    :return: the exit status
+    """
+    from sb3_torcs.errors import InvalidOption
+    from sb3_torcs.game import find_game
+    from sb3_torcs.watching import film_shows
+
+    if args.beside is not None and args.film is None:
+        raise InvalidOption("--beside is for films; add --film FILE.mp4")
+    film = writable_file(args.film, (".mp4",)) if args.film else None
+    game = find_game()
+    names = [args.name] if args.beside is None else [args.name, args.beside]
+    shows = [_show(game, name, args) for name in names]
+    if film is None:
+        _in_window(shows[0], args)
+    else:
+        film_shows(shows, film, size=args.size, view=args.view, fps=args.fps)
+    for name, show in zip(names, shows, strict=True):
+        _report(name, show)
+    if film is not None:
+        print(f"film: {film}")
+    return 0
+
+
+def _size(text: str) -> tuple[int, int]:
+    """
+    Read a size, for argparse.
+
+    :param text: from the command line
+    :return: width and height [pixels]
+    """
+    width, _, height = text.partition("x")
+    if not (width.isdigit() and height.isdigit()):
+        raise argparse.ArgumentTypeError(f"{text!r}: expected WIDTHxHEIGHT, e.g. 1280x720")
+    return int(width), int(height)
+
+
+def _show(game: Game, name: str, args: argparse.Namespace) -> Show:
+    """
+    Decide who drives what.
+
+    :param game: the installation
+    :param name: of a model or a robot
+    :param args: from the command line
+    """
+    from sb3_torcs.models import TrainingRecord, find_model, training_record
+    from sb3_torcs.watching import Show
+
+    robot, record = None, TrainingRecord()
+    if name.partition(":")[0] in game.robots():
+        robot = game.parse_robot(name)
+    elif name != "scripted":
+        record = training_record(_model(find_model, game, name))
+    settings = {key: record.env_kwargs[key] for key in KEPT if key in record.env_kwargs}
+    if args.car is not None:
+        settings["car"] = args.car
+    words = args.robots.split(",") if args.robots else []
+    opponents = [game.parse_robot(word) for word in words]
+    track = args.track or record.env_kwargs.get("track", "aalborg")
+    return Show(game, track, robot, name, settings, opponents, args.laps)
+
+
+def _model(find_model: Any, game: Game, name: str) -> Path:
+    """
+    Find a model, and mention robots if there is none.
+
+    :param find_model: of :mod:`sb3_torcs.models`
+    :param game: the installation
+    :param name: as typed
+    """
+    from sb3_torcs.errors import InvalidOption, near_miss
+
+    try:
+        path: Path = find_model(name)
+        return path
+    except InvalidOption as error:
+        hint = near_miss(name, game.robots())
+        raise InvalidOption(
+            f"{error}; nor is there a robot of this name{hint}".rstrip(";")
+        ) from None
+
+
+def _in_window(show: Show, args: argparse.Namespace) -> None:
+    """
+    Show a race on the user's display.
+
+    :param show: the race
+    :param args: from the command line
+    """
+    from sb3_torcs.display import find_display
+    from sb3_torcs.game_window import Window
+    from sb3_torcs.watching import show_in_window
+
+    display = find_display()
+    window = Window(size=args.size, view=args.view, display=display, driver=show.driver_name)
+    show_in_window(show, window)
+
+
+def _report(name: str, show: Show) -> None:
+    """
+    Say how it ended.
+
+    :param name: of the model or robot
+    :param show: the race
+    """
+    if show.results:
+        show_results(show.results, show.race.drivers[0], str(show.track))
+    elif show.agent is not None and show.agent.end is not None:
+        print(f"{name}: {show.agent.end} after {show.agent.distance:.0f} m")

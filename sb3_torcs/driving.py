@@ -1,0 +1,81 @@
+"""An agent that drives in the game itself, behind the SCR protocol, outside of any training."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from sb3_torcs.models import load_driver
+
+__all__ = ["Agent"]
+
+
+class Agent:
+    """
+    A saved model at the wheel.
+
+    :param model: what :func:`~sb3_torcs.models.load_driver` loads
+    :param settings: of ``Torcs-v0`` with ``backend="scr"``: ``host``, ``port``, ``track`` and so on
+    :param algo: of the model, if that cannot be found out
+    :raises ModelMismatch: if the model does not fit
+    """
+
+    def __init__(self, model: str, settings: Mapping[str, Any], algo: str | None = None) -> None:
+        self.env = gym.make("sb3_torcs:Torcs-v0", backend="scr", max_episode_steps=-1, **settings)
+        self.driver = load_driver(model, self.env, algo)
+        # The first decision of all loads libraries, for which a race has no time.
+        self.driver.predict(np.zeros(self.env.observation_space.shape or (), np.float32))
+        self.lap_times: list[float] = []
+        """[s] of each whole lap."""
+        self.distance = 0.0
+        """[m] driven."""
+        self.end: str | None = None
+        """Why the drive ended, as in ``info``; ``None`` while it goes on, or if the race ended."""
+        self.end_time: float | None = None
+        """[s] of the race when that was."""
+        self.error: BaseException | None = None
+        """What went wrong, where the agent drives in a thread."""
+
+    @property
+    def backend(self) -> Any:
+        """The connection."""
+        return self.env.get_wrapper_attr("backend")
+
+    def drive(self, aftermath: float | None = None) -> None:
+        """
+        Drive to the end of the race.
+
+        :param aftermath: drive on for so long after leaving the road, standing and so on, and then
+            stop [s]; ``None`` drives on whatever happens
+        :raises ServerLost: if the server is gone
+        """
+        try:
+            observation, _ = self.env.reset()
+            while not self.backend.over and not self._has_enough(aftermath):
+                action, _ = self.driver.predict(observation, deterministic=True)
+                observation, _, terminated, _, info = self.env.step(action)
+                self._note(info, terminated)
+        finally:
+            self.env.close()
+
+    def _note(self, info: dict[str, Any], terminated: bool) -> None:
+        """
+        Keep what is told afterwards.
+
+        :param info: of a step
+        :param terminated: whether an episode would be over
+        """
+        self.time = info["car"].time
+        self.distance = info["distance"]
+        if "lap_time" in info:
+            self.lap_times.append(info["lap_time"])
+        if terminated and self.end is None:
+            self.end, self.end_time = info["end"], self.time
+
+    def _has_enough(self, aftermath: float | None) -> bool:
+        if aftermath is None or self.end_time is None:
+            return False
+        return bool(self.time > self.end_time + aftermath)

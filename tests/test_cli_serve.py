@@ -1,0 +1,157 @@
+"""``sb3-torcs serve``: the game for clients of every language, from the first word to the last."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from third_party import ThirdParty
+
+from sb3_torcs.cli import main
+
+pytestmark = pytest.mark.usefixtures("game")
+
+PATIENCE = 60.0  # [s]
+
+
+def free_ports(number=1):
+    """The first of some neighbouring ports that are free now."""
+    for port in range(20000 + os.getpid() % 20000, 60000, 10):
+        sockets = []
+        try:
+            for place in range(number):
+                sockets.append(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+                sockets[-1].bind(("127.0.0.1", port + place))
+            return port
+        except OSError:
+            continue
+        finally:
+            for bound in sockets:
+                bound.close()
+    raise AssertionError("no free port")
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Where everything private goes; nothing may be left in it."""
+    yield tmp_path
+    assert list(tmp_path.glob("sb3-torcs-*")) == []
+
+
+def serve(folder, port, *words):
+    call = [sys.executable, "-m", "sb3_torcs.cli", "serve", "--port", str(port), *words]
+    return subprocess.Popen(
+        call, env={**os.environ, "TMPDIR": str(folder)}, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )  # fmt: skip
+
+
+def games_of(folder):
+    """Processes of the game that run in a folder."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            text = path.read_bytes()
+        except OSError:
+            continue
+        if b"torcs-bin" in text and os.fsencode(folder) in text:
+            found.append(int(path.parent.name))
+    return found
+
+
+def test_a_client_drives_a_race_to_its_end(folder):
+    port = free_ports()
+    process = serve(folder, port, "--track", "a-speedway", "--laps", "1", "--wait")
+    with ThirdParty(port) as client:
+        client.identify()
+        assert client.drive() == b"***shutdown***\0"
+    out, err = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 0, err
+    assert f"awaiting SCR clients at 127.0.0.1, UDP port {port}; the game waits" in out
+    assert f"scr_server 0: {client.answers} decisions, 0 late" in out
+    assert "scr_server 0, car1-trb1, a-speedway" in out
+
+
+def test_two_clients_race_against_a_robot(folder):
+    port = free_ports(2)
+    words = ("--track", "michigan", "--drivers", "2", "--robots", "inferno", "--laps", "1")
+    process = serve(folder, port, *words, "--wait", "--car", "155-DTM")
+    with ThirdParty(port) as one, ThirdParty(port + 1) as other:
+        one.identify()
+        other.identify()
+        last = [b"", b""]
+        while not all(message.startswith(b"***") for message in last):
+            for place, client in enumerate((one, other)):
+                if not last[place].startswith(b"***"):
+                    last[place] = client.drive(1)
+    out, err = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 0, err
+    assert f"UDP ports {port} to {port + 1}" in out
+    assert "race on michigan" in out
+    assert "155-DTM" in out
+    assert "inferno" in out
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_whatever_ends_it_nothing_is_left(folder, number):
+    port = free_ports()
+    process = serve(folder, port, "--wait")
+    with ThirdParty(port) as client:
+        client.identify()
+        client.drive(20)
+        assert len(games_of(folder)) == 1
+        process.send_signal(number)
+        _, err = process.communicate(timeout=PATIENCE)
+        assert process.returncode == (130 if number == signal.SIGINT else -number)
+        if number == signal.SIGINT:
+            assert "sb3-torcs: interrupted" in err
+    deadline = time.monotonic() + PATIENCE  # a game without its owner ends itself
+    while (games_of(folder) or list(folder.iterdir())) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert games_of(folder) == []
+
+
+def test_a_client_that_thinks_too_long_loses_ticks_and_is_told(folder):
+    port = free_ports()
+    process = serve(folder, port, "--track", "a-speedway", "--laps", "1", "--deadline", "2")
+    with ThirdParty(port) as client:
+        client.identify()
+        client.drive(40, think=0.012)
+        client.drive()
+    out, err = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 0, err
+    assert "2 ms per answer" in out
+    (line,) = [line for line in out.splitlines() if line.startswith("scr_server 0:")]
+    decisions, late = (int(word) for word in line.split() if word.isdigit())
+    assert late >= 40
+    assert decisions > client.answers
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--deadline", "0"], "--deadline is 0 ms; expected more than 0, or --wait"),
+        (["--drivers", "11"], "scr_server has no driver 10; expected 0 to 9"),
+        (["--track", "forzza"], "no track 'forzza'; did you mean 'forza'?"),
+        (["--robots", "infernal"], "no robot 'infernal'; did you mean 'inferno'?"),
+        (["--car", "car1-trb9"], "no car 'car1-trb9'; did you mean"),
+        (["--port", "65530", "--drivers", "9"], "ports end at 65535"),
+    ],
+)
+def test_what_cannot_be_served(words, message, capsys):
+    assert main(["serve", *words]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_a_port_that_is_taken_is_named(capsys):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        port = taken.getsockname()[1]
+        assert main(["serve", "--port", str(port)]) == 2
+    assert f"UDP port {port} at 127.0.0.1 cannot be had" in capsys.readouterr().err
