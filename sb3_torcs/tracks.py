@@ -10,6 +10,7 @@ from __future__ import annotations
 import functools
 import math
 import os
+from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -187,6 +188,12 @@ class Track:
         table.setflags(write=False)
         return table
 
+    @functools.cached_property
+    def _starts(self) -> list[float]:
+        """Where the segments begin [m]; a list, since one number is found in it faster."""
+        starts: list[float] = self.table[:, START].tolist()
+        return starts
+
     def find(self, distance: float) -> tuple[int, float]:
         """
         Find the segment at a place.
@@ -195,8 +202,8 @@ class Track:
         :return: index of the segment, and how far along it the place is [m]
         """
         distance %= self.length
-        index = int(np.searchsorted(self.table[:, START], distance, side="right")) - 1
-        return index, distance - float(self.table[index, START])
+        index = bisect_right(self._starts, distance) - 1
+        return index, distance - self._starts[index]
 
     def pose(self, distance: float, offset: float = 0.0) -> Pose:
         """
@@ -217,9 +224,8 @@ class Track:
         :param offset: from the axis, left positive [m]
         :return: x [m], y [m] and the axis' heading there [rad]
         """
-        segment = self.table[index]
-        begin = Pose(*(float(value) for value in segment[X:WIDTH_START]))
-        on_axis = _advance(begin, along, float(segment[CURVATURE]))
+        curvature, *begin = self.table[index, CURVATURE:WIDTH_START].tolist()
+        on_axis = _advance(Pose(*begin), along, curvature)
         return Pose(
             on_axis.x - offset * math.sin(on_axis.heading),
             on_axis.y + offset * math.cos(on_axis.heading),

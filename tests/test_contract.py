@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import pickle
 import subprocess
 import sys
 import warnings
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -24,11 +26,22 @@ from sb3_torcs.drivers import ScriptedDriver
 from sb3_torcs.errors import BackendUnavailable
 from sb3_torcs.sensors import encode
 
-WORLDS = ["TorcsLite-v0", "Torcs-v0"]
+
+class World(NamedTuple):
+    """An id, and the options that choose the world behind it."""
+
+    id: str
+    options: dict[str, Any] = {}  # noqa: RUF012
+
+    def make(self, **options):
+        return gym.make(self.id, **self.options, **options)
+
+
+WORLDS = [World("TorcsLite-v0"), World("Torcs-v0"), World("Torcs-v0", {"backend": "scr"})]
 
 ROLLOUT = """
-import sys, hashlib, gymnasium as gym, numpy as np, sb3_torcs
-env = gym.make(sys.argv[1], start="random")
+import sys, json, hashlib, gymnasium as gym, numpy as np, sb3_torcs
+env = gym.make(sys.argv[1], start="random", **json.loads(sys.argv[2]))
 env.action_space.seed(7)
 digest = hashlib.sha256(env.reset(seed=7)[0].tobytes())
 for _ in range(300):
@@ -40,16 +53,16 @@ print(digest.hexdigest())
 """
 
 
-@pytest.fixture(params=WORLDS)
+@pytest.fixture(params=WORLDS, ids=lambda world: "-".join((world.id, *world.options.values())))
 def world(request):
-    if request.param == "Torcs-v0":
+    if request.param.id == "Torcs-v0":
         request.getfixturevalue("game")  # which fails where there is none
     return request.param
 
 
 def rollout(world, seed, steps=300, **options):
     """Drive with seeded random actions; return everything that was seen."""
-    env = gym.make(world, **options)
+    env = world.make(**options)
     env.action_space.seed(seed)
     seen = [env.reset(seed=seed)]
     for _ in range(steps):
@@ -69,7 +82,7 @@ def assert_equal(first, second):
 def test_gymnasium_finds_nothing_to_warn_of(world):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        env = gym.make(world, render_mode="rgb_array")
+        env = world.make(render_mode="rgb_array")
         check_gymnasium(env.unwrapped)
         env.close()
 
@@ -78,7 +91,7 @@ def test_stable_baselines3_finds_nothing_to_warn_of(world):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.filterwarnings("ignore", message="We recommend you to use a symmetric")
-        env = gym.make(world)
+        env = world.make()
         check_sb3(env.unwrapped)
         env.close()
 
@@ -91,7 +104,7 @@ def test_the_same_seed_gives_the_same_bytes(world, start):
 def test_the_same_seed_gives_the_same_bytes_in_another_process(world):
     def digest(hash_seed):
         return subprocess.run(
-            [sys.executable, "-c", ROLLOUT, world],
+            [sys.executable, "-c", ROLLOUT, world.id, json.dumps(world.options)],
             capture_output=True,
             text=True,
             check=True,
@@ -99,7 +112,7 @@ def test_the_same_seed_gives_the_same_bytes_in_another_process(world):
         ).stdout
 
     namespace = {}
-    argv, sys.argv = sys.argv, ["", world]
+    argv, sys.argv = sys.argv, ["", world.id, json.dumps(world.options)]
     try:
         exec(ROLLOUT.replace("print(", "result = ("), namespace)
     finally:
@@ -115,7 +128,7 @@ def test_another_seed_gives_another_drive(world):
 
 def test_environments_side_by_side_do_not_share_state(world):
     alone = rollout(world, 5, 100)
-    first, second = gym.make(world), gym.make(world)
+    first, second = world.make(), world.make()
     first.action_space.seed(5)
     seen = [first.reset(seed=5)]
     second.reset(seed=99)
@@ -131,7 +144,7 @@ def test_environments_side_by_side_do_not_share_state(world):
 
 
 def test_observations_stay_in_their_space(world):
-    env = gym.make(world)
+    env = world.make()
     for answer in rollout(world, 11, 500, start="random"):
         assert env.observation_space.contains(answer[0]), answer[0]
 
@@ -144,14 +157,14 @@ def test_an_observation_is_what_the_sensor_table_makes_of_the_car(world):
 
 def test_no_checker_stands_between_the_agent_and_the_world(world):
     """It would be asked at every step; both libraries' checks above look at more."""
-    env = gym.make(world)
+    env = world.make()
     while env is not env.unwrapped:
         assert not isinstance(env, PassiveEnvChecker)
         env = env.env
 
 
 def test_no_memory_is_shared_between_steps(world):
-    env = gym.make(world)
+    env = world.make()
     first, info = env.reset(seed=0)
     kept, car = first.copy(), info["car"]
     beams = car.range_finders.copy()
@@ -164,7 +177,7 @@ def test_no_memory_is_shared_between_steps(world):
 
 
 def test_no_sensor_is_dead(world):
-    driver, env = ScriptedDriver(), gym.make(world, start="random")
+    driver, env = ScriptedDriver(), world.make(start="random")
     rows = []
     for seed in range(4):
         observation, _ = env.reset(seed=seed)
@@ -188,7 +201,7 @@ def test_info_has_what_it_promises(world):
 
 def test_actions_out_of_range_are_clipped(world):
     def first_step(action):
-        env = gym.make(world, disable_env_checker=True)
+        env = world.make(disable_env_checker=True)
         env.reset(seed=0)
         return env.step(np.array(action, np.float32))[:2]
 
@@ -196,14 +209,14 @@ def test_actions_out_of_range_are_clipped(world):
 
 
 def test_a_closed_environment_can_be_closed_again(world):
-    env = gym.make(world)
+    env = world.make()
     env.reset()
     env.close()
     env.close()
 
 
 def test_a_pickled_environment_goes_on_where_it_was(world):
-    env = gym.make(world, render_mode="rgb_array", start="random").unwrapped
+    env = world.make(render_mode="rgb_array", start="random").unwrapped
     env.reset(seed=0)
     action = np.array([0.02, 0.6, 0.0], np.float32)
     for _ in range(5):
@@ -217,7 +230,7 @@ def test_a_pickled_environment_goes_on_where_it_was(world):
 
 def test_action_repeat_holds_the_controls(world):
     action = np.array([0.05, 0.8, 0.0], np.float32)
-    fine, coarse = gym.make(world, action_repeat=1), gym.make(world, action_repeat=5)
+    fine, coarse = world.make(action_repeat=1), world.make(action_repeat=5)
     fine.reset(seed=0)
     coarse.reset(seed=0)
     for _ in range(5):
@@ -233,9 +246,11 @@ def test_vector_environments_drive_as_one_alone(world, kind):
         if kind == "dummy"
         else {"vec_env_cls": SubprocVecEnv, "vec_env_kwargs": {"start_method": kind}}
     )
-    vector = make_vec_env(f"sb3_torcs:{world}", n_envs=2, seed=5, **choice)
+    vector = make_vec_env(
+        f"sb3_torcs:{world.id}", n_envs=2, seed=5, env_kwargs=world.options, **choice
+    )
     try:
-        single = gym.make(world)
+        single = world.make()
         observations, expected = vector.reset(), single.reset(seed=6)[0]
         np.testing.assert_array_equal(observations[1], expected)
         action = np.array([0.1, 0.7, 0.0], np.float32)
@@ -250,7 +265,7 @@ def test_vector_environments_drive_as_one_alone(world, kind):
 def test_nothing_graphical_loads_before_the_first_picture(world):
     code = (
         "import sys, gymnasium as gym\n"
-        f"env = gym.make('sb3_torcs:{world}', render_mode='rgb_array')\n"
+        f"env = gym.make('sb3_torcs:{world.id}', render_mode='rgb_array', **{world.options})\n"
         "env.reset(seed=0); env.step(env.action_space.sample())\n"
         "print([m for m in ('pygame', 'matplotlib', 'highway_env', 'torch') if m in sys.modules])"
     )
@@ -275,11 +290,11 @@ def test_the_real_game_is_never_replaced_in_silence(monkeypatch):
 
 def test_a_model_of_one_world_drives_in_the_other():
     """They share their spaces to the bit; so a policy of one loads in the other."""
-    lite, real = (gym.make(world, track="g-track-1") for world in WORLDS)
-    assert lite.observation_space == real.observation_space
-    assert lite.action_space == real.action_space
+    envs = [world.make(track="g-track-1") for world in WORLDS]
     driver = ScriptedDriver()
-    for env in (lite, real):
+    for env in envs:
+        assert env.observation_space == envs[0].observation_space
+        assert env.action_space == envs[0].action_space
         observation, _ = env.reset(seed=0)
         for _ in range(100):
             observation, *_, info = env.step(driver.predict(observation)[0])

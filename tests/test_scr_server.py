@@ -197,7 +197,7 @@ class TestTexts:
         assert _engine.scr_parse_action(text) == expected
 
     def test_an_introduction(self):
-        angles, start = _engine.scr_parse_init(
+        angles, start, _exact = _engine.scr_parse_init(
             b"SCR(init " + b" ".join(b"%d" % i for i in range(19)) + b")"
         )
         assert angles == [math.radians(i) for i in range(19)]
@@ -205,7 +205,7 @@ class TestTexts:
 
     @pytest.mark.parametrize("text", [b"SCR", b"SCR(init)", b"SCR(init 1 2 3)", b"SCR(init x)"])
     def test_an_introduction_without_angles(self, text):
-        angles, _ = _engine.scr_parse_init(text)
+        angles, *_ = _engine.scr_parse_init(text)
         assert angles == [math.radians(i) for i in range(-90, 91, 10)]
 
     def test_an_introduction_with_a_start(self):
@@ -225,7 +225,7 @@ class TestTexts:
             assert 0.0 <= clutch <= 1.0
             assert -1.0 <= steering <= 1.0
             assert -1 <= gear <= 8
-            angles, _start = _engine.scr_parse_init(text)
+            angles, *_ = _engine.scr_parse_init(text)
             assert len(angles) == 19
             assert all(math.isfinite(angle) for angle in angles)
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from sb3_torcs.backends.lite import LiteBackend
 from sb3_torcs.envs.racing import RacingEnv
+from sb3_torcs.errors import InvalidOption
 from sb3_torcs.tracks import Track
 
 __all__ = ["TorcsLiteEnv"]
@@ -62,6 +63,11 @@ class TorcsLiteEnv(RacingEnv):
         laps: int | None = None,
         render_mode: str | None = None,
     ) -> None:
+        if render_mode == "game":
+            raise InvalidOption(
+                "render_mode is 'game', which draws the game's own picture: that is for Torcs-v0; "
+                "expected None, 'rgb_array' or 'human'"
+            )
         super().__init__(
             LiteBackend(track, car=car, range_finders=range_finders),
             reward=reward,

@@ -64,6 +64,11 @@ class TorcsVectorEnv(SyncVectorEnv):
             raise InvalidOption(f"num_envs is {num_envs!r}; expected a whole number >= 1")
         if threads is not None and not is_count(threads):
             raise InvalidOption(f"threads is {threads!r}; expected a whole number >= 1, or None")
+        if options.get("backend", "native") != "native":
+            raise InvalidOption(
+                f"backend is {options['backend']!r}; races on threads are for backend 'native', "
+                "others drive with gym.make_vec(..., vectorization_mode='async')"
+            )
         registered = gym.spec("Torcs-v0").max_episode_steps or NO_LIMIT
         limit = registered if max_episode_steps is None else max_episode_steps
         if not is_count(limit) and limit != NO_LIMIT:

@@ -145,13 +145,14 @@ private:
 void bind_scr(py::module_& module) {
     module.def(
         "scr_format_state",
-        [](const std::array<double, scr::STATE_NUMBERS>& numbers) {
+        [](const std::array<double, scr::STATE_NUMBERS>& numbers, bool exact) {
             scr::State state;
             std::memcpy(&state, numbers.data(), sizeof state);
             char text[scr::LONGEST_STATE];
-            return py::bytes(text, scr::format_state(state, text));
+            return py::bytes(text, scr::format_state(state, exact, text));
         },
-        "numbers"_a, "Write a state: its numbers in the order of the protocol, SI.");
+        "numbers"_a, "exact"_a = false,
+        "Write a state: its numbers in the order of the protocol, SI; with six digits or all.");
     module.def(
         "scr_parse_action",
         [](const py::bytes& text) {
@@ -168,9 +169,9 @@ void bind_scr(py::module_& module) {
             if (init.start)
                 start = py::make_tuple(init.start->distance, init.start->track_position,
                                        init.start->heading_error, init.start->speed);
-            return py::make_tuple(init.angles, start);
+            return py::make_tuple(init.angles, start, init.exact);
         },
-        "text"_a, "Read how a client introduces itself: its angles, and its start or None.");
+        "text"_a, "Read how a client introduces itself: angles, start or None, whether it wants all digits.");
 }
 
 }  // namespace

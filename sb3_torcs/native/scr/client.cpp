@@ -120,8 +120,8 @@ std::optional<Action> Client::ask(const State& state) {
 }
 
 void Client::tell(const State& state) {
-    state_size_ = format_state(state, state_);
-    lap_time_ = as_written(state.lap_time);
+    state_size_ = format_state(state, init_.exact, state_);
+    lap_time_ = as_written(state.lap_time, init_.exact);
     send_state();
 }
 

@@ -84,17 +84,21 @@ void for_each_tag(std::string_view text, Use use) {
     }
 }
 
+char* write(double number, bool exact, char* begin, char* end) {
+    const auto general = std::chars_format::general;
+    return exact ? std::to_chars(begin, end, number, general).ptr
+                 : std::to_chars(begin, end, number, general, DIGITS).ptr;
+}
+
 }  // namespace
 
-double as_written(double number) {
+double as_written(double number, bool exact) {
     char text[32];
-    const auto end =
-        std::to_chars(text, text + sizeof text, number, std::chars_format::general, DIGITS).ptr;
-    std::from_chars(text, end, number);
+    std::from_chars(text, write(number, exact, text, text + sizeof text), number);
     return number;
 }
 
-std::size_t format_state(const State& state, char (&text)[LONGEST_STATE]) {
+std::size_t format_state(const State& state, bool exact, char (&text)[LONGEST_STATE]) {
     char* end = text;
     const auto value = reinterpret_cast<const char*>(&state);
     std::size_t offset = 0;
@@ -106,9 +110,7 @@ std::size_t format_state(const State& state, char (&text)[LONGEST_STATE]) {
             double number;
             std::memcpy(&number, value + offset, sizeof number);
             *end++ = ' ';
-            end = std::to_chars(end, text + LONGEST_STATE, number * tag.scale,
-                                std::chars_format::general, DIGITS)
-                      .ptr;
+            end = write(number * tag.scale, exact, end, text + LONGEST_STATE);
         }
         *end++ = ')';
     }
@@ -147,6 +149,7 @@ Init parse_init(std::string_view text) {
         if (tag == "init" && numbers(rest, angles) == angles.size()) degrees = angles;
         if (tag == "start" && numbers(rest, start) == start.size())
             init.start = Start{start[0], start[1], start[2], start[3]};
+        if (tag == "digits") init.exact = number(next_word(rest)).value_or(DIGITS) > DIGITS;
     });
     for (std::size_t i = 0; i < degrees.size(); i++) init.angles[i] = degrees[i] * RADIANS;
     return init;

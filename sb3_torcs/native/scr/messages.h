@@ -15,7 +15,7 @@
 namespace torcs::scr {
 
 constexpr int STATE_NUMBERS = 79;
-constexpr std::size_t LONGEST_STATE = 2048;    // [bytes] 79 numbers of 13 characters, and 19 tags
+constexpr std::size_t LONGEST_STATE = 4096;    // [bytes] 79 numbers of 25 characters, and 19 tags
 constexpr std::size_t LONGEST_MESSAGE = 4096;  // [bytes] that a client may send
 
 constexpr std::string_view IDENTIFIED = "***identified***";
@@ -62,14 +62,15 @@ struct Action {
 struct Init {
     std::array<double, 19> angles;  // [rad] of range finders, left negative
     std::optional<Start> start{};  // not on the grid (an extension)
+    bool exact = false;            // states shall have all digits (an extension)
 };
 
 // Writes the state with its closing zero; returns the length with it. Six significant digits, as
-// C++ streams write them.
-std::size_t format_state(const State& state, char (&text)[LONGEST_STATE]);
+// C++ streams write them; or as many as it takes to read the very numbers.
+std::size_t format_state(const State& state, bool exact, char (&text)[LONGEST_STATE]);
 
 // What a client reads where a number is written.
-double as_written(double number);
+double as_written(double number, bool exact);
 
 // Every text has a meaning: tags in any order, what is missing or no number takes its default,
 // what is out of range is clipped, what is unknown is ignored.

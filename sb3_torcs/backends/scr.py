@@ -1,0 +1,323 @@
+"""The game itself behind an environment: a process of its own, driven by the SCR protocol."""
+
+from __future__ import annotations
+
+import os
+from array import array
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sb3_torcs.backends.native import AGENT, starting_list, track_path
+from sb3_torcs.backends.scr_car import CarReader
+from sb3_torcs.backends.scr_gearbox import read_gearbox
+from sb3_torcs.car import CONTROL_TICK, CarState, Controls, Start, is_count
+from sb3_torcs.errors import EngineForked, GameFailed, GameTimeout, InvalidOption, ServerLost
+from sb3_torcs.game import find_game
+from sb3_torcs.game_process import GameProcess, compiled_library
+from sb3_torcs.race_file import MANY_LAPS, SCR_SERVER, RaceSetup
+from sb3_torcs.scr_client import ScrClient
+from sb3_torcs.scr_game import SCR_PORT, open_ports, start_server
+from sb3_torcs.scr_protocol import ScrAction, format_action, parse_engine, parse_state
+from sb3_torcs.sensors import range_finder_angles
+from sb3_torcs.tracks import Track, load_track
+
+__all__ = ["ScrBackend"]
+
+DRIVER = (SCR_SERVER, 0)
+MAX_PORT = 65535
+HOST = "127.0.0.1"
+PATIENCE = 60.0  # [s] with a game of our own, which also has to load on a busy machine
+PATIENCE_WITH_OTHERS = 10.0  # [s] with a server that should be there already
+PAUSE = 0.02  # [s] before an action is said again to our own server, which knows it again
+GRACE = 5.0  # [s] for a game whose port is closed to have ended
+STANDING = Controls(0.0, 0.0, 1.0, 0)  # until the race begins: as the cars of the engine do
+
+
+class ScrBackend:
+    """
+    One agent in the stock game with our driver module, or on any SCR server.
+
+    The server's sensors have six digits. What it does not say is worked out: the place by the
+    track, the yaw rate by what was turned during a step, laps and times by its lap clock. The best
+    lap time is that of any whole lap, also with a cut corner or a touched wall.
+
+    :param track: ``"aalborg"``, ``"road/aalborg"``, or the path of a TORCS XML file; that of the
+        server, if one is named
+    :param car: any of the game's; that of the server, if one is named
+    :param range_finders: see :func:`sb3_torcs.sensors.range_finder_angles`
+    :param opponents: robots, e.g. ``("inferno", "berniw:3")``
+    :param laps: of the race with opponents, who take fuel for so many; ``None`` drives on
+    :param grid_place: of the agent among them, 1 in front; ``None`` is behind them all
+    :param host: of a server that runs already; ``None`` starts a game
+    :param port: of the driver there; ``None`` is the first one, 3001
+    """
+
+    def __init__(
+        self,
+        track: str | Path = "aalborg",
+        *,
+        car: str = "car1-trb1",
+        range_finders: str | Sequence[float] = "scr",
+        opponents: Sequence[str] = (),
+        laps: int | None = None,
+        grid_place: int | None = None,
+        host: str | None = None,
+        port: int | None = None,
+    ) -> None:
+        self._settings: dict[str, Any] = {
+            "track": track,
+            "car": car,
+            "range_finders": range_finders,
+            "opponents": opponents,
+            "laps": laps,
+            "grid_place": grid_place,
+            "host": host,
+            "port": port,
+        }
+        self._own = host is None
+        self._address = (HOST if host is None else host, SCR_PORT if port is None else port)
+        game = self._game = find_game()
+        self.car = car
+        self.range_finder_angles = range_finder_angles(range_finders)
+        self._gearbox = read_gearbox(game.find_car(car))
+        self.track: Track = load_track(track_path(game, track))
+        entries = starting_list(game, opponents, grid_place)
+        if self._own:
+            compiled_library("_scr_server")  # what is not built is told now, not at a reset
+        if not self._own and (len(entries) > 1 or grid_place is not None):
+            raise InvalidOption(
+                f"opponents and grid_place are those of the race at {host}; name them there, e.g. "
+                "`sb3-torcs serve --robots inferno`, or leave out host"
+            )
+        if self._own and port is not None:
+            raise InvalidOption(f"port is {port!r}, of no host; add host='localhost'")
+        if not is_count(self._address[1]) or self._address[1] > MAX_PORT:
+            raise InvalidOption(f"port is {port!r}; expected 1 to {MAX_PORT}")
+        self._race = RaceSetup(
+            track,
+            [DRIVER if entry == AGENT else entry for entry in entries],
+            laps=laps if len(entries) > 1 and laps else MANY_LAPS,
+            session="race" if len(entries) > 1 else "practice",
+            car=car,
+        )
+        self._process: GameProcess | None = None
+        self._client: ScrClient | None = None
+        self._reader = CarReader(self.track)
+        self.lost_ticks = 0
+        """Control ticks that went by between two states: answers came too late for them."""
+        self.latencies = array("d")
+        """From the arrival of each state to our answer [s], at a host of its own."""
+        self._owner = os.getpid()
+        self._drive: list[Any] = []  # since the reset, so that a copy can follow
+
+    def reset(self, rng: np.random.Generator, start: Start | None) -> CarState:
+        """Begin an episode; see :class:`~sb3_torcs.backends.base.Backend`."""
+        del rng  # there is no chance in the game
+        if start is not None and not self._own:
+            raise InvalidOption(
+                "a race at a host of its own begins on the grid; use start='grid' and no options "
+                "of reset, or leave out host"
+            )
+        self._check_owner()
+        self._drive = [start]
+        try:
+            self._connect(start)
+            self._message = self._first_state(start)
+            self._state = self._reader.begin(parse_state(self._message))
+        except BaseException:
+            self._hang_up()
+            raise
+        return self._state
+
+    def step(self, controls: Controls, ticks: int) -> CarState:
+        """Drive on; see :class:`~sb3_torcs.backends.base.Backend`."""
+        self._check_owner()
+        client = self._client
+        if client is None:
+            raise ServerLost("the game is not there; call reset, which begins anew")
+        self._drive.append((controls, ticks))
+        try:
+            if self._hold(client, controls, ticks):
+                self._state = self._reader.read(parse_state(self._message), ticks)
+            else:
+                self._state = _standing(self._state, ticks)
+        except ServerLost as error:
+            failure = self._failure(error)
+            self._hang_up()
+            raise failure from error
+        except BaseException:  # Ctrl-C comes between two messages
+            self._hang_up()
+            raise
+        return self._state
+
+    @property
+    def over(self) -> bool:
+        """Whether the race has ended, or has not begun; a car in it stands then."""
+        return self._client is None or self._client.over
+
+    def close(self) -> None:
+        """End the game, or leave the server."""
+        self._hang_up()
+
+    def __getstate__(self) -> dict[str, Any]:
+        if not self._own and self._drive:
+            raise InvalidOption(
+                f"a race at {self._settings['host']} cannot be driven twice; make another "
+                "environment, with another port"
+            )
+        # A game of our own is deterministic, so that what was done says all.
+        return {"settings": self._settings, "drive": self._drive}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(**state["settings"])  # type: ignore[misc]
+        if not state["drive"]:
+            return
+        start, *steps = state["drive"]
+        self.reset(np.random.default_rng(), start)
+        for controls, ticks in steps:
+            self.step(controls, ticks)
+
+    def _connect(self, start: Start | None) -> None:
+        """
+        Bring the race to where it begins: by a restart where there is one, else by a new game.
+
+        :param start: as of ``reset``
+        """
+        if self._client is not None and not self._client.over:
+            try:
+                self._client.restart(start)
+            except (GameFailed, ServerLost):
+                if not self._own:
+                    raise
+            else:
+                return
+        self._hang_up()
+        if self._own:
+            self._launch()
+        host, port = self._address
+        manners: dict[str, Any] = {"patience": PATIENCE_WITH_OTHERS, "latencies": self.latencies}
+        if self._own:
+            manners = {"patience": PATIENCE, "pause": PAUSE, "watch": self._watch, "exact": True}
+        self._client = ScrClient(host, port, self.range_finder_angles, **manners)
+        self._client.identify(start)
+
+    def _launch(self) -> None:
+        """Start a game of our own, on any port that is free."""
+        sockets = open_ports(1)
+        try:
+            self._process = start_server(self._game, self._race, sockets)
+            self._address = sockets[0].getsockname()
+        finally:
+            for bound in sockets:
+                bound.close()
+
+    def _watch(self) -> None:
+        """Raise if the game of our own has ended."""
+        if self._process is not None and self._process.poll() is not None:
+            raise GameFailed(f"{self._process.epitaph()}; call reset to begin anew")
+
+    def _failure(self, error: ServerLost) -> Exception:
+        """
+        Say what has happened to a server that is lost.
+
+        :param error: as the client sees it
+        :return: what to raise
+        """
+        if self._process is None:
+            return error
+        with suppress(GameTimeout, GameFailed):
+            self._process.wait(GRACE)  # its port closes a moment before it has ended
+        return GameFailed(f"{self._process.epitaph()}; call reset to begin anew")
+
+    def _first_state(self, start: Start | None) -> bytes:
+        """
+        Wait on the brake until the race begins.
+
+        :param start: as of ``reset``; there is no countdown but on the grid
+        """
+        client = self._client
+        assert client is not None, "_connect makes it"
+        while (message := client.receive()) is not None:
+            lap_time = parse_engine(message).lap_time
+            if lap_time >= 0.0:
+                self._answered = lap_time
+                return message
+            if start is not None:
+                raise InvalidOption(
+                    f"the game begins on the grid instead of at {start}: a car would stand in a "
+                    "wall or in another car there; start elsewhere, or nearer to the middle of the "
+                    "road"
+                )
+            client.send(_action(STANDING, 0, lap_time))
+        raise ServerLost(f"the race at {client.address} ended before it began; call reset again")
+
+    def _hold(self, client: ScrClient, controls: Controls, ticks: int) -> bool:
+        """
+        Drive one tick after the other; the last message is that of the new state.
+
+        :param client: our side of the conversation
+        :param controls: as of ``step``
+        :param ticks: as of ``step``
+        :return: whether the race went on so long
+        """
+        for _ in range(ticks):
+            if client.over:
+                return False
+            lap_time, gear, speed = parse_engine(self._message)
+            self.lost_ticks += max(round((lap_time - self._answered) / CONTROL_TICK) - 1, 0)
+            self._answered = lap_time
+            gear = self._gearbox.choose(gear, speed) if controls.gear is None else controls.gear
+            client.send(_action(controls, gear, lap_time))
+            message = client.receive()
+            if message is None:
+                return False
+            self._message = message
+        return True
+
+    def _hang_up(self) -> None:
+        """Leave the server, and end the game if it is ours."""
+        if self._client is not None:
+            self._client.close()
+            self._client = None
+        if self._process is not None:
+            self._process.stop()
+            self._process = None
+
+    def _check_owner(self) -> None:
+        """Raise in a child process, which would talk in between."""
+        if os.getpid() != self._owner:
+            raise EngineForked(
+                "this game belongs to the parent process; make the environment after the fork"
+            )
+
+
+def _action(controls: Controls, gear: int, lap_time: float) -> bytes:
+    """
+    Write an action.
+
+    :param controls: what was asked for
+    :param gear: chosen
+    :param lap_time: of the state that is answered [s]
+    """
+    steering, throttle, brake, _ = controls
+    return format_action(ScrAction(steering, throttle, brake, gear, focus=None, lap_time=lap_time))
+
+
+def _standing(state: CarState, ticks: int) -> CarState:
+    """
+    Let a car stand that has been taken out of the race.
+
+    :param state: the last one that was told
+    :param ticks: that pass
+    """
+    return state._replace(
+        time=state.time + ticks * CONTROL_TICK,
+        yaw_rate=0.0,
+        speed_x=0.0,
+        speed_y=0.0,
+        speed_z=0.0,
+    )

@@ -1,0 +1,443 @@
+"""``Torcs-v0`` over the SCR protocol: the same drive, and what happens when things break."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import os
+import pickle
+import runpy
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from scr_loopback import Errant, Loopback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import SubprocVecEnv
+
+from sb3_torcs.backends import scr
+from sb3_torcs.backends.native import NativeBackend
+from sb3_torcs.backends.scr import ScrBackend
+from sb3_torcs.backends.scr_gearbox import read_gearbox
+from sb3_torcs.car import Controls, Start
+from sb3_torcs.drivers import ScriptedDriver
+from sb3_torcs.errors import (
+    CarFileError,
+    EngineForked,
+    GameFailed,
+    InvalidOption,
+    ServerLost,
+    ServerNotFound,
+    TrackNotFound,
+    UnknownCar,
+    UnknownRobot,
+)
+
+pytestmark = pytest.mark.usefixtures("game")
+
+STRAIGHT_ON = Controls(0.0, 0.5, 0.0)
+COMPARE = runpy.run_path(str(Path(__file__).parent.parent / "examples" / "compare_scr.py"))
+
+
+def rng():
+    return np.random.default_rng(0)
+
+
+@pytest.fixture
+def backend():
+    """A world of its own on a short track, with the game already there."""
+    with contextlib.closing(ScrBackend("g-track-1")) as world:
+        world.reset(rng(), None)
+        yield world
+
+
+def gone(pid, seconds=5.0):
+    """Whether a process ends in time."""
+    for _ in range(int(seconds / 0.05)):
+        try:
+            stat = Path(f"/proc/{pid}/stat").read_text()
+        except FileNotFoundError:
+            return True
+        if stat.rpartition(")")[2].split()[0] == "Z":
+            return True
+        time.sleep(0.05)
+    return False
+
+
+# ---- The same drive ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("track", "start"), [("g-track-1", "grid"), ("dirt-1", Start(300.0, -0.4, 0.1, 25.0))]
+)
+def test_a_lap_is_that_of_the_engine_to_six_digits(track, start):
+    repeated, by_itself = COMPARE["compare"](
+        track, ScriptedDriver(), None if start == "grid" else start
+    )
+    assert repeated.decisions > 300
+    assert repeated.equal
+    assert repeated.laps[0]
+    assert by_itself.equal
+    assert by_itself.same_decisions == by_itself.decisions
+
+
+@pytest.mark.parametrize("start", [None, Start(100.0, 0.3, -0.1, 30.0)])
+def test_a_car_is_that_of_the_engine(start):
+    native, over_scr = NativeBackend("alpine-1"), ScrBackend("alpine-1")
+    worlds = (native, over_scr)
+    cars = [world.reset(rng(), start) for world in worlds]
+    controls = Controls(0.01, 0.9, 0.0)
+    for _ in range(60):
+        one, other = (car._asdict() for car in cars)
+        # By difference here; and the game's frame is up to a third of a metre beside the track's.
+        tolerances = {"yaw_rate": 0.2, "x": 0.4, "y": 0.4, "yaw": 1e-3}
+        tolerances |= {"distance_from_start": 0.006, "distance_raced": 0.006}  # six digits
+        for name, tolerance in tolerances.items():
+            assert other.pop(name) == pytest.approx(one.pop(name), abs=tolerance), name
+        one["time"] = one["lap_time"]  # the engine's clock is one step ahead at the start
+        for name, value in one.items():
+            np.testing.assert_allclose(other[name], value, rtol=1e-5, atol=2e-5, err_msg=name)
+        cars = [world.step(controls, 3) for world in worlds]
+    native.close()
+    over_scr.close()
+
+
+@pytest.mark.parametrize("name", ["car1-trb1", "car1-ow1", "155-DTM", "p406"])
+def test_the_gearbox_shifts_as_that_of_the_engine(name):
+    native, over_scr = NativeBackend("michigan", car=name), ScrBackend("michigan", car=name)
+    for world in (native, over_scr):
+        world.reset(rng(), Start(100.0, 0.0, 0.0, 15.0))
+    gears = []
+    for tick in range(800):
+        controls = Controls(0.0, 0.8, 0.0) if tick < 600 else Controls(0.0, 0.0, 0.3)
+        cars = [world.step(controls, 1) for world in (native, over_scr)]
+        assert cars[0].gear == cars[1].gear, tick
+        gears.append(cars[0].gear)
+    assert len(set(gears)) >= 4
+    native.close()
+    over_scr.close()
+
+
+def test_opponents_race_as_in_the_engine():
+    options = {"opponents": ("inferno", "berniw"), "grid_place": 1, "laps": 2}
+    native, over_scr = NativeBackend("aalborg", **options), ScrBackend("aalborg", **options)
+    cars = [world.reset(rng(), None) for world in (native, over_scr)]
+    seen = set()
+    for _ in range(100):
+        np.testing.assert_allclose(cars[0].opponents, cars[1].opponents, rtol=1e-5)
+        assert cars[0].race_position == cars[1].race_position
+        seen.add(cars[0].race_position)
+        cars = [world.step(Controls(0.0, 0.3, 0.0), 5) for world in (native, over_scr)]
+    assert len(seen) > 1
+    native.close()
+    over_scr.close()
+
+
+def test_a_lost_or_doubled_datagram_changes_nothing(backend):
+    def drive():
+        cars = [backend.reset(rng(), Start(50.0, 0.0, 0.0, 20.0))]
+        cars += [backend.step(Controls(0.001 * n, 0.6, 0.0), 3) for n in range(60)]
+        return [(car.x, car.y, car.time, *car.range_finders) for car in cars]
+
+    alone = drive()
+    with Errant(backend._address) as network:
+        backend._client.close()
+        backend._client = scr.ScrClient(
+            network.host, network.port, backend.range_finder_angles, pause=scr.PAUSE
+        )
+        backend._client.identify()
+        backend._client.receive()
+        for _ in range(2):
+            assert drive() == alone
+    assert network.lost > 10
+    assert network.doubled > 10
+
+
+# ---- Options -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"track": "nowhere"}, TrackNotFound, "nowhere"),
+        ({"car": "trabant"}, UnknownCar, "trabant"),
+        ({"opponents": ["nobody"]}, UnknownRobot, "nobody"),
+        ({"opponents": "inferno"}, InvalidOption, "expected a list of names"),
+        ({"grid_place": 2}, InvalidOption, "expected 1 to 1"),
+        ({"sensor_noise": True}, InvalidOption, "-noisy"),
+        ({"port": 3001}, InvalidOption, "add host='localhost'"),
+        ({"host": "localhost", "port": 99999}, InvalidOption, "expected 1 to 65535"),
+        ({"host": "localhost", "opponents": ["inferno"]}, InvalidOption, "serve --robots"),
+        ({"backend": "native", "host": "localhost"}, InvalidOption, "add backend='scr'"),
+        ({"render_mode": "game"}, InvalidOption, "--window"),
+    ],
+)
+def test_what_cannot_be_is_told_before_anything_starts(options, error, message):
+    with pytest.raises(error, match=message):
+        gym.make("Torcs-v0", **{"backend": "scr", **options})
+
+
+@pytest.mark.parametrize("world", [NativeBackend, ScrBackend])
+def test_a_start_in_a_wall_is_told(world):
+    with contextlib.closing(world("e-track-2")) as backend:
+        with pytest.raises(InvalidOption, match="nearer to the middle of the road"):
+            backend.reset(rng(), Start(53.87, 0.952))
+        assert backend.reset(rng(), Start(53.87, 0.3)).distance_raced == pytest.approx(0.0)
+
+
+def test_races_on_threads_are_for_the_engine():
+    with pytest.raises(InvalidOption, match="vectorization_mode='async'"):
+        gym.make_vec("Torcs-v0", num_envs=2, backend="scr")
+
+
+def test_a_broken_car_is_told(tmp_path):
+    file = tmp_path / "car.xml"
+    for text, message in (
+        ("<params", "is broken"),
+        ("<params/>", "has no gears"),
+        ('<params><section name="Engine"><attnum name="revs limiter" val="x"/></section></params>',
+         "is broken"),
+    ):  # fmt: skip
+        file.write_text(text)
+        with pytest.raises(CarFileError, match=message):
+            read_gearbox(file)
+
+
+# ---- Somebody else's server ----------------------------------------------------------------------
+
+
+def test_a_server_that_runs_already_is_driven():
+    with Loopback() as server:
+        env = gym.make("Torcs-v0", backend="scr", host=server.host, port=server.port)
+        env.reset(seed=0)
+        for _ in range(10):
+            *_, info = env.step(np.array([0.5, 0.25, 0.0], np.float32))
+        assert info["distance"] == 50.0
+        assert server.actions[-1].steering == 0.5
+        env.reset()
+        with pytest.raises(InvalidOption, match="begins on the grid"):
+            env.reset(options={"distance": 10.0})
+        with pytest.raises(InvalidOption, match="cannot be driven twice"):
+            pickle.dumps(env.unwrapped)
+        env.close()
+    assert len(server.inits) == 2
+
+
+def test_a_car_beyond_the_end_of_the_lap_is_on_another_track(monkeypatch):
+    with Loopback() as server:
+        world = ScrBackend("aalborg", host=server.host, port=server.port)
+        world.reset(rng(), None)
+        server.tick = 2700
+        with pytest.raises(InvalidOption, match="give the server's track"):
+            world.step(STRAIGHT_ON, 2)
+        world.close()
+
+
+def test_no_server_is_told(monkeypatch):
+    monkeypatch.setattr(scr, "PATIENCE_WITH_OTHERS", 1.0)
+    world = ScrBackend("aalborg", host="127.0.0.1", port=9)
+    with pytest.raises(ServerNotFound, match="sb3-torcs serve"):
+        world.reset(rng(), None)
+    with pytest.raises(ServerLost, match="call reset"):
+        world.step(STRAIGHT_ON, 1)
+    world.close()
+
+
+def test_a_server_that_ends_and_comes_back_is_driven_again(monkeypatch):
+    monkeypatch.setattr(scr, "PATIENCE_WITH_OTHERS", 3.0)
+    with Loopback() as server:
+        world = ScrBackend("aalborg", host=server.host, port=server.port)
+        world.reset(rng(), None)
+    with pytest.raises(ServerLost, match="port is closed"):
+        world.step(STRAIGHT_ON, 5)
+    with Loopback(port=server.port):
+        world.reset(rng(), None)
+        world.step(STRAIGHT_ON, 5)
+        world.close()
+
+
+def test_a_car_that_was_taken_out_stands():
+    with Loopback(ticks=10) as server:
+        world = ScrBackend("aalborg", host=server.host, port=server.port)
+        world.reset(rng(), None)
+        cars = [world.step(STRAIGHT_ON, 5) for _ in range(4)]
+        world.close()
+    assert [round(car.time, 6) for car in cars] == [0.1, 0.2, 0.3, 0.4]
+    assert cars[-1].speed_x == 0.0
+    assert cars[-1].distance_raced == cars[-2].distance_raced
+
+
+# ---- When things break ---------------------------------------------------------------------------
+
+
+def test_a_game_that_is_killed_in_mid_lap_is_told_and_replaced(backend):
+    first = backend.step(STRAIGHT_ON, 50)
+    pid = backend._process.pid
+    folder = backend._process.folder
+    os.kill(pid, signal.SIGKILL)
+    begun = time.monotonic()
+    with pytest.raises(GameFailed, match=r"SIGKILL.*call reset"):
+        backend.step(STRAIGHT_ON, 5000)
+    assert time.monotonic() - begun < 5.0
+    assert not folder.exists()
+    with pytest.raises(ServerLost, match="call reset"):
+        backend.step(STRAIGHT_ON, 1)
+    backend.reset(rng(), None)
+    again = backend.step(STRAIGHT_ON, 50)
+    np.testing.assert_array_equal(again.range_finders, first.range_finders)
+    assert backend._process.pid != pid
+
+
+def test_a_game_that_is_killed_between_episodes_is_replaced(backend):
+    os.kill(backend._process.pid, signal.SIGKILL)
+    assert backend.reset(rng(), None).distance_raced == 0.0
+
+
+def test_resets_keep_the_game(backend):
+    pid = backend._process.pid
+    first = backend.step(STRAIGHT_ON, 20)
+    for _ in range(50):
+        backend.reset(rng(), None)
+    again = backend.step(STRAIGHT_ON, 20)
+    np.testing.assert_array_equal(again.range_finders, first.range_finders)
+    assert backend._process.pid == pid
+
+
+def test_a_car_that_stands_too_long_is_taken_out_and_a_reset_begins_anew(backend):
+    """By the game's own rule, after the race; the game then ends."""
+    car = backend.reset(rng(), None)
+    while not backend._client.over:
+        car = backend.step(Controls(0.0, 0.0, 1.0), 500)
+        assert car.time < 1000.0
+    assert backend.step(STRAIGHT_ON, 5).speed_x == 0.0
+    assert backend.reset(rng(), None).time < 0.1
+
+
+def test_nothing_is_left_of_a_closed_world(backend):
+    pid, folder = backend._process.pid, backend._process.folder
+    backend.close()
+    assert gone(pid)
+    assert not folder.exists()
+
+
+def test_nothing_is_left_of_a_forgotten_world():
+    world = ScrBackend("g-track-1")
+    world.reset(rng(), None)
+    pid, folder = world._process.pid, world._process.folder
+    del world
+    gc.collect()
+    assert gone(pid)
+    assert not folder.exists()
+
+
+WAIT = """
+import sys, time, numpy as np
+from sb3_torcs.backends.scr import ScrBackend
+from sb3_torcs.car import Controls
+world = ScrBackend("g-track-1")
+world.reset(np.random.default_rng(0), None)
+print(world._process.pid, world._process.folder, flush=True)
+while True:
+    world.step(Controls(0.0, 0.1, 0.0), 100)
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
+def test_a_dead_client_leaves_no_game(number):
+    with subprocess.Popen(
+        [sys.executable, "-c", WAIT], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as client:
+        pid, folder = client.stdout.readline().split()
+        client.send_signal(number)
+        _, words = client.communicate(timeout=20.0)
+    assert gone(int(pid))
+    assert not Path(folder).exists()
+    assert ("KeyboardInterrupt" in words) == (number == signal.SIGINT)
+
+
+def test_a_fork_leaves_the_game_to_its_parent(backend):
+    before = backend.step(STRAIGHT_ON, 5)
+    child = os.fork()
+    if child == 0:
+        try:
+            backend.step(STRAIGHT_ON, 5)
+        except EngineForked:
+            os._exit(0)
+        os._exit(1)
+    assert os.waitpid(child, 0)[1] == 0
+    assert backend.step(STRAIGHT_ON, 5).time > before.time
+
+
+def test_two_worlds_do_not_hear_each_other():
+    worlds = [ScrBackend("g-track-1"), ScrBackend("dirt-1")]
+    alone = []
+    for world in worlds:
+        world.reset(rng(), None)
+        alone.append([world.step(STRAIGHT_ON, 5) for _ in range(30)])
+    for world in worlds:
+        world.reset(rng(), None)
+    together = [[], []]
+    for _ in range(30):
+        for world, cars in zip(worlds, together, strict=True):
+            cars.append(world.step(STRAIGHT_ON, 5))
+    for one, other in zip(alone, together, strict=True):
+        for car, same in zip(one, other, strict=True):
+            np.testing.assert_array_equal(car.range_finders, same.range_finders)
+            assert car[:20] == same[:20]
+    for world in worlds:
+        world.close()
+
+
+def test_resets_leak_nothing(backend):
+    def descriptors():
+        return len(os.listdir("/proc/self/fd"))
+
+    def game_memory():
+        status = Path(f"/proc/{backend._process.pid}/statm").read_text()
+        return int(status.split()[1])  # [pages]
+
+    for _ in range(50):
+        backend.reset(rng(), None)
+    descriptors_before, pages_before = descriptors(), game_memory()
+    for n in range(200):
+        backend.reset(rng(), Start(10.0 * n, 0.0, 0.0, 20.0) if n % 2 else None)
+    assert descriptors() == descriptors_before
+    assert game_memory() - pages_before < 2500  # 10 MB
+
+
+def test_relaunches_leak_nothing():
+    world = ScrBackend("g-track-1")
+    for n in range(8):
+        world.reset(rng(), None)
+        os.kill(world._process.pid, signal.SIGKILL)
+        if n == 1:
+            before = len(os.listdir("/proc/self/fd"))
+    world.reset(rng(), None)
+    assert len(os.listdir("/proc/self/fd")) == before
+    world.close()
+
+
+@pytest.mark.slow
+def test_four_worlds_in_processes_drive_as_one_alone():
+    options = {"backend": "scr", "track": "g-track-1", "start": "random"}
+    vector = make_vec_env(
+        "sb3_torcs:Torcs-v0", 4, seed=5, env_kwargs=options, vec_env_cls=SubprocVecEnv
+    )
+    single = gym.make("Torcs-v0", **options)
+    try:
+        observations, expected = vector.reset(), single.reset(seed=7)[0]
+        for step in range(400):
+            np.testing.assert_array_equal(observations[2], expected)
+            action = np.array([0.2 * np.sin(0.1 * step), 0.8, 0.0], np.float32)
+            observations = vector.step(np.stack([action] * 4))[0]
+            expected, _, terminated, truncated, _ = single.step(action)
+            if terminated or truncated:
+                expected = single.reset()[0]
+    finally:
+        vector.close()
+        single.close()

@@ -1,0 +1,192 @@
+"""The conversation with a server: in order, with losses, and when the server is gone."""
+
+from __future__ import annotations
+
+import socket
+
+import numpy as np
+import pytest
+from scr_loopback import COUNTDOWN, Errant, Loopback
+
+from sb3_torcs.car import Start
+from sb3_torcs.errors import ServerLost, ServerNotFound
+from sb3_torcs.scr_client import ScrClient
+from sb3_torcs.scr_protocol import ScrAction, format_action, parse_state
+
+ANGLES = np.radians(np.arange(-90.0, 91.0, 10.0))
+
+
+def client_of(server, **options):
+    return ScrClient(server.host, server.port, ANGLES, **options)
+
+
+def answer(client, message, steering=0.0):
+    client.send(format_action(ScrAction(steering, lap_time=parse_state(message).lap_time)))
+
+
+def drive(client, ticks):
+    """Answer as many states; return what they say."""
+    distances = []
+    for tick in range(ticks):
+        message = client.receive()
+        distances.append(parse_state(message).distance_from_start)
+        answer(client, message, 0.001 * tick)
+    return distances
+
+
+def free_port():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as bound:
+        bound.bind(("127.0.0.1", 0))
+        return bound.getsockname()[1]
+
+
+def test_one_state_follows_each_action():
+    with Loopback() as server:
+        client = client_of(server)
+        client.identify()
+        assert drive(client, COUNTDOWN + 4) == [0.0] * COUNTDOWN + [0.0, 1.0, 2.0, 3.0]
+        client.close()
+    assert server.inits[0].angles == pytest.approx(ANGLES)
+    assert [action.steering for action in server.actions] == [0.001 * n for n in range(7)]
+
+
+def test_the_end_of_the_race_is_told_once_its_last_state_was():
+    with Loopback(ticks=2) as server:
+        client = client_of(server)
+        client.identify()
+        drive(client, COUNTDOWN + 2)
+        assert client.receive() is None
+        assert client.over
+        assert client.receive() is None
+        client.identify()  # the next race
+        assert drive(client, COUNTDOWN + 1)[-1] == 0.0
+        client.close()
+
+
+def test_a_restart_begins_anew_where_it_was_asked_for():
+    with Loopback() as server:
+        client = client_of(server)
+        client.identify()
+        drive(client, 20)
+        client.restart(Start(100.0, 0.5))
+        assert drive(client, COUNTDOWN + 2)[-2:] == [0.0, 1.0]
+        client.close()
+    assert server.inits[-1].start == Start(100.0, 0.5)
+
+
+def test_of_several_states_the_newest_is_taken():
+    with Loopback() as server:
+        client = client_of(server)
+        client.identify()
+        first = client.receive()
+        for tick in (5, 6, 7):
+            server.tick = tick
+            server.send_state()
+        assert parse_state(client.receive()).distance_from_start == 7.0
+        assert first != client._taken
+        client.close()
+
+
+def test_a_state_that_comes_twice_is_taken_once():
+    with Loopback() as server:
+        client = client_of(server)
+        client.identify()
+        message = client.receive()
+        server.say(message)
+        answer(client, message)
+        assert client.receive() != message
+        client.close()
+
+
+def test_an_action_is_said_again_when_no_state_follows():
+    with Loopback(mute={0, 2, 3}) as server:
+        client = client_of(server, pause=0.02)
+        client.identify()
+        assert drive(client, COUNTDOWN + 6)[COUNTDOWN:] == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
+        client.close()
+    assert server.late == 3
+    assert len(server.actions) == COUNTDOWN + 6
+
+
+def test_one_in_twenty_datagrams_lost_and_as_many_doubled_changes_nothing():
+    with Loopback() as server, Errant((server.host, server.port)) as network:
+        client = client_of(network, pause=0.02)
+        for _ in range(3):
+            client.identify()
+            driven = drive(client, 300)
+            assert driven[COUNTDOWN:] == list(range(300 - COUNTDOWN))
+            client.restart()
+        client.close()
+    assert network.lost > 50
+    assert network.doubled > 50
+
+
+def test_no_server_is_told_with_what_to_type():
+    client = ScrClient("127.0.0.1", free_port(), ANGLES, patience=1.0)
+    with pytest.raises(ServerNotFound, match=r"no SCR server answers at 127\.0\.0\.1:\d+.*serve"):
+        client.identify()
+    client.close()
+
+
+def test_a_silent_server_is_told_too():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as silent:
+        silent.bind(("127.0.0.1", 0))
+        client = ScrClient(*silent.getsockname(), ANGLES, patience=1.0)
+        with pytest.raises(ServerNotFound, match="tried for 1 s"):
+            client.identify()
+        client.close()
+
+
+def test_a_host_without_an_address_is_told():
+    with pytest.raises(ServerNotFound, match="no way to no such host:3001"):
+        ScrClient("no such host", 3001, ANGLES)
+
+
+def test_a_server_may_come_later():
+    servers = []
+
+    def begin():
+        if not servers:
+            servers.append(Loopback(port=port).__enter__())
+
+    port = free_port()
+    client = ScrClient("127.0.0.1", port, ANGLES, watch=begin)
+    client.identify()
+    drive(client, 5)
+    client.close()
+    servers[0].stop()
+
+
+def test_a_server_that_ends_is_noticed_at_once():
+    server = Loopback()
+    with server:
+        client = client_of(server, patience=60.0, pause=30.0)
+        client.identify()
+        message = client.receive()
+    with pytest.raises(ServerLost, match="its port is closed"):  # noqa: PT012
+        answer(client, message)
+        client.receive()
+    client.close()
+
+
+def test_a_server_that_falls_silent_is_given_up_in_time():
+    with Loopback() as server:
+        client = client_of(server, patience=0.3, pause=0.05)
+        client.identify()
+        answer(client, client.receive())
+        server.take = lambda *message: None
+        client.receive()
+        answer(client, client._taken)
+        with pytest.raises(ServerLost, match="nothing came for"):
+            client.receive()
+        client.close()
+
+
+def test_what_watches_the_server_has_the_last_word():
+    def watch():
+        raise RuntimeError("it has burnt down")
+
+    client = ScrClient("127.0.0.1", free_port(), ANGLES, patience=5.0, watch=watch)
+    with pytest.raises(RuntimeError, match="burnt down"):
+        client.identify()
+    client.close()
