@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
-import numpy as np
+from gymnasium import spaces
 
 from sb3_torcs.models import load_driver
 
@@ -27,7 +27,7 @@ class Agent:
         self.env = gym.make("sb3_torcs:Torcs-v0", backend="scr", max_episode_steps=-1, **settings)
         self.driver = load_driver(model, self.env, algo)
         # The first decision of all loads libraries, for which a race has no time.
-        self.driver.predict(np.zeros(self.env.observation_space.shape or (), np.float32))
+        self.driver.predict(cast(spaces.Box, self.env.observation_space).high, deterministic=True)
         self.lap_times: list[float] = []
         """[s] of each whole lap."""
         self.distance = 0.0

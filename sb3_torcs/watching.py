@@ -141,7 +141,7 @@ def film_shows(
     :raises OutputNotWritable: if the file cannot be written; no part of it is left behind
     :raises GameFailed: if a game ends too early; the same holds
     """
-    part = (size[0] // len(shows) // 2 * 2, size[1])
+    part = (size[0] // len(shows), size[1])
     with ExitStack() as stack:
         films = [
             stack.enter_context(

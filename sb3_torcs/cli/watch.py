@@ -134,10 +134,8 @@ def _model(find_model: Any, game: Game, name: str) -> Path:
         path: Path = find_model(name)
         return path
     except InvalidOption as error:
-        hint = near_miss(name, game.robots())
-        raise InvalidOption(
-            f"{error}; nor is there a robot of this name{hint}".rstrip(";")
-        ) from None
+        hint = near_miss(name, game.robots()).rstrip(";")
+        raise InvalidOption(f"{error}; nor is there a robot '{name}'{hint}") from None
 
 
 def _in_window(show: Show, args: argparse.Namespace) -> None:

@@ -1,0 +1,63 @@
+"""``sb3-torcs compete``: an agent as an ordinary client in a race that runs elsewhere."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import pytest
+
+from sb3_torcs.cli import main
+from sb3_torcs.game import find_game
+from sb3_torcs.race_file import RaceSetup
+from sb3_torcs.scr_game import open_ports, start_server
+
+pytestmark = pytest.mark.usefixtures("game")
+
+
+@pytest.fixture
+def race():
+    """A race for one client, in real time; its port."""
+    sockets = open_ports(1)
+    setup = RaceSetup("a-speedway", [("scr_server", 0)], laps=1)
+    # A busy machine may take its time here: what is late is tested where the server is.
+    with start_server(find_game(), setup, sockets, deadline=2.0) as process:
+        port = sockets[0].getsockname()[1]
+        sockets[0].close()
+        yield port, process
+
+
+def test_an_agent_drives_to_the_end_and_says_how_long_it_took(race, capsys):
+    port, process = race
+    words = ["compete", "scripted", "--port", str(port), "--track", "a-speedway", "--json"]
+    assert main(words) == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert set(figures) == {
+        "laps", "lap_times", "distance", "ticks", "lost_ticks", "latency_ms",
+    }  # fmt: skip
+    assert figures["laps"] == len(figures["lap_times"]) == 1
+    assert figures["lost_ticks"] == 0
+    assert figures["ticks"] == pytest.approx(figures["lap_times"][0] / 0.02, abs=60)
+    latency = figures["latency_ms"]
+    assert 0.0 < latency["median"] <= latency["p99"] <= latency["longest"]
+    process.wait(10.0)
+    (late,) = re.findall(r"decisions, (\d+) late", process.words())
+    assert late == "0"
+
+
+def test_for_people_it_prints_three_lines(race, capsys):
+    port, _ = race
+    assert main(["compete", "scripted", "--port", str(port), "--track", "a-speedway"]) == 0
+    first, second, third = capsys.readouterr().out.splitlines()
+    assert re.fullmatch(r"lap times s: [\d.]+; \d+ m", first)
+    assert re.fullmatch(r"lost ticks: \d+ of \d+", second)
+    assert re.fullmatch(r"answer ms: median .*, 99 % within .*, longest .*", third)
+
+
+def test_a_server_that_is_not_there_is_told(monkeypatch, capsys):
+    monkeypatch.setattr("sb3_torcs.backends.scr.PATIENCE_WITH_OTHERS", 0.2)
+    (bound,) = open_ports(1)
+    port = bound.getsockname()[1]
+    bound.close()
+    assert main(["compete", "scripted", "--port", str(port)]) == 2
+    assert f"no SCR server answers at 127.0.0.1:{port}" in capsys.readouterr().err

@@ -1,0 +1,151 @@
+"""``sb3-torcs watch``: agents and robots in the game's window, and films of them."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+from pathlib import Path
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+
+from sb3_torcs import driving
+from sb3_torcs.cli import main
+from sb3_torcs.display import VirtualDisplay
+
+pytestmark = pytest.mark.usefixtures("game", "nothing_is_left")
+
+SMALL = ["--track", "a-speedway", "--size", "160x120", "--fps", "5"]
+
+
+@pytest.fixture
+def nothing_is_left(tmp_path, monkeypatch):
+    """Whatever happens, no folder and no process of the game stays."""
+    private = tmp_path / "private"
+    private.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(private))
+    yield
+    assert list(private.iterdir()) == []
+    assert children() == []
+
+
+def children():
+    """Programs that this process has started and that still run."""
+    call = ["ps", "--ppid", str(os.getpid()), "-o", "comm="]
+    listed = subprocess.run(call, capture_output=True, text=True, check=False)
+    names = set(listed.stdout.split()) & {"torcs-bin", "Xvfb"}
+    return sorted(names)
+
+
+class Turning:
+    """Leaves the road at once."""
+
+    def predict(self, observation, *, deterministic=True):
+        return np.array([1.0, 1.0, 0.0], np.float32), None
+
+
+class Failing(Turning):
+    """Breaks down after some decisions."""
+
+    decisions = 0
+
+    def predict(self, observation, *, deterministic=True):
+        self.decisions += 1
+        if self.decisions > 30:
+            raise ZeroDivisionError("as told")
+        return super().predict(observation)
+
+
+def stream(path):
+    """What ffmpeg says of a film: codec, pixels, size; and the number of frames."""
+    call = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", str(path)]
+    said = subprocess.run(call, capture_output=True, text=True, check=False).stderr
+    frames, _ = imageio_ffmpeg.count_frames_and_secs(str(path))
+    return re.search(r"Video: (h264).*?(yuv420p).*? (\d+x\d+)", said).groups(), frames
+
+
+def test_a_film_of_a_robot_is_the_race_that_the_game_runs_without_one(tmp_path, capsys):
+    assert main(["robots", "inferno", "--track", "a-speedway", "--laps", "1", "--game"]) == 0
+    alone = capsys.readouterr().out
+    film = tmp_path / "lap.mp4"
+    assert main(["watch", "inferno", *SMALL, "--film", str(film)]) == 0
+    filmed = capsys.readouterr().out
+    assert filmed == f"{alone}film: {film}\n"
+    (lap,) = re.findall(r"best lap: ([\d.]+) s", alone)
+    kind, frames = stream(film)
+    assert kind == ("h264", "yuv420p", "160x120")
+    # A second before the start, the lap, a second after it.
+    assert abs(frames - 5 * (float(lap) + 2.0)) <= 2
+
+
+def test_two_drivers_side_by_side(tmp_path, capsys):
+    film = tmp_path / "both.mp4"
+    words = ["watch", "scripted", *SMALL, "--beside", "inferno", "--film", str(film)]
+    assert main(words) == 0
+    out = capsys.readouterr().out
+    assert "scr_server 0, car1-trb1, a-speedway" in out
+    assert "inferno 3, car1-trb1, a-speedway" in out
+    slower = max(float(lap) for lap in re.findall(r"best lap: ([\d.]+) s", out))
+    kind, frames = stream(film)
+    assert kind[2] == "160x120"
+    assert abs(frames - 5 * (slower + 2.0)) <= 2
+
+
+def test_a_film_ends_soon_after_the_agents_drive(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(driving, "load_driver", lambda *_: Turning())
+    film = tmp_path / "off.mp4"
+    assert main(["watch", "scripted", *SMALL, "--film", str(film)]) == 0
+    assert re.search(r"scripted: (off_track|backwards) after -?\d+ m", capsys.readouterr().out)
+    assert 10 < stream(film)[1] < 60
+
+
+def test_an_agent_that_breaks_down_ends_everything(tmp_path, monkeypatch):
+    monkeypatch.setattr(driving, "load_driver", lambda *_: Failing())
+    with pytest.raises(ZeroDivisionError, match="as told"):
+        main(["watch", "scripted", *SMALL, "--film", str(tmp_path / "broken.mp4")])
+    assert not (tmp_path / "broken.mp4").exists()
+
+
+def test_a_window_shows_the_race_and_closes(monkeypatch, capsys):
+    monkeypatch.setattr(driving, "load_driver", lambda *_: Turning())
+    with VirtualDisplay((320, 240)) as display:
+        monkeypatch.setenv("DISPLAY", display.name)
+        assert main(["watch", "scripted", "--robots", "bt", "--size", "160x120"]) == 0
+    assert re.search(r"scripted: (off_track|backwards) after", capsys.readouterr().out)
+
+
+def test_without_a_display_it_offers_a_film(monkeypatch, capsys):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    assert main(["watch", "inferno"]) == 2
+    said = capsys.readouterr().err
+    assert "there is no display" in said
+    assert "--film" in said
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["infernal"], "there is no model 'infernal'"),
+        (["infernal"], "nor is there a robot 'infernal'; did you mean 'inferno'?"),
+        (["inferno", "--beside", "bt"], "--beside is for films; add --film FILE.mp4"),
+        (["inferno", "--film", "lap.avi"], "'lap.avi' should end in .mp4"),
+        (["inferno", "--film", "lap.mp4", "--view", "behnd"], "did you mean 'behind'?"),
+        (["inferno", "--film", "lap.mp4", "--fps", "0"], "fps is 0; expected 1 to 500"),
+        (["inferno", "--film", "lap.mp4", "--size", "161x120"], "a film needs even numbers"),
+        (["inferno", "--film", "lap.mp4", "--track", "forzza"], "did you mean 'forza'?"),
+        (["inferno", "--film", "lap.mp4", "--robots", "inferno"], "none of them twice"),
+    ],
+)
+def test_what_cannot_be_watched(words, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["watch", *words]) == 2
+    assert message in capsys.readouterr().err
+    assert list(Path().glob("*.mp4")) == []
+
+
+def test_a_size_that_is_none(capsys):
+    with pytest.raises(SystemExit):
+        main(["watch", "inferno", "--size", "big"])
+    assert "'big': expected WIDTHxHEIGHT" in capsys.readouterr().err
