@@ -47,7 +47,6 @@ class ScrClient:
     :param patience: without a word after which the server is given up [s]
     :param pause: before an action is said again [s], then twice that, and so on: servers but ours
         take each for the answer to another state, so it should be rare
-    :param exact: ask for all digits of the sensors, not six; only our own server does that
     :param latencies: to which the time from each state to its answer is added [s]
     :param watch: called while nothing comes; raises if the server has ended
     :raises ServerNotFound: if the host has no address
@@ -61,7 +60,6 @@ class ScrClient:
         *,
         patience: float = PATIENCE,
         pause: float = PAUSE,
-        exact: bool = False,
         latencies: array[float] | None = None,
         watch: Callable[[], None] = lambda: None,
     ) -> None:
@@ -71,7 +69,6 @@ class ScrClient:
         self._latencies = latencies
         self._arrived = 0.0
         self._angles = angles
-        self._exact = exact
         self._patience = patience
         self._pause = pause
         self._watch = watch
@@ -98,7 +95,7 @@ class ScrClient:
         """
         self._taken = b""
         self._drain()
-        if not self._ask(format_init(self._angles, start, self._exact), IDENTIFIED, FIRST_PAUSE):
+        if not self._ask(format_init(self._angles, start, exact=True), IDENTIFIED, FIRST_PAUSE):
             raise ServerNotFound(
                 f"no SCR server answers at {self.address}, tried for {self._patience:g} s; start "
                 "one with `sb3-torcs serve --track aalborg`, or check --host and --port"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import socket
 import threading
-from contextlib import suppress
 
 import numpy as np
 
@@ -42,12 +41,21 @@ class _Thread:
     def stop(self):
         self.ending = True
         self._thread.join()
-        self.socket.close()
 
     def _run(self):
-        while not self.ending:
-            with suppress(TimeoutError, ConnectionError):  # the other end may be gone
-                self.take(*self.socket.recvfrom(65535))
+        while self._next():
+            pass
+        self.socket.close()
+
+    def _next(self):
+        """Take a datagram; what has come before the end is taken before it."""
+        try:
+            self.take(*self.socket.recvfrom(65535))
+        except TimeoutError:
+            return not self.ending
+        except ConnectionError:
+            return True  # the other end is gone
+        return True
 
 
 class Loopback(_Thread):

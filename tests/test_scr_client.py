@@ -173,10 +173,9 @@ def test_a_server_that_falls_silent_is_given_up_in_time():
     with Loopback() as server:
         client = client_of(server, patience=0.3, pause=0.05)
         client.identify()
-        answer(client, client.receive())
-        server.take = lambda *message: None
-        client.receive()
-        answer(client, client._taken)
+        message = client.receive()
+        server.say = lambda message: None
+        answer(client, message)
         with pytest.raises(ServerLost, match="nothing came for"):
             client.receive()
         client.close()

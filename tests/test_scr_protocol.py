@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
 import runpy
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -114,7 +116,7 @@ def test_a_literal_introduction_is_written_and_read():
 def test_without_angles_they_are_ten_degrees_apart():
     expected = tuple(math.radians(angle) for angle in range(-90, 91, 10))
     for text in (b"SCR", b"SCR(init)", b"SCR\0", b"SCRAPHEAP"):
-        assert parse_init(text) == (expected, None)
+        assert parse_init(text) == (expected, None, False)
 
 
 def test_tags_come_in_any_order_and_unknown_ones_are_passed_over():
@@ -233,3 +235,9 @@ def test_no_broken_message_gives_a_wrong_number():
     for state, action in FUZZ["mutations"](seed=1, number=3000):
         FUZZ["check_state"](state)
         FUZZ["check_action"](action)
+
+
+def test_the_example_counts_what_it_has_checked(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["fuzz_scr.py", "--messages", "600"])
+    FUZZ["main"]()
+    assert re.search(r"600 messages: \d+ states and \d+ actions read, all", capsys.readouterr().out)

@@ -201,7 +201,7 @@ class ScrBackend:
         host, port = self._address
         manners: dict[str, Any] = {"patience": PATIENCE_WITH_OTHERS, "latencies": self.latencies}
         if self._own:
-            manners = {"patience": PATIENCE, "pause": PAUSE, "watch": self._watch, "exact": True}
+            manners = {"patience": PATIENCE, "pause": PAUSE, "watch": self._watch}
         self._client = ScrClient(host, port, self.range_finder_angles, **manners)
         self._client.identify(start)
 
