@@ -7,6 +7,7 @@ server recognises (see :attr:`sb3_torcs.scr_protocol.ScrAction.lap_time`).
 
 from __future__ import annotations
 
+import os
 import socket
 import struct
 import weakref
@@ -29,6 +30,7 @@ from sb3_torcs.scr_protocol import (
 __all__ = ["ScrClient"]
 
 LONGEST = 65535  # [bytes] of a datagram; some servers send pictures
+LOOKS = 50  # for an answer before this process sleeps: some 100 microseconds
 FIRST_PAUSE = 1.0  # [s] before the first message is said again; servers take their time to load
 PAUSE = 1.0  # [s] before an action is said again
 PATIENCE = 10.0  # [s] without a word after which a server is given up
@@ -74,6 +76,7 @@ class ScrClient:
         self._watch = watch
         self._said = b""  # the last word, to be said again
         self._taken = b""  # the last state
+        self._buffer = memoryview(bytearray(LONGEST))
         self._timeout = 0.0
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._end = weakref.finalize(self, self._socket.close)
@@ -208,17 +211,31 @@ class ScrClient:
             # In Python's own time-out there is one more call of the system for each datagram.
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, times)
             self._timeout = pause
-        try:
-            return self._socket.recv(LONGEST)
-        except BlockingIOError:
-            return None
+        # To be woken takes longer than the game needs for a tick, so the answer is looked for a
+        # little while. Whoever else wants the processor has it in between.
+        for _ in range(LOOKS):
+            with suppress(BlockingIOError):
+                return self._take(socket.MSG_DONTWAIT)
+            os.sched_yield()
+        with suppress(BlockingIOError):
+            return self._take()
+        return None
+
+    def _take(self, flags: int = 0) -> bytes:
+        """
+        Take a datagram.
+
+        :param flags: of ``recv``
+        """
+        size = self._socket.recv_into(self._buffer, 0, flags)
+        return self._buffer[:size].tobytes()
 
     def _drain(self) -> list[bytes]:
         """Take all that waits."""
         messages = []
         try:
             while True:
-                messages.append(self._socket.recv(LONGEST, socket.MSG_DONTWAIT))
+                messages.append(self._take(socket.MSG_DONTWAIT))
         except (BlockingIOError, ConnectionError):
             return messages
 
