@@ -325,7 +325,9 @@ def test_a_command_in_the_docs_parses_and_names_what_exists(page, line, parsed, 
 @pytest.mark.parametrize(("page", "line"), MENTIONED)
 def test_a_command_in_the_text_parses(page, line, parsed):
     match shlex.split(line):
-        case ["sb3-torcs", *words] if words[0] != "evaluate" or len(words) > 1:
+        case ["sb3-torcs", "evaluate" | "watch" | "compete"]:
+            pass  # the verb alone, which needs to be told who drives
+        case ["sb3-torcs", *words]:
             parsed(words)
         case ["make", target, *_]:
             assert target in TARGETS
@@ -390,8 +392,8 @@ def test_a_local_link_leads_somewhere(page, target):
 
 def test_the_pictures_are_small_enough_for_a_first_look():
     pictures = list((ROOT / "docs" / "images").iterdir())
-    assert {picture.suffix for picture in pictures} == {".png"}
-    assert [picture for picture in pictures if picture.stat().st_size > 200_000] == []
+    most = {".png": 200_000, ".webp": 1_000_000, ".mp4": 3_000_000}  # [bytes]
+    assert [p.name for p in pictures if p.stat().st_size > most.get(p.suffix, 0)] == []
 
 
 def undocumented(node, where):
