@@ -117,8 +117,8 @@ class ScrClient:
         self._said = message
         try:
             self._socket.send(message)
-        except ConnectionError as error:
-            raise self._lost("its port is closed") from error
+        except OSError as error:
+            raise self._unreachable(error) from error
 
     def receive(self) -> bytes | None:
         """
@@ -133,8 +133,8 @@ class ScrClient:
         while True:
             try:
                 message = self._wait(pause)
-            except ConnectionError as error:
-                raise self._lost("its port is closed") from error
+            except OSError as error:
+                raise self._unreachable(error) from error
             if message is None:
                 self._watch()
                 waited += pause
@@ -176,27 +176,22 @@ class ScrClient:
         :return: whether it came before the end of patience
         """
         self._said = question
-        waited = 0.0
-        while waited < self._patience:
-            with suppress(ConnectionError):  # it tells of an earlier one: the server may be back
-                self._socket.send(question)
-            while (message := self._wait_open(pause)) is not None:
-                if message.startswith(answer):
-                    return True
-            self._watch()
-            waited += pause
+        now = again = perf_counter()
+        until = now + self._patience
+        while now < until:
+            message = None
+            with suppress(OSError):  # it tells of an earlier datagram: the server may be back
+                # By the clock: in real time states come all along, whether it was heard or not.
+                if now >= again:
+                    again = now + pause
+                    self._socket.send(question)
+                message = self._wait(pause)
+            if message is None:
+                self._watch()
+            elif message.startswith(answer):
+                return True
+            now = perf_counter()
         return False
-
-    def _wait_open(self, pause: float) -> bytes | None:
-        """
-        Wait for a datagram, also while the port is closed.
-
-        :param pause: [s]
-        """
-        with suppress(ConnectionError):
-            return self._wait(pause)
-        self._watch()
-        return self._wait_open(pause)  # hears of a closed port once for each datagram
 
     def _wait(self, pause: float) -> bytes | None:
         """
@@ -236,7 +231,7 @@ class ScrClient:
         try:
             while True:
                 messages.append(self._take(socket.MSG_DONTWAIT))
-        except (BlockingIOError, ConnectionError):
+        except OSError:  # nothing is left, or an error that the next call will meet again
             return messages
 
     def _newest(self, message: bytes) -> bytes | None:
@@ -254,6 +249,15 @@ class ScrClient:
             elif text.startswith((SHUTDOWN, RESTART)):
                 self.over = True
         return state
+
+    def _unreachable(self, error: OSError) -> ServerLost:
+        """
+        Build the error.
+
+        :param error: of the socket
+        """
+        closed = isinstance(error, ConnectionError)
+        return self._lost("its port is closed" if closed else error.strerror or str(error))
 
     def _lost(self, why: str) -> ServerLost:
         """

@@ -142,7 +142,7 @@ _BY_NAME = {tag.name: (place, tag) for place, tag in enumerate(_TAGS)}
 # Where the words stand in a message that is in the server's order, which needs no search.
 _BEGINS = [sum(1 + tag.size for tag in _TAGS[:place]) for place in range(len(_TAGS) + 1)]
 _WORDS = _BEGINS.pop()
-_NAMES: tuple[bytes, ...] = tuple(tag.name for tag in _TAGS)
+_NAMES: tuple[bytes, ...] = tuple(b"(" + tag.name for tag in _TAGS)
 _pick_names = itemgetter(*_BEGINS)
 _pick_numbers = itemgetter(*(word for word in range(_WORDS) if word not in _BEGINS))
 
@@ -313,11 +313,11 @@ def _parse_ordered(text: bytes) -> ScrState | None:
     :param text: without what follows a zero byte
     :return: the state; ``None`` if it is written otherwise, or broken
     """
-    words = text[1:-1].replace(b")(", b" ").split(b" ")
+    words = text[:-1].replace(b")(", b" (").split(b" ")
     if len(words) != _WORDS or _pick_names(words) != _NAMES or b"_" in text:
         return None
     tags = len(_TAGS)
-    brackets = text[:1] + text[-1:] == b"()" and text.count(b")(") == tags - 1
+    brackets = text.endswith(b")") and text.count(b")(") == tags - 1
     if not brackets or text.count(b"(") != tags or text.count(b")") != tags:
         return None
     try:

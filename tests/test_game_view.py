@@ -224,13 +224,19 @@ def test_there_is_no_picture_before_and_after():
 # ---- Faults, and what is left -------------------------------------------------------------------
 
 
-def traces(env):
-    """The processes, folder and socket of the game that draws."""
+def children():
+    """The processes that this one has started, by whatever test."""
+    text = Path(f"/proc/{os.getpid()}/task/{os.getpid()}/children").read_text()
+    return {int(pid) for pid in text.split()}
+
+
+def traces(env, before):
+    """The processes and the folder of the game that draws."""
     view = env._viewer
-    children = Path(f"/proc/{os.getpid()}/task/{os.getpid()}/children")
-    pids = [int(pid) for pid in children.read_text().split()]
+    pids = children() - before
     folder = view._game.folder
     assert view._game.pid in pids
+    assert len(pids) == 2
     assert folder.is_dir()
     return [Path(f"/proc/{pid}") for pid in pids] + [folder]
 
@@ -243,20 +249,19 @@ def wait_until_gone(paths):
 
 
 def test_nothing_runs_before_the_first_picture():
-    children = Path(f"/proc/{os.getpid()}/task/{os.getpid()}/children")
-    before = children.read_text()
+    before = children()
     env = make()
     env.reset(seed=1)
     env.step(GAS)
-    assert children.read_text() == before
+    assert children() == before
     env.close()
 
 
 def test_close_leaves_nothing(env):
-    descriptors = len(os.listdir("/proc/self/fd"))
+    descriptors, before = len(os.listdir("/proc/self/fd")), children()
     env.reset(seed=1)
     env.render()
-    left = traces(env)
+    left = traces(env, before)
     env.close()
     env.close()
     assert [path for path in left if path.exists()] == []
@@ -264,14 +269,15 @@ def test_close_leaves_nothing(env):
 
 
 def test_a_game_that_dies_is_told_and_replaced(env):
+    before = children()
     env.reset(seed=1)
-    before = env.render()
-    left = traces(env)
+    picture = env.render()
+    left = traces(env, before)
     os.kill(env._viewer._game.pid, signal.SIGKILL)
     with pytest.raises(GameFailed, match="SIGKILL"):
         env.render()
     assert [path for path in left if path.exists()] == []
-    np.testing.assert_array_equal(env.render(), before)
+    np.testing.assert_array_equal(env.render(), picture)
 
 
 def test_a_killed_owner_leaves_nothing(tmp_path):
