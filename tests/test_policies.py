@@ -157,6 +157,7 @@ def test_other_numbers_of_actions_take_other_heads():
     ({"net_arch": [300]}, "the critic has two layer sizes"),
     ({"net_arch": {"pi": [8]}}, "the critic has two layer sizes"),
     ({"critic_lr_scale": 0.0}, "pass a number above 0"),
+    ({"ema_decay": 1.0}, "pass a share in"),
     ({"init_std": -1.0}, "pass a number above 0"),
 ])  # fmt: skip
 def test_a_wrong_option_is_named_with_what_is_allowed(kwargs, message):
@@ -248,6 +249,32 @@ def test_the_critic_learns_at_its_own_rate():
     assert model.critic.optimizer.param_groups[0]["lr"] == 1e-3
 
 
+def test_the_average_drives_when_nothing_is_left_to_chance():
+    """Each update leaves it its share; what explores is the actor itself."""
+    model = make_model(ema_decay=0.75)
+    model.learn(6)
+    expected = [weight.clone() for weight in model.policy.driver.parameters()]
+    for _ in range(3):
+        model.train(1, 8)
+        for weight, new in zip(expected, model.actor.parameters(), strict=True):
+            weight.mul_(0.75).add_(0.25 * new)
+    for weight, average in zip(expected, model.policy.driver.parameters(), strict=True):
+        th.testing.assert_close(average, weight)
+    scaled = model.policy.driver(th.as_tensor(OBSERVATIONS)).detach().numpy()
+    drives, explores = (model.predict(OBSERVATIONS, deterministic=known)[0] for known in (1, 0))
+    np.testing.assert_array_equal(drives, model.policy.unscale_action(scaled))
+    assert not np.array_equal(drives, explores)
+
+
+def test_averaging_changes_no_bit_of_the_training():
+    networks = []
+    for decay in (None, 0.9):
+        model = updater("SplitHeadPolicy", 32, net_arch=SMALL, ema_decay=decay)
+        model.train(10, 32)
+        networks.append([*model.actor.parameters(), *model.critic.parameters()])
+    assert_same(*networks)
+
+
 def test_switching_the_mode_reaches_every_module():
     """The short cut must not leave a module behind."""
     policy = make_model().policy
@@ -265,7 +292,7 @@ def test_switching_the_mode_reaches_every_module():
 def test_a_loaded_model_goes_on_like_the_saved_one(tmp_path, algorithm):
     """Parameters, optimizer and its two rates: ten more updates end in the same bits."""
     kwargs = {"critic_lr_scale": 5.0, "layer_norm": True, "head_bias": (0, 0, -2)}
-    model = make_model(algorithm, **kwargs)
+    model = make_model(algorithm, ema_decay=0.9, **kwargs)
     model.learn(20)
     model.save(tmp_path / "model")
     loaded = algorithm.load(tmp_path / "model", device="cpu")
@@ -295,7 +322,7 @@ def test_a_fresh_process_loads_it_without_importing_the_plugin(tmp_path):
 
 def test_the_policy_alone_can_be_saved_and_loaded(tmp_path):
     """``policy.save`` and ``actor.save``, as for SB3's own."""
-    policy = make_model(critic_lr_scale=2.0, head_bias=(0, 0, -1)).policy
+    policy = make_model(critic_lr_scale=2.0, head_bias=(0, 0, -1), ema_decay=0.9).policy
     for part in (policy, policy.actor):
         part.save(str(tmp_path / "part"))
         loaded = type(part).load(str(tmp_path / "part"), device="cpu")
@@ -313,7 +340,7 @@ def test_the_alias_belongs_to_ddpg_and_td3_only():
 @pytest.mark.parametrize("algorithm", [DDPG, TD3])
 def test_the_export_is_the_driver(tmp_path, algorithm):
     """From raw observations to environment units, equal to predict; any number of rows."""
-    model = make_model(algorithm, init_std=0.5, layer_norm=True)
+    model = make_model(algorithm, init_std=0.5, layer_norm=True, ema_decay=0.9)
     model.learn(20)
     script = export_actor(model, tmp_path / "driver.pt")
     code = "import sys, torch; print(torch.jit.load(sys.argv[1])(torch.zeros(2, 29)).tolist())"
