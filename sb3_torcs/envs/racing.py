@@ -87,6 +87,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
             raise InvalidOption(f"render_mode is {render_mode!r}; expected None or one of {modes}")
         self.backend = backend
         self._encode: Callable[[CarState], Observation] = getattr(backend, "encode", encode)
+        self._draw_track = getattr(backend, "draw_track", None)
         self.action_repeat = int(action_repeat)
         self.laps = None if laps is None else int(laps)
         self.render_mode = render_mode
@@ -152,6 +153,8 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         if self._closed:
             raise EnvClosed("reset after close; make a new environment with gym.make")
         super().reset(seed=seed)
+        if self._draw_track is not None:
+            self._draw_track(self.np_random)
         start = self._place(options) if options else self._draw_start()
         self.car = self.backend.reset(self.np_random, start)
         self._controls = Controls(0.0, 0.0, 0.0)

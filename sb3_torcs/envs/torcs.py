@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy.typing as npt
 from sb3_torcs.backends.base import Backend
 from sb3_torcs.backends.native import NativeBackend
 from sb3_torcs.backends.scr import ScrBackend
+from sb3_torcs.backends.several import SeveralTracks, is_several
 from sb3_torcs.car import is_count
 from sb3_torcs.envs.racing import RacingEnv
 from sb3_torcs.errors import EnvClosed, InvalidOption
@@ -40,7 +42,8 @@ class TorcsEnv(RacingEnv):
 
     Units are SI and radians; left is positive.
 
-    :param track: ``"aalborg"``, ``"road/aalborg"``, or the path of a TORCS XML file
+    :param track: ``"aalborg"``, ``"road/aalborg"``, or the path of a TORCS XML file; or a list of
+        them: each episode is on one, drawn from the seed
     :param car: any of the game's, e.g. ``"car1-trb1"``
     :param reward: ``"progress"``, ``"blog"``, ``"apex"``, or a dict of weights
     :param action_repeat: control ticks of 0.02 s per decision
@@ -69,7 +72,7 @@ class TorcsEnv(RacingEnv):
     def __init__(
         self,
         *,
-        track: str | Path = "aalborg",
+        track: str | Path | Sequence[str | Path] = "aalborg",
         car: str = "car1-trb1",
         reward: str | Mapping[str, float] = "progress",
         action_repeat: int = 5,
@@ -92,15 +95,17 @@ class TorcsEnv(RacingEnv):
                 "render_mode 'game' is for backend 'native'; `sb3-torcs serve --window` shows "
                 "the game of backend 'scr'"
             )
+        if render_mode == "game" and is_several(track):
+            raise InvalidOption("render_mode 'game' is for one track; give one, not a list")
         if backend != "native":
             self.metadata = RacingEnv.metadata
         self.render_size = _size(render_size)
         super().__init__(
             _world(
                 backend,
+                track,
                 sensor_noise=sensor_noise,
                 address={"host": host, "port": port},
-                track=track,
                 car=car,
                 range_finders=range_finders,
                 opponents=opponents,
@@ -144,12 +149,13 @@ class TorcsEnv(RacingEnv):
 
 
 def _world(
-    backend: str, *, sensor_noise: bool, address: Mapping[str, Any], **options: Any
+    backend: str, track: Any, *, sensor_noise: bool, address: Mapping[str, Any], **options: Any
 ) -> Backend:
     """
     Make the world that was chosen.
 
     :param backend: as of :class:`TorcsEnv`
+    :param track: as there
     :param sensor_noise: as there
     :param address: host and port, as there
     :param options: that all worlds have
@@ -161,11 +167,17 @@ def _world(
                 "sensor_noise is for backend 'native'; an SCR server adds noise of its own if it "
                 "is started with -noisy"
             )
-        return ScrBackend(**options, **address)
+        if is_several(track):
+            raise InvalidOption(
+                f"track is {track!r}; a game of backend 'scr' has one track, backend 'native' "
+                "takes several"
+            )
+        return ScrBackend(track, **options, **address)
     for name, value in address.items():
         if value is not None:
             raise InvalidOption(f"{name} is {value!r}, for no server; add backend='scr'")
-    return NativeBackend(**options, sensor_noise=sensor_noise)
+    make: Callable[[Any], Backend] = partial(NativeBackend, **options, sensor_noise=sensor_noise)
+    return SeveralTracks(map(make, track)) if is_several(track) else make(track)
 
 
 def _size(size: Any) -> tuple[int, int]:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
+from typing import Any
 
+from sb3_torcs.backends.base import Backend
 from sb3_torcs.backends.lite import LiteBackend
+from sb3_torcs.backends.several import SeveralTracks, is_several
 from sb3_torcs.envs.racing import RacingEnv
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.tracks import Track
@@ -41,7 +45,8 @@ class TorcsLiteEnv(RacingEnv):
     Units are SI and radians; left is positive.
 
     :param track: ``"aalborg"``, ``"road/aalborg"``, the path of a track file, a ``Track``, or
-        ``"random"`` for a new closed track each episode, drawn from the seed
+        ``"random"`` for a new closed track each episode, drawn from the seed; or a list: each
+        episode is on one of them
     :param car: ``"car1-trb1"``
     :param reward: ``"progress"``, ``"blog"``, ``"apex"``, or a dict of weights
     :param action_repeat: control ticks of 0.02 s per decision
@@ -54,7 +59,7 @@ class TorcsLiteEnv(RacingEnv):
     def __init__(
         self,
         *,
-        track: str | Path | Track = "aalborg",
+        track: str | Path | Track | Sequence[str | Path | Track] = "aalborg",
         car: str = "car1-trb1",
         reward: str | Mapping[str, float] = "progress",
         action_repeat: int = 5,
@@ -68,8 +73,9 @@ class TorcsLiteEnv(RacingEnv):
                 "render_mode is 'game', which draws the game's own picture: that is for Torcs-v0; "
                 "expected None, 'rgb_array' or 'human'"
             )
+        make: Callable[[Any], Backend] = partial(LiteBackend, car=car, range_finders=range_finders)
         super().__init__(
-            LiteBackend(track, car=car, range_finders=range_finders),
+            SeveralTracks(map(make, track)) if is_several(track) else make(track),
             reward=reward,
             action_repeat=action_repeat,
             start=start,

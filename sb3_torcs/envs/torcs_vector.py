@@ -14,6 +14,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from sb3_torcs.backends.native import Fleet
+from sb3_torcs.backends.several import is_several
 from sb3_torcs.car import CarState, is_count
 from sb3_torcs.envs.racing import Observation
 from sb3_torcs.envs.torcs import TorcsEnv
@@ -68,6 +69,11 @@ class TorcsVectorEnv(SyncVectorEnv):
             raise InvalidOption(
                 f"backend is {options['backend']!r}; races on threads are for backend 'native', "
                 "others drive with gym.make_vec(..., vectorization_mode='async')"
+            )
+        if is_several(options.get("track", "aalborg")):
+            raise InvalidOption(
+                "track is a list; races on threads are on one track, others drive with "
+                "gym.make_vec(..., vectorization_mode='sync')"
             )
         registered = gym.spec("Torcs-v0").max_episode_steps or NO_LIMIT
         limit = registered if max_episode_steps is None else max_episode_steps

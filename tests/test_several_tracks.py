@@ -1,0 +1,103 @@
+"""A list of tracks: each episode is on one of them, drawn from the seed."""
+
+from __future__ import annotations
+
+import pickle
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import SubprocVecEnv
+
+import sb3_torcs  # noqa: F401  # registers the ids
+from sb3_torcs.errors import InvalidOption, TrackNotFound
+from sb3_torcs.tracks import load_track
+
+TRACKS = ("aalborg", "alpine-1", "g-track-1")
+GAS = np.array([0.0, 1.0, 0.0], np.float32)
+
+
+@pytest.fixture(params=["TorcsLite-v0", "Torcs-v0"])
+def make(request):
+    if request.param == "Torcs-v0":
+        request.getfixturevalue("game")
+    return lambda **options: gym.make(request.param, **{"track": TRACKS, **options}).unwrapped
+
+
+def drive(env, seed, episodes=12):
+    """Some episodes: where each was, and what was seen."""
+    seen = []
+    for number in range(episodes):
+        observation, _ = env.reset(seed=seed if number == 0 else None)
+        seen.append((env.track.name, env.car.distance_from_start, observation.tobytes()))
+        seen += [(env.track.name, *env.step(GAS)[:2])[2:] for _ in range(3)]
+    return seen
+
+
+def test_every_track_has_its_turn_and_the_seed_says_which(make):
+    env, other = make(start="random"), make(start="random")
+    seen = drive(env, seed=5)
+    assert {item[0] for item in seen if len(item) == 3} == set(TRACKS)
+    assert drive(other, seed=5) == seen
+    assert drive(env, seed=5) == seen, "what was driven before must not matter"
+    assert drive(env, seed=6) != seen
+
+
+def test_a_start_is_anywhere_on_the_track_that_was_drawn(make):
+    """Not within the length of the track of the episode before."""
+    env = make(track=["alpine-1", "g-track-1"], start="random")
+    env.reset(seed=0)
+    farthest = {}
+    for _ in range(60):
+        env.reset()
+        name, distance = env.track.name, env.car.distance_from_start
+        farthest[name] = max(farthest.get(name, 0.0), distance)
+    for name, distance in farthest.items():
+        assert distance > 0.85 * load_track(name).length
+
+
+def test_an_episode_is_what_it_is_on_that_track_alone(make):
+    env = make()
+    env.reset(seed=1)
+    alone = make(track=env.track.name)
+    alone.reset(seed=1)
+    for _ in range(20):
+        one, two = env.step(GAS), alone.step(GAS)
+        np.testing.assert_array_equal(one[0], two[0])
+        assert one[1:4] == two[1:4]
+
+
+def test_a_pickled_one_goes_on_where_it_was(make):
+    env = make(start="random")
+    env.reset(seed=3)
+    env.step(GAS)
+    copy = pickle.loads(pickle.dumps(env))
+    for _ in range(6):
+        np.testing.assert_array_equal(env.step(GAS)[0], copy.step(GAS)[0])
+        assert env.reset()[0].tobytes() == copy.reset()[0].tobytes()
+        assert env.track.name == copy.track.name
+
+
+def test_processes_take_it(make):
+    kwargs = {"track": TRACKS, "start": "random"}
+    env_id = f"sb3_torcs:{make().spec.id}"
+    envs = make_vec_env(env_id, 2, seed=0, env_kwargs=kwargs, vec_env_cls=SubprocVecEnv)
+    assert envs.reset().shape == (2, 29)
+    envs.close()
+
+
+def test_what_cannot_be_is_told(make):
+    with pytest.raises(InvalidOption, match="empty list"):
+        make(track=[])
+    with pytest.raises(TrackNotFound, match="aalborg"):
+        make(track=["aalborg", "alborg"])
+
+
+@pytest.mark.usefixtures("game")
+@pytest.mark.parametrize("options", [{"backend": "scr"}, {"render_mode": "game"}])
+def test_what_has_one_track_refuses_a_list(options):
+    with pytest.raises(InvalidOption, match="one track"):
+        gym.make("Torcs-v0", track=TRACKS, **options)
+    with pytest.raises(InvalidOption, match="one track"):
+        gym.make_vec("Torcs-v0", num_envs=2, track=TRACKS)
