@@ -20,7 +20,7 @@ from sb3_torcs.errors import DisplayUnavailable
 __all__ = ["VirtualDisplay", "find_display"]
 
 PROGRAM = "Xvfb"
-INSTALL = "`sudo apt install xvfb`"
+INSTALL = "`sb3-torcs install-torcs --film`, or: `sudo apt install xvfb`"
 FILM = "`--film FILE.mp4` films the race without one"
 PATIENCE = 20.0  # [s] for a server to start on a busy machine
 GRACE = 5.0  # [s] for a server to end
@@ -66,7 +66,7 @@ class VirtualDisplay:
         if program is None:
             raise DisplayUnavailable(
                 f"there is no {PROGRAM}, the program for a display that nobody sees; "
-                f"type: {INSTALL}, or: `sb3-torcs install-torcs`"
+                f"type: {INSTALL}"
             )
         with tempfile.TemporaryFile() as words:
             process, number = _start(program, size, words)

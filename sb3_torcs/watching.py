@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sb3_torcs.driving import Agent
-from sb3_torcs.errors import GameFailed
+from sb3_torcs.errors import GameFailed, ServerLost
 from sb3_torcs.film import FPS, Film, side_by_side
 from sb3_torcs.game import Game
 from sb3_torcs.game_process import GameProcess
@@ -114,7 +114,12 @@ def show_in_window(show: Show, window: Window) -> None:
     """
     with show.start(window) as process:
         if show.agent is not None:
-            show.agent.drive(AFTERMATH)
+            try:
+                show.agent.drive(AFTERMATH)
+            except ServerLost as error:
+                if process.poll() is None:
+                    raise
+                raise GameFailed(process.epitaph()) from error
             if show.agent.end is not None:
                 return
         process.wait()
@@ -155,7 +160,7 @@ def film_shows(
             write_video(path, side_by_side(*pictures), fps, encoding=PHOTOGRAPHIC)
         finally:
             for film in films:
-                film.game.stop() if film.game.poll() is None else None
+                film.game.stop()
             for thread in threads:
                 thread.join()
 
@@ -175,7 +180,9 @@ def _begin(show: Show, film: Film) -> threading.Thread:
         try:
             show.agent.drive(AFTERMATH)
         except BaseException as error:
-            show.agent.error = error
+            # A game that ended by itself knows better why.
+            if not isinstance(error, ServerLost) or film.game.poll() is None:
+                show.agent.error = error
             film.game.stop()  # which otherwise waits for an answer
 
     thread = threading.Thread(target=drive, name="agent")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import signal
 import subprocess
 from pathlib import Path
 
@@ -11,9 +12,10 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 
-from sb3_torcs import driving
+from sb3_torcs import driving, watching
 from sb3_torcs.cli import main
 from sb3_torcs.display import VirtualDisplay
+from sb3_torcs.scr_game import start_server
 
 pytestmark = pytest.mark.usefixtures("game", "nothing_is_left")
 
@@ -114,6 +116,33 @@ def test_a_window_shows_the_race_and_closes(monkeypatch, capsys):
         monkeypatch.setenv("DISPLAY", display.name)
         assert main(["watch", "scripted", "--robots", "bt", "--size", "160x120"]) == 0
     assert re.search(r"scripted: (off_track|backwards) after", capsys.readouterr().out)
+
+
+@pytest.mark.parametrize("film", [[], ["--film", "killed.mp4"]])
+def test_a_game_that_is_killed_says_how_it_ended(film, tmp_path, monkeypatch, capsys):
+    started = []
+
+    def start(*args, **options):
+        started.append(start_server(*args, **options))
+        return started[-1]
+
+    class Killing(Turning):
+        decisions = 0
+
+        def predict(self, observation, *, deterministic=True):
+            self.decisions += 1
+            if self.decisions == 20:
+                os.kill(started[0].pid, signal.SIGKILL)
+            return super().predict(observation)
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(watching, "start_server", start)
+    monkeypatch.setattr(driving, "load_driver", lambda *_: Killing())
+    with VirtualDisplay((320, 240)) as display:
+        monkeypatch.setenv("DISPLAY", display.name)
+        assert main(["watch", "scripted", *SMALL, *film]) == 2
+    assert "the game ended with SIGKILL" in capsys.readouterr().err
+    assert list(Path().glob("*.mp4")) == []
 
 
 def test_without_a_display_it_offers_a_film(monkeypatch, capsys):

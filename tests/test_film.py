@@ -79,6 +79,14 @@ class TestFrames:
         driving = pictures[(FPS + 1) * 2 :].astype(int)
         assert np.abs(np.diff(driving, axis=0)).mean(axis=(1, 2, 3)).min() > 1
 
+    @pytest.mark.parametrize("view", ["helicopter", "tv"])
+    def test_no_view_begins_in_the_dark(self, game, view):
+        with filmed(game, view=view) as film:
+            frame = next(film.frames())
+        assert (frame.number, frame.time) == (0, pytest.approx(-1.0))
+        middle = frame.picture[40:80, 60:120]
+        assert middle.mean() > 30
+
     def test_the_sky_is_above_the_road(self, lap):
         picture = lap[0].picture
         assert picture[:40, 60:120].mean() > picture[-40:, 60:120].mean() + 30

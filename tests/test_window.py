@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import ctypes
 import dataclasses
+import os
+import re
+import signal
 import subprocess
 import sys
 import tempfile
 import time
+from contextlib import contextmanager
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -26,6 +30,7 @@ SIZE = (320, 240)
 LAP = RaceSetup("aalborg", [("inferno", 3)], laps=1)
 ESCAPE = 9  # the key's code
 KEY_PRESS, KEY_PRESS_MASK, FULL_PICTURE = 2, 1, 2
+CLIENT_MESSAGE = 33
 
 
 @pytest.fixture(autouse=True)
@@ -52,6 +57,17 @@ class XKeyEvent(ctypes.Structure):
         ("subwindow", ctypes.c_ulong), ("time", ctypes.c_ulong), ("x", ctypes.c_int),
         ("y", ctypes.c_int), ("x_root", ctypes.c_int), ("y_root", ctypes.c_int),
         ("state", ctypes.c_uint), ("keycode", ctypes.c_uint), ("same_screen", ctypes.c_int),
+        ("rest_of_an_event", ctypes.c_long * 24),
+    ]  # fmt: skip
+
+
+class XClientMessageEvent(ctypes.Structure):
+    """As Xlib lays it out."""
+
+    _fields_ = [
+        ("type", ctypes.c_int), ("serial", ctypes.c_ulong), ("send_event", ctypes.c_int),
+        ("display", ctypes.c_void_p), ("window", ctypes.c_ulong), ("message_type", ctypes.c_ulong),
+        ("format", ctypes.c_int), ("data", ctypes.c_long * 5),
         ("rest_of_an_event", ctypes.c_long * 24),
     ]  # fmt: skip
 
@@ -94,19 +110,32 @@ class Viewer:
             time.sleep(0.05)
         raise AssertionError("there is no race to be seen")
 
-    def press(self, code):
-        """Press a key in the only window there is."""
-        window, children, number = ctypes.c_ulong(), ctypes.POINTER(ctypes.c_ulong)(), 0
+    def window(self):
+        """The only one there is."""
+        window, children = ctypes.c_ulong(), ctypes.POINTER(ctypes.c_ulong)()
         number = ctypes.c_uint()
         self.x.XQueryTree(
             self.display, self.root, ctypes.byref(window), ctypes.byref(window),
             ctypes.byref(children), ctypes.byref(number),
         )  # fmt: skip
-        target = ctypes.c_ulong(children[number.value - 1])
+        return ctypes.c_ulong(children[number.value - 1])
+
+    def press(self, code):
+        """Press a key."""
+        target = self.window()
         event = XKeyEvent(
             type=KEY_PRESS, window=target.value, root=self.root.value, keycode=code, same_screen=1
         )
         self.x.XSendEvent(self.display, target, 1, KEY_PRESS_MASK, ctypes.byref(event))
+        self.x.XSync(self.display, 0)
+
+    def close_window(self):
+        """Click where a window manager shows a cross."""
+        window = self.window()
+        message = XClientMessageEvent(type=CLIENT_MESSAGE, window=window.value, format=32)
+        message.message_type = self.x.XInternAtom(self.display, b"WM_PROTOCOLS", 0)
+        message.data[0] = self.x.XInternAtom(self.display, b"WM_DELETE_WINDOW", 0)
+        self.x.XSendEvent(self.display, window, 0, 0, ctypes.byref(message))
         self.x.XSync(self.display, 0)
 
     def __enter__(self):
@@ -114,6 +143,27 @@ class Viewer:
 
     def __exit__(self, *error):
         self.x.XCloseDisplay(self.display)
+
+
+@contextmanager
+def race_of_another_process():
+    """Somebody who shows a race: his process, the numbers of game and display, the folder."""
+    code = (
+        "import sys; sys.path.insert(0, 'tests')\n"
+        "from test_window import shown, Viewer\n"
+        "from sb3_torcs.display import VirtualDisplay\n"
+        "from sb3_torcs.game import find_game\n"
+        f"display = VirtualDisplay({SIZE})\n"
+        "process = shown(find_game(), display)\n"
+        "Viewer(display.name).wait_for_a_race()\n"
+        "print(process.pid, display.pid, process.folder, flush=True)\n"
+        "input()\n"
+    )
+    call = [sys.executable, "-c", code]
+    root = Path(__file__).parent.parent
+    with subprocess.Popen(call, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=root) as owner:
+        game, display, folder = owner.stdout.readline().decode().split()
+        yield owner, int(game), int(display), Path(folder)
 
 
 class TestSettings:
@@ -177,6 +227,11 @@ class TestSettings:
         with pytest.raises(GameIncomplete, match=r"screen\.xml cannot be read.*install-torcs"):
             window_files(dataclasses.replace(game, data=tmp_path), Window())
 
+    def test_the_documentation_names_the_views(self):
+        page = Path(__file__).parent.parent / "docs" / "window.md"
+        (named,) = re.findall(r"views by name: (.*?)\.\n", page.read_text(), re.DOTALL)
+        assert re.findall(r"`(\w+)`", named) == list(VIEWS)
+
 
 class TestTheWindow:
     def test_it_opens_in_the_race_and_escape_ends_it(self, game):
@@ -196,29 +251,45 @@ class TestTheWindow:
             process.wait(20)
             assert list((process.folder / "results" / "race").glob("*.xml"))
 
+    def test_closing_it_ends_the_race(self, game):
+        with (
+            VirtualDisplay(SIZE) as display,
+            shown(game, display) as process,
+            Viewer(display.name) as viewer,
+        ):
+            viewer.wait_for_a_race()
+            viewer.close_window()
+            process.wait(20)
+            assert list((process.folder / "results" / "race").glob("*.xml"))
+
     def test_without_a_display_it_says_so(self, game):
         window = Window(SIZE, display=":2999")
         with GameProcess(game, LAP, **window_arguments(game, window)) as process:
             with pytest.raises(GameFailed, match="failed to open display ':2999'"):
                 process.wait(20)
 
+    def test_it_removes_no_folder_but_its_own(self, game, tmp_path):
+        precious = tmp_path / "precious"
+        precious.mkdir()
+        with VirtualDisplay(SIZE) as display:
+            arguments = window_arguments(game, Window(SIZE, display=display.name))
+            # No process has this number: as if the owner were gone.
+            gone = {"SB3_TORCS_OWNER": "999999999", "SB3_TORCS_FOLDER": str(precious)}
+            arguments["environment"] |= gone
+            with GameProcess(game, LAP, **arguments) as process:
+                with pytest.raises(GameFailed, match="exit status 1"):
+                    process.wait(20)
+                assert process.folder.exists()
+        assert precious.exists()
+
     def test_it_goes_with_the_process_that_started_it(self):
-        code = (
-            "import sys; sys.path.insert(0, 'tests')\n"
-            "from test_window import shown, Viewer\n"
-            "from sb3_torcs.display import VirtualDisplay\n"
-            "from sb3_torcs.game import find_game\n"
-            f"display = VirtualDisplay({SIZE})\n"
-            "process = shown(find_game(), display)\n"
-            "Viewer(display.name).wait_for_a_race()\n"
-            "print(process.pid, process.folder, display.pid, flush=True)\n"
-            "input()\n"
-        )
-        call = [sys.executable, "-c", code]
-        root = Path(__file__).parent.parent
-        with subprocess.Popen(
-            call, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=root
-        ) as owner:
-            game, folder, server = owner.stdout.readline().decode().split()
+        with race_of_another_process() as (owner, game, display, folder):
             owner.kill()
-        assert gone_within(10, lambda: runs(game), Path(folder).exists, lambda: runs(server))
+        assert gone_within(10, lambda: runs(game), folder.exists, lambda: runs(display))
+
+    def test_it_goes_with_a_session_that_ends(self):
+        """The display first, and the process that started the game just after it."""
+        with race_of_another_process() as (owner, game, display, folder):
+            os.kill(display, signal.SIGTERM)
+            owner.kill()
+        assert gone_within(10, lambda: runs(game), folder.exists)

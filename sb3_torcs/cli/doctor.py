@@ -37,6 +37,9 @@ PACKAGES = {
 EXTENSION = "sb3_torcs._engine"
 COMPILERS = ("c++", "g++", "clang++")
 DEFAULT_CAR = "car1-trb1"
+GAME_LIBRARIES = ("_scr_server", "_game_window")
+PROGRAM_USERS = "`watch`, `serve`, `robots --game`, backend 'scr' and render_mode 'game'"
+LIBRARY_USERS = "`watch`, `serve`, backend 'scr' and render_mode 'game'"
 REINSTALL = "sudo apt-get install --reinstall torcs torcs-data"
 
 
@@ -99,7 +102,8 @@ def checks() -> list[Check]:
     for look in (_tracks, _cars, _layout):
         missing = Check(look.__name__.strip("_"), False, "there is no game to look at", game.fix)
         results.append(_guarded(look) if game.ok else missing)
-    return results + [_guarded(check) for check in (_torcs, _text_mode, _window)]
+    extras = (_game_program, _game_libraries, _window, _film)
+    return results + [_guarded(check) for check in (_torcs, *extras)]
 
 
 def _guarded(check: Callable[[], Check]) -> Check:
@@ -257,27 +261,59 @@ def _torcs() -> Check:
     return Check("Torcs-v0", True, "drives", None)
 
 
-def _text_mode() -> Check:
-    """See whether the game's own program runs: only comparisons with it need that."""
+def _game_program() -> Check:
+    """See whether the game's own program runs: the engine of this process does without."""
     from sb3_torcs.text_mode import missing_libraries
 
-    purpose = "only `sb3-torcs robots --game` needs it"
     try:
         game = find_game()
     except BackendUnavailable:
-        return Check("text mode", True, f"no game; {purpose}", None)
+        return _optional("game program", "no game", PROGRAM_USERS)
     if game.program is None:
-        return Check("text mode", True, f"no torcs-bin in {game.libraries}; {purpose}", None)
+        return _optional("game program", f"no torcs-bin in {game.libraries}", PROGRAM_USERS)
     missing = missing_libraries(game)
     if missing:
-        found = f"{game.program} would not find {', '.join(missing)}; {purpose}"
-        return Check("text mode", True, found, None)
-    return Check("text mode", True, str(game.program), None)
+        found = f"{game.program} would not find {', '.join(missing)}"
+        return _optional("game program", found, PROGRAM_USERS)
+    return Check("game program", True, str(game.program), None)
+
+
+def _game_libraries() -> Check:
+    """Look for what we built for the inside of the game's own program."""
+    from sb3_torcs.game_process import compiled_library
+
+    try:
+        files = [compiled_library(name) for name in GAME_LIBRARIES]
+    except BackendUnavailable as error:
+        return _optional("game libraries", str(error), LIBRARY_USERS)
+    return Check("game libraries", True, ", ".join(file.name for file in files), None)
 
 
 def _window() -> Check:
-    """Look for OpenGL and a display: only the game's own window needs them."""
+    """Look for OpenGL and a display."""
     library = "libGL.so.1" if linker_knows("libGL.so.1") else "no libGL.so.1 (libgl1)"
     display = os.environ.get("DISPLAY")
     where = f"display {display}" if display else "no display"
-    return Check("window", True, f"{library}, {where}; only the game's own window needs them", None)
+    return _optional("window", f"{library}, {where}", "`watch` and `serve --window`")
+
+
+def _film() -> Check:
+    """Look for the display that nobody sees."""
+    from sb3_torcs.display import INSTALL, PROGRAM
+
+    program = shutil.which(PROGRAM)
+    if program is not None:
+        return Check("film", True, program, None)
+    found = f"no {PROGRAM}; type: {INSTALL}"
+    return _optional("film", found, "`watch --film` and render_mode 'game'")
+
+
+def _optional(name: str, found: str, users: str) -> Check:
+    """
+    Say what was found of something that neither environment needs to drive.
+
+    :param name: of the check
+    :param found: what is there, or is not
+    :param users: what does need it
+    """
+    return Check(name, True, f"{found}; only for {users}", None)

@@ -30,25 +30,35 @@ public:
         if (gone()) end();
     }
 
+    // To be called when something is lost that goes with the owner, like the display of a session
+    // that ends: the owner may be gone a little later.
+    void await_end(std::chrono::milliseconds patience) {
+        constexpr auto pause = std::chrono::milliseconds(10);
+        for (; patience.count() > 0 && owner_ > 0 && !gone(); patience -= pause)
+            std::this_thread::sleep_for(pause);
+        if (gone()) end();
+    }
+
     // The other end of a pipe or socket was closed. Of a process that is killed these go first,
     // its children notice a little later.
     [[noreturn]] void lost_contact() {
-        for (int tries = 0; tries < 200 && owner_ > 0 && !gone(); ++tries) {
-            std::this_thread::sleep_for(std::chrono::milliseconds(10));
-        }
-        if (gone()) end();
+        await_end(std::chrono::seconds(2));
         _exit(1);
     }
 
 private:
+    // As game_process.py names them: whatever else the variable says, nothing else is removed.
+    static constexpr const char* FOLDER_PREFIX = "sb3-torcs-game-";
+
     [[noreturn]] void end() {
         std::error_code ignored;
-        if (!folder_.empty()) std::filesystem::remove_all(folder_, ignored);
+        const bool is_private = folder_.filename().string().rfind(FOLDER_PREFIX, 0) == 0;
+        if (is_private) std::filesystem::remove_all(folder_, ignored);
         _exit(1);
     }
 
     int owner_ = 0;
-    std::string folder_;
+    std::filesystem::path folder_;
     std::chrono::steady_clock::time_point checked_{};
 };
 

@@ -14,8 +14,8 @@ constexpr double RUN_OUT = 1.0;       // [s] after the end: the last crossing of
 
 double now = 0;         // [s] what the game's clock shows
 double origin = 0;      // [s] simulated time of the first frame
-long frames = 0;        // since then
-double last_time = 0;   // [s] simulated, of the last frame
+long frame = 0;         // number of the last one; -1 is drawn, but nobody gets it
+double last_time = HUGE_VAL;  // [s] simulated, of the last frame
 double over_since = 0;  // [s] simulated time of the race's end
 
 double frame_time() {
@@ -24,13 +24,14 @@ double frame_time() {
     return seconds;
 }
 
-// Frames are counted, not summed up: the error of one never reaches the next.
+// Frames are counted, not summed up: the error of one never reaches the next. A camera that flies
+// knows where it is only from its second picture on.
 double time_of_next_frame(double time) {
-    if (frames == 0 || time < last_time) {  // a race that begins, or begins again
+    if (time < last_time) {  // a race that begins, or begins again
         origin = std::fmax(FIRST_FRAME, time);
-        frames = 0;
+        frame = -2;
     }
-    return origin + static_cast<double>(frames++) * frame_time();
+    return origin + static_cast<double>(++frame) * frame_time();
 }
 
 }  // namespace
@@ -46,6 +47,8 @@ void advance_clock() {
     }
     now = ReInfo->time + (steps + 0.5) * torcs::PHYSICS_STEP;
 }
+
+bool rolling() { return frame >= 0; }
 
 bool run_out() {
     if (frame_time() <= 0) return false;

@@ -1,6 +1,8 @@
 // From the start of the program into the race and out again, past all menus.
 
+#include <chrono>
 #include <csignal>
+#include <cstdint>
 #include <cstdio>
 #include <cstdlib>
 #include <cstring>
@@ -26,6 +28,7 @@ namespace window {
 namespace {
 
 constexpr int READ_STANDARD = 1;
+constexpr std::intptr_t STOP_RACE = 7;  // the state of the race in which Escape puts it
 constexpr unsigned LIGHTING = 0x0B50, CULL_FACE = 0x0B44, ALPHA_TEST = 0x0BC0;
 constexpr int AT_ONCE_NEXT_STEP = 0x1 | 0x100;  // what a state of the race returns to go on
 
@@ -62,6 +65,9 @@ void start_race() {
     GfParmSetStr(ReInfo->params, race, "display mode", "normal");
     original_init_view = std::exchange(ReInfo->graphics.init_view, init_view);
     if (filming()) send_frames();
+    // To close the window is Escape, too. Not every GLUT tells of it.
+    if (auto* const on_close = original<void(void (*)())>("glutCloseFunc"))
+        on_close([] { ReStateApply(reinterpret_cast<void*>(STOP_RACE)); });
     ReStateApply(reinterpret_cast<void*>(torcs::LOAD_EVENT));
 }
 
@@ -85,6 +91,9 @@ torcs::Owner& owner() {
 // The program calls this one after it has opened its window.
 INSTEAD void TorcsEntry() {
     std::signal(SIGPIPE, SIG_IGN);
+    window::owner();  // made before what is called at the exit, and so there for it
+    // Without its display the program ends at once.
+    std::atexit([] { window::owner().await_end(std::chrono::milliseconds(500)); });
     ssgInit();
     GfInitClient();
     glutDisplayFunc(window::start_race);

@@ -81,7 +81,7 @@ void send_picture() {
 int draw_and_send(torcs::Situation* situation) {
     const int result = draw(situation);
     header.time = situation->time;
-    drawn = true;
+    drawn = rolling();
     GfuiDisplay();
     drawn = false;
     return result;

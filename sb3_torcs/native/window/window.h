@@ -32,6 +32,9 @@ torcs::Owner& owner();
 // Let the clock go on by exactly as much as there is between two frames.
 void advance_clock();
 
+// Whether the picture that is drawn now belongs to the film.
+bool rolling();
+
 // Whether the film goes on although the race is over.
 bool run_out();
 
