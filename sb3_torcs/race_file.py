@@ -110,6 +110,7 @@ def write_race(game: Game, folder: Path, race: RaceSetup) -> str:
     shutil.copyfile(game.data / ENGINE_SETTINGS, settings)
     if race.has_clients:
         _write_scr_drivers(folder, race.car)
+        _forbid_learning(folder, race)
     template = f"config/raceman/{SESSIONS[race.session]}.xml"
     _needed(game, template)
     try:
@@ -158,6 +159,18 @@ def _write_scr_drivers(folder: Path, car: str) -> None:
     file = folder / "drivers" / SCR_SERVER / f"{SCR_SERVER}.xml"
     file.parent.mkdir(parents=True)
     _write(root, file)
+
+
+def _forbid_learning(folder: Path, race: RaceSetup) -> None:
+    """
+    Keep robots from writing down what they learned: after a restart they would drive otherwise.
+
+    :param folder: private to the game
+    :param race: who races where
+    """
+    for module, _ in race.drivers:
+        if module != SCR_SERVER:
+            (folder / "drivers" / module).touch()  # where they would make a folder
 
 
 def _write(root: ElementTree.Element, file: Path) -> None:

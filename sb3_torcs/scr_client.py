@@ -49,7 +49,8 @@ class ScrClient:
     :param patience: without a word after which the server is given up [s]
     :param pause: before an action is said again [s], then twice that, and so on: servers but ours
         take each for the answer to another state, so it should be rare
-    :param latencies: to which the time from each state to its answer is added [s]
+    :param latencies: to which the time from each state to its answer is added [s], for a server
+        that does not wait
     :param watch: called while nothing comes; raises if the server has ended
     :raises ServerNotFound: if the host has no address
     """
@@ -68,6 +69,8 @@ class ScrClient:
         self.address = f"{host}:{port}"
         self.over = True
         """Whether the server has ended the race, or there was none yet."""
+        self.lost = 0
+        """States that another one followed before our answer: the server did not wait for it."""
         self._latencies = latencies
         self._arrived = 0.0
         self._angles = angles
@@ -114,6 +117,7 @@ class ScrClient:
         """
         if self._latencies is not None and message is not self._said:
             self._latencies.append(perf_counter() - self._arrived)
+            self.lost += self._is_late()
         self._said = message
         try:
             self._socket.send(message)
@@ -234,6 +238,13 @@ class ScrClient:
         except OSError:  # nothing is left, or an error that the next call will meet again
             return messages
 
+    def _is_late(self) -> bool:
+        """Say whether a newer state waits than the one that is answered now."""
+        with suppress(OSError):
+            following = self._take(socket.MSG_DONTWAIT | socket.MSG_PEEK)
+            return following != self._taken and not following.startswith(b"***")
+        return False
+
     def _newest(self, message: bytes) -> bytes | None:
         """
         Choose the newest state of those that wait.
@@ -244,7 +255,8 @@ class ScrClient:
         state = None
         for text in (message, *self._drain()):
             if not text.startswith(b"***"):
-                if text != self._taken:
+                if text not in (state, self._taken):
+                    self.lost += state is not None
                     state = text
             elif text.startswith((SHUTDOWN, RESTART)):
                 self.over = True

@@ -50,7 +50,7 @@ def test_for_people_it_prints_three_lines(race, capsys):
     assert main(["compete", "scripted", "--port", str(port), "--track", "a-speedway"]) == 0
     first, second, third = capsys.readouterr().out.splitlines()
     assert re.fullmatch(r"lap times s: [\d.]+; \d+ m", first)
-    assert re.fullmatch(r"lost ticks: \d+ of \d+", second)
+    assert re.fullmatch(r"lost ticks: \d+; answers: \d+", second)
     assert re.fullmatch(r"answer ms: median .*, 99 % within .*, longest .*", third)
 
 

@@ -14,6 +14,7 @@ import pytest
 from third_party import ThirdParty
 
 from sb3_torcs.cli import main
+from sb3_torcs.display import VirtualDisplay
 
 pytestmark = pytest.mark.usefixtures("game")
 
@@ -44,10 +45,10 @@ def folder(tmp_path):
     assert list(tmp_path.glob("sb3-torcs-*")) == []
 
 
-def serve(folder, port, *words):
+def serve(folder, port, *words, **variables):
     call = [sys.executable, "-m", "sb3_torcs.cli", "serve", "--port", str(port), *words]
     return subprocess.Popen(
-        call, env={**os.environ, "TMPDIR": str(folder)}, text=True,
+        call, env={**os.environ, "TMPDIR": str(folder), **variables}, text=True,
         stdout=subprocess.PIPE, stderr=subprocess.PIPE,
     )  # fmt: skip
 
@@ -133,10 +134,31 @@ def test_a_client_that_thinks_too_long_loses_ticks_and_is_told(folder):
     assert decisions > client.answers
 
 
+def test_a_window_shows_the_race(folder):
+    port = free_ports()
+    with VirtualDisplay((320, 240)) as display:
+        words = ("--track", "a-speedway", "--laps", "1", "--wait", "--window")
+        process = serve(folder, port, *words, DISPLAY=display.name)
+        with ThirdParty(port) as client:
+            client.identify()
+            assert client.drive(100) != b""
+            windows = subprocess.run(
+                ["xwininfo", "-root", "-tree", "-display", display.name],
+                capture_output=True, text=True, check=True,
+            )  # fmt: skip
+            assert "torcs" in windows.stdout.lower()
+            process.send_signal(signal.SIGINT)
+            _, err = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 130, err
+    assert games_of(folder) == []
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--deadline", "0"], "--deadline is 0 ms; expected more than 0, or --wait"),
+        (["--deadline", "0"], "--deadline is 0 ms; expected 0.001 to 3.6e+06, or --wait"),
+        (["--deadline", "0.0001"], "--deadline is 0.0001 ms"),
+        (["--deadline", "inf"], "--deadline is inf ms"),
         (["--drivers", "11"], "scr_server has no driver 10; expected 0 to 9"),
         (["--track", "forzza"], "no track 'forzza'; did you mean 'forza'?"),
         (["--robots", "infernal"], "no robot 'infernal'; did you mean 'inferno'?"),

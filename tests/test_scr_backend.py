@@ -6,12 +6,14 @@ import contextlib
 import gc
 import os
 import pickle
+import re
 import runpy
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -23,9 +25,11 @@ from stable_baselines3.common.vec_env import SubprocVecEnv
 from sb3_torcs.backends import scr
 from sb3_torcs.backends.native import NativeBackend
 from sb3_torcs.backends.scr import ScrBackend
+from sb3_torcs.backends.scr_car import CarReader
 from sb3_torcs.backends.scr_gearbox import read_gearbox
 from sb3_torcs.car import Controls, Start
 from sb3_torcs.drivers import ScriptedDriver
+from sb3_torcs.driving import Agent
 from sb3_torcs.errors import (
     CarFileError,
     EngineForked,
@@ -37,6 +41,11 @@ from sb3_torcs.errors import (
     UnknownCar,
     UnknownRobot,
 )
+from sb3_torcs.game import find_game
+from sb3_torcs.race_file import RaceSetup
+from sb3_torcs.scr_game import open_ports, start_server
+from sb3_torcs.scr_protocol import SHUTDOWN, ScrState
+from sb3_torcs.tracks import load_track
 
 pytestmark = pytest.mark.usefixtures("game")
 
@@ -274,6 +283,62 @@ def test_a_car_that_was_taken_out_stands():
     assert [round(car.time, 6) for car in cars] == [0.1, 0.2, 0.3, 0.4]
     assert cars[-1].speed_x == 0.0
     assert cars[-1].distance_raced == cars[-2].distance_raced
+
+
+class LastLap(Loopback):
+    """A race that ends at the line: its last state tells the lap's time."""
+
+    def state(self):
+        state = super().state()
+        return state if self.tick < self.ticks else state._replace(lap_time=0.0, last_lap_time=70.0)
+
+    def say(self, message):
+        if message.startswith(SHUTDOWN):
+            self.send_state()
+        super().say(message)
+
+
+def test_the_last_lap_counts_though_the_race_ends_in_mid_step():
+    with LastLap(ticks=8) as server:
+        world = ScrBackend("aalborg", host=server.host, port=server.port)
+        world.reset(rng(), None)
+        cars = [world.step(STRAIGHT_ON, 5) for _ in range(3)]
+        world.close()
+    assert [car.laps for car in cars] == [0, 1, 1]
+    assert cars[1].last_lap_time == 70.0
+
+
+@pytest.mark.parametrize("think", [0.012, 0.2])
+def test_both_sides_count_the_same_lost_ticks(think):
+    """In real time; an answer that crosses the next state on its way may count on one side only."""
+    (bound,) = open_ports(1)
+    race = RaceSetup("a-speedway", [("scr_server", 0)], laps=1)
+    with start_server(find_game(), race, [bound], deadline=0.01) as game:
+        host, port = bound.getsockname()
+        bound.close()
+        settings = {"track": "a-speedway", "host": host, "port": port, "action_repeat": 1}
+        agent = Agent("scripted", settings)
+        pauses = [think] * 10
+        decide = agent.driver.predict
+
+        def predict(*words, **named):
+            time.sleep(pauses.pop() if pauses else 0.0)
+            return decide(*words, **named)
+
+        agent.driver = SimpleNamespace(predict=predict)
+        agent.drive()
+        game.wait(20.0)
+        (told,) = re.findall(r"decisions, (\d+) late", game.words())
+    assert agent.backend.lost_ticks > 0
+    assert abs(int(told) - agent.backend.lost_ticks) <= 2
+
+
+def test_the_time_goes_on_at_the_first_line_after_a_flying_start():
+    """The lap clock begins anew there, and no lap tells how long the tick was."""
+    reader = CarReader(load_track("aalborg"))
+    reader.begin(ScrState(lap_time=70.0))
+    cars = [reader.read(ScrState(lap_time=clock), 5) for clock in (70.11, 0.05, 0.16)]
+    assert [car.time for car in cars] == pytest.approx([70.11, 70.22, 70.33])
 
 
 # ---- When things break ---------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+from array import array
 
 import numpy as np
 import pytest
@@ -85,6 +86,24 @@ def test_of_several_states_the_newest_is_taken():
         assert parse_state(client.receive()).distance_from_start == 7.0
         assert first != client._taken
         client.close()
+
+
+def test_ticks_that_were_lost_are_counted():
+    """A state that another one followed, before it was answered or without ever being."""
+    with Loopback() as server:
+        client = client_of(server, latencies=array("d"))
+        client.identify()
+        message = client.receive()
+        answer(client, message)  # in time
+        message = client.receive()
+        for tick in (5, 6, 7):
+            server.tick = tick
+            server.send_state()
+            server.send_state()  # doubled
+        answer(client, message)  # late, and 5 and 6 are passed over
+        assert parse_state(client.receive()).distance_from_start == 7.0
+        client.close()
+    assert client.lost == 3
 
 
 def test_a_state_that_comes_twice_is_taken_once():

@@ -429,6 +429,30 @@ class TestRestart:
         fresh.identify()
         assert drive(fresh, fresh.receive(), 400) == first
 
+    def test_robots_that_learn_begin_anew(self, serve):
+        """bt would write down what it learned, and drive otherwise from its first corner on."""
+        _, client = serve([("bt", 1), DRIVER], track="g-track-1", laps=3)
+        start = " (start 100 0 0 10)"
+        client.identify(start)
+        first = drive(client, client.receive(), 1500)
+        client.receive()
+        assert client.ask("(meta 1)") == b"***restart***\0"
+        client.identify(start)
+        assert drive(client, client.receive(), 450) == first[:450]
+
+    def test_asked_for_while_another_driver_thinks(self, serve):
+        _, first, second = serve([DRIVER, ("scr_server", 1)])
+        first.identify()
+        second.identify()
+        first.receive()
+        first.send(STAND)
+        second.receive()
+        first.send("(meta 1)")  # before the state that it might answer
+        second.send(STAND)
+        while not second.receive().startswith(b"***restart***"):
+            second.send(STAND)
+        assert first.receive() == b"***restart***\0"
+
     def test_often(self, serve):
         process, client = serve()
         client.identify()
@@ -467,6 +491,28 @@ class TestRestart:
 def memory(pid):
     """Read what a process has in memory [kB]."""
     return int(re.search(r"VmRSS:\s+(\d+)", Path(f"/proc/{pid}/status").read_text())[1])
+
+
+class TestThinking:
+    """Clients that wait for the game and let it wait for them."""
+
+    def test_a_game_that_waits_is_driven_the_same_at_any_speed(self, serve):
+        def driven(pauses):
+            state = client.receive()
+            states = []
+            for pause in pauses:
+                time.sleep(pause)
+                states.append(state)
+                state = client.ask(action(state))
+            client.ask("(meta 1)")
+            client.identify(" (start 100 0 0 20)")
+            return states
+
+        _, client = serve()
+        client.identify(" (start 100 0 0 20)")
+        quick = driven([0.0] * 40)
+        assert driven([0.012] * 40) == quick
+        assert driven([0.2] * 5) == quick[:5]
 
 
 # ---- What goes wrong ----------------------------------------------------------------------------
@@ -569,6 +615,19 @@ class TestDeadline:
         assert min(steps) > 0.03
         assert speeds[0] < 1000
         assert max(speeds) > 3000
+        assert process.poll() is None
+
+    def test_who_was_late_once_does_not_lag_behind(self, serve):
+        """A client that answers state after state, and does not say which."""
+        process, client = serve(deadline=0.2)
+        client.identify()
+        state = client.receive()
+        time.sleep(0.3)
+        for _ in range(20):
+            before, state = state, client.ask(STAND)
+            time.sleep(0.005)
+        assert state != before
+        client.nothing_comes()
         assert process.poll() is None
 
     def test_a_silent_client_stands_on_the_brake(self, serve):

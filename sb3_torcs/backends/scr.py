@@ -107,8 +107,7 @@ class ScrBackend:
         self._process: GameProcess | None = None
         self._client: ScrClient | None = None
         self._reader = CarReader(self.track)
-        self.lost_ticks = 0
-        """Control ticks that went by between two states: answers came too late for them."""
+        self._lost_before = 0  # of a client that has hung up
         self.latencies = array("d")
         """From the arrival of each state to our answer [s], at a host of its own."""
         self._owner = os.getpid()
@@ -141,10 +140,11 @@ class ScrBackend:
             raise ServerLost("the game is not there; call reset, which begins anew")
         self._drive.append((controls, ticks))
         try:
-            if self._hold(client, controls, ticks):
-                self._state = self._reader.read(parse_state(self._message), ticks)
-            else:
-                self._state = _standing(self._state, ticks)
+            driven = self._hold(client, controls, ticks)
+            if driven:
+                self._state = self._reader.read(parse_state(self._message), driven)
+            if driven < ticks:
+                self._state = _standing(self._state, ticks - driven)
         except ServerLost as error:
             failure = self._failure(error)
             self._hang_up()
@@ -158,6 +158,11 @@ class ScrBackend:
     def over(self) -> bool:
         """Whether the race has ended, or has not begun; a car in it stands then."""
         return self._client is None or self._client.over
+
+    @property
+    def lost_ticks(self) -> int:
+        """Control ticks for which an answer came too late, or none; since the world was made."""
+        return self._lost_before + (0 if self._client is None else self._client.lost)
 
     def close(self) -> None:
         """End the game, or leave the server."""
@@ -244,7 +249,6 @@ class ScrBackend:
         while (message := client.receive()) is not None:
             lap_time = parse_engine(message).lap_time
             if lap_time >= 0.0:
-                self._answered = lap_time
                 return message
             if start is not None:
                 raise InvalidOption(
@@ -255,32 +259,31 @@ class ScrBackend:
             client.send(_action(STANDING, 0, lap_time))
         raise ServerLost(f"the race at {client.address} ended before it began; call reset again")
 
-    def _hold(self, client: ScrClient, controls: Controls, ticks: int) -> bool:
+    def _hold(self, client: ScrClient, controls: Controls, ticks: int) -> int:
         """
         Drive one tick after the other; the last message is that of the new state.
 
         :param client: our side of the conversation
         :param controls: as of ``step``
         :param ticks: as of ``step``
-        :return: whether the race went on so long
+        :return: for how many of them the race went on
         """
-        for _ in range(ticks):
+        for tick in range(ticks):
             if client.over:
-                return False
+                return tick
             lap_time, gear, speed = parse_engine(self._message)
-            self.lost_ticks += max(round((lap_time - self._answered) / CONTROL_TICK) - 1, 0)
-            self._answered = lap_time
             gear = self._gearbox.choose(gear, speed) if controls.gear is None else controls.gear
             client.send(_action(controls, gear, lap_time))
             message = client.receive()
             if message is None:
-                return False
+                return tick
             self._message = message
-        return True
+        return ticks
 
     def _hang_up(self) -> None:
         """Leave the server, and end the game if it is ours."""
         if self._client is not None:
+            self._lost_before += self._client.lost
             self._client.close()
             self._client = None
         if self._process is not None:

@@ -38,6 +38,7 @@ class CarReader:
         self._time = state.lap_time
         self._laps = 0
         self._best = 0.0
+        self._tick = CONTROL_TICK
         self._yaw: float | None = None
         self._raced = state.distance_raced
         # The way since the start has six digits of an ever larger number. The place on the lap is
@@ -57,11 +58,13 @@ class CarReader:
         before, self._before = self._before, state
         duration = state.lap_time - before.lap_time
         if duration < 0.0:  # a lap has begun
-            duration = CONTROL_TICK * ticks
+            # The game's ticks take ten of its steps, or eleven: as those before.
+            duration = self._tick * ticks
             if state.last_lap_time > 0.0:
                 duration = state.last_lap_time - before.lap_time + state.lap_time
                 self._laps += 1
                 self._best = min(self._best or math.inf, state.last_lap_time)
+        self._tick = duration / ticks
         self._time += duration
         raced = self._lap_began + state.distance_from_start
         if abs(state.distance_raced - raced) > 0.5 * self._track.length:

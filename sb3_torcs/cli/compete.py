@@ -98,8 +98,7 @@ def _show(agent: Agent) -> None:
     figures = _figures(agent)
     times = ", ".join(f"{seconds:.3f}" for seconds in agent.lap_times) or "none"
     print(f"lap times s: {times}; {agent.distance:.0f} m")
-    total = figures["ticks"] + figures["lost_ticks"]
-    print(f"lost ticks: {figures['lost_ticks']} of {total}")
+    print(f"lost ticks: {figures['lost_ticks']}; answers: {figures['ticks']}")
     latency = figures["latency_ms"]
     print(
         f"answer ms: median {latency['median']:.2f}, 99 % within {latency['p99']:.2f}, "

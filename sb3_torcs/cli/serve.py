@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 __all__ = ["add_parser", "run"]
 
 DEFAULT_DEADLINE = 10.0  # [ms] as the SCR server has it
+SHORTEST_DEADLINE = 0.001  # [ms] the server counts in microseconds
+LONGEST_DEADLINE = 3_600_000.0  # [ms]
 REPORT = "scr_server "  # begins the lines that our drivers print when a race is over
 
 DESCRIPTION = """\
@@ -67,8 +69,11 @@ def run(args: argparse.Namespace) -> int:
     from sb3_torcs.race_file import SCR_SERVER, RaceSetup, session_for
     from sb3_torcs.scr_game import open_ports, start_server
 
-    if not args.deadline > 0.0:
-        raise InvalidOption(f"--deadline is {args.deadline:g} ms; expected more than 0, or --wait")
+    if not SHORTEST_DEADLINE <= args.deadline <= LONGEST_DEADLINE:
+        raise InvalidOption(
+            f"--deadline is {args.deadline:g} ms; expected {SHORTEST_DEADLINE:g} to "
+            f"{LONGEST_DEADLINE:g}, or --wait"
+        )
     game = find_game()
     robots = [game.parse_robot(name) for name in args.robots.split(",")] if args.robots else []
     drivers = [(SCR_SERVER, number) for number in range(args.drivers)] + robots

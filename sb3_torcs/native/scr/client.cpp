@@ -103,22 +103,28 @@ Init Client::identify() {
 
 std::optional<Action> Client::ask(const State& state) {
     late_answer_.reset();
+    answer_.reset();
     read_all(false);
+    if (answer_) return answer_;
     tell(state);
     decisions_++;
-    answer_.reset();
+    owed_++;
     const bool forever = deadline_ == Clock::duration::zero();
     const Clock::time_point until = Clock::now() + deadline_;
-    while (!answer_) {
+    // Who answers state after state, and was late, answers the older ones first. Taken for the answer
+    // to this one, they would keep him behind for the rest of the race.
+    while (!answer_ || (owed_ > 0 && !forever)) {
         watch_owner();
         const Clock::time_point next = Clock::now() + WATCH;
         if (wait(forever ? next : std::min(until, next))) read_all(true);
-        if (!answer_ && !forever && Clock::now() >= until) {
-            late_++;
-            return late_answer_;
-        }
+        if (!forever && Clock::now() >= until) break;
     }
-    return answer_;
+    if (answer_) {
+        owed_ = 0;
+        return answer_;
+    }
+    late_++;
+    return late_answer_;
 }
 
 void Client::tell(const State& state) {
@@ -175,7 +181,8 @@ void Client::read(std::string_view text, bool answers) {
     }
     if (!is_from_client()) return;
     const Action action = parse_action(text);
-    if (answers && action.lap_time.value_or(lap_time_) == lap_time_) {
+    owed_ = action.lap_time ? 0 : std::max(owed_ - 1, 0L);
+    if (action.restart || (answers && action.lap_time.value_or(lap_time_) == lap_time_)) {
         answer_ = action;
         return;
     }
@@ -188,6 +195,7 @@ void Client::adopt(std::string_view text) {
     client_ = sender_;
     client_size_ = sender_size_;
     identified_ = true;
+    owed_ = 0;
 }
 
 void Client::send(std::string_view text) const {

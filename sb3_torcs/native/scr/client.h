@@ -28,7 +28,7 @@ public:
     Init identify();
 
     // Sends a state and waits for what the client answers. Past the deadline that is nothing, or
-    // its late answer to an older state.
+    // its late answer to an older state. Who wants a restart gets no more states before.
     std::optional<Action> ask(const State& state);
 
     // Sends a state that needs no answer.
@@ -66,6 +66,7 @@ private:
     std::size_t state_size_ = 0;
     double lap_time_ = 0.0;  // [s] of that state, as it was written
     std::optional<Action> answer_, late_answer_;
+    long owed_ = 0;  // states that may still be answered, by who does not say which one he answers
     char message_[LONGEST_MESSAGE];
     long decisions_ = 0, late_ = 0;
 };
