@@ -1,18 +1,39 @@
-"""The evaluation protocol: drive some episodes and write down what happened."""
+"""The evaluation protocol: drive some episodes, write down what happened, and say what is better.
+
+It is written for people in ``docs/evaluation.md``; everything that compares drivers comes here.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 
-from sb3_torcs.car import CarState
+from sb3_torcs.car import CONTROL_TICK, CarState
 
-__all__ = ["Driver", "Episode", "Step", "drive", "evaluate"]
+__all__ = [
+    "KEPT",
+    "RACE_LAPS",
+    "Driver",
+    "Episode",
+    "Merit",
+    "Step",
+    "drive",
+    "evaluate",
+    "merit",
+    "race_environment",
+    "time_limit",
+]
+
+RACE_LAPS = 3  # from the grid in a row: what it takes to *complete* a track
+LONGEST_TRACK = 10000.0  # [m] for a random track, whose length is not known beforehand
+KEPT = ("track", "car", "reward", "action_repeat", "range_finders")
+"""What an evaluation takes from the training's environment, unless it is told otherwise."""
 
 
 class Driver(Protocol):
@@ -46,11 +67,82 @@ class Episode:
     damage: float  # [points]
     episode_return: float
 
+    @property
+    def finished(self) -> bool:
+        """Whether all laps that were asked for were driven, without leaving the road."""
+        return self.end == "laps"
+
+    @property
+    def race_time(self) -> float:
+        """Seconds from the start to the end of the last whole lap; 0 without one."""
+        return sum(self.lap_times)
+
+    @property
+    def flying_lap(self) -> float | None:
+        """The best lap [s] but the first one, which begins standing."""
+        return min(self.lap_times[1:], default=None)
+
     def as_dict(self) -> dict[str, Any]:
         """Return the fields as the command prints them."""
         fields = asdict(self)
         fields["return"] = fields.pop("episode_return")
         return fields
+
+
+class Merit(NamedTuple):
+    """How good races are, in the order in which it counts: greater is better."""
+
+    finished: int  # races whose laps were all driven
+    distance: float  # [m] in the others
+    haste: float  # [s] minus the time of those that were finished
+
+
+def merit(races: Sequence[Episode]) -> Merit:
+    """
+    Value races from the grid, one per track; a training keeps the model whose are the greatest.
+
+    On one track: three whole laps are better than none, then the shorter time is better; without
+    three whole laps, the longer way.
+
+    :param races: of one driver
+    :return: to be compared with that of another driver on the same tracks
+    """
+    finished = [race for race in races if race.finished]
+    others = [race.distance for race in races if not race.finished]
+    return Merit(len(finished), sum(others), -sum(race.race_time for race in finished))
+
+
+def time_limit(kwargs: Mapping[str, Any]) -> int:
+    """
+    Work out after how many decisions to give up: later than any drive that is not standing.
+
+    :param kwargs: of the environment, with ``laps``
+    :return: decisions
+    """
+    from sb3_torcs.envs.racing import STUCK_SPEED
+    from sb3_torcs.tracks import load_track
+
+    track = kwargs.get("track", "aalborg")
+    length = LONGEST_TRACK if track == "random" else load_track(track).length
+    # One lap more than asked for: the way from the grid to the line, and some patience.
+    seconds = (kwargs["laps"] + 1) * length / STUCK_SPEED
+    return math.ceil(seconds / (kwargs.get("action_repeat", 5) * CONTROL_TICK))
+
+
+def race_environment(
+    env_id: str, env_kwargs: Mapping[str, Any], track: str | None = None
+) -> gym.Env[Any, Any]:
+    """
+    Build the environment of an evaluation: three laps from the grid.
+
+    :param env_id: of the training
+    :param env_kwargs: of the training
+    :param track: instead of the training's
+    :return: the environment, which nothing but the race ends
+    """
+    kwargs = {name: env_kwargs[name] for name in KEPT if name in env_kwargs}
+    kwargs.update({"laps": RACE_LAPS}, **({} if track is None else {"track": track}))
+    return gym.make(env_id, max_episode_steps=time_limit(kwargs), **kwargs)
 
 
 def drive(env: gym.Env[Any, Any], driver: Driver, *, seed: int | None = None) -> Iterator[Step]:

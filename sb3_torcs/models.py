@@ -60,13 +60,12 @@ class NormalizedDriver:
     A model that learned from normalized observations, with the statistics it learned with.
 
     :param model: a Stable-Baselines3 model
-    :param statistics: a pickled ``VecNormalize``
+    :param statistics: a ``VecNormalize``
     """
 
-    def __init__(self, model: Any, statistics: Path) -> None:
-        with statistics.open("rb") as file:
-            self._statistics = pickle.load(file)
+    def __init__(self, model: Any, statistics: Any) -> None:
         self._model = model
+        self._statistics = statistics
 
     def predict(
         self, observation: npt.NDArray[np.float32], *, deterministic: bool = True
@@ -256,8 +255,14 @@ def load_driver(path: str | Path, env: gym.Env[Any, Any], algo: str | None = Non
     algorithm = _algorithm(algo or record.algo, data, model_file)
     # On the CPU: for one decision at a time it is the fastest, and it is always there. The
     # schedules are of no use to a driver, and the saved ones may be from another version.
-    model = algorithm.load(io.BytesIO(model_file.read_bytes()), device="cpu", buffer_size=1)
-    return NormalizedDriver(model, record.statistics) if record.statistics else model
+    # Nor is a memory: SB3 warns of the class that it chose itself for returns over several steps.
+    model = algorithm.load(
+        io.BytesIO(model_file.read_bytes()), device="cpu", buffer_size=1, replay_buffer_class=None
+    )
+    if record.statistics is None:
+        return model
+    with record.statistics.open("rb") as file:
+        return NormalizedDriver(model, pickle.load(file))
 
 
 def _algorithm(name: str | None, data: dict[str, Any], model: Path) -> Any:

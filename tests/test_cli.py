@@ -13,7 +13,7 @@ from fake_game import write_game
 from stable_baselines3 import DDPG
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_torcs import bench, models
+from sb3_torcs import bench, evaluation, game_process, models
 from sb3_torcs.cli import VERBS, common, doctor, evaluate, main, recording, train
 from sb3_torcs.cli.train import TrainOptions
 from sb3_torcs.errors import BackendUnavailable
@@ -244,9 +244,9 @@ def test_the_environment_is_that_of_the_training_unless_the_words_say_otherwise(
 def test_the_time_limit_cuts_no_lap_of_a_car_that_does_not_count_as_standing():
     """Three laps of 2587.5 m at 5 km/h take 5589 s, and a decision takes 0.1 s."""
     kwargs = {"track": "aalborg", "laps": 3}
-    assert evaluate.time_limit(kwargs) > 55890
-    assert evaluate.time_limit({**kwargs, "action_repeat": 1}) > 5 * 55890
-    assert evaluate.time_limit({**kwargs, "track": "random"}) > 55890
+    assert evaluation.time_limit(kwargs) > 55890
+    assert evaluation.time_limit({**kwargs, "action_repeat": 1}) > 5 * 55890
+    assert evaluation.time_limit({**kwargs, "track": "random"}) > 55890
 
 
 def decision(lap_time=None, distance=0.0):
@@ -419,7 +419,7 @@ def test_the_shipped_hyperparameters_train(tmp_path):
 
 PARTS = (
     "python", "TorcsLite-v0", "compiler", "extension", "game", "tracks", "cars", "layout",
-    "Torcs-v0", "text mode", "window",
+    "Torcs-v0", "game program", "game libraries", "window", "film",
 )  # fmt: skip
 
 
@@ -440,7 +440,7 @@ def test_the_doctor_is_content_with_the_game_and_the_engine(capsys, game):
     ok, found = doctor_says(capsys)
     assert ok, [check for check in found.values() if not check["ok"]]
     assert "21 road" in found["tracks"]["found"]
-    assert found["text mode"]["found"] == str(game.program)
+    assert found["game program"]["found"] == str(game.program)
 
 
 def test_the_doctor_is_not_content_without_the_game(capsys, monkeypatch, tmp_path):
@@ -454,9 +454,8 @@ def test_the_doctor_is_not_content_without_the_game(capsys, monkeypatch, tmp_pat
         assert found[part]["found"] == "there is no game to look at"
         assert found[part]["fix"] == found["game"]["fix"]
     assert not found["Torcs-v0"]["ok"]
-    # Nothing that drives in this process needs them.
-    assert found["text mode"]["ok"]
-    assert found["window"]["ok"]
+    # Nothing that drives in this process needs it.
+    assert found["game program"]["ok"]
 
 
 def test_the_doctor_names_each_missing_part(capsys, monkeypatch, tmp_path):
@@ -476,7 +475,22 @@ def test_the_doctor_names_each_missing_part(capsys, monkeypatch, tmp_path):
     assert "mud-1.xml: there are no track segments" in found["tracks"]["found"]
     assert found["cars"]["found"] == "1, no car1-trb1"
     assert found["layout"]["found"] == "not compared: the extension is missing"
-    assert "no torcs-bin" in found["text mode"]["found"]
+    assert "no torcs-bin" in found["game program"]["found"]
+
+
+def test_the_doctor_misses_what_only_the_games_own_program_needs(
+    capsys, monkeypatch, tmp_path, game
+):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.setattr(game_process, "__file__", str(tmp_path / "game_process.py"))
+    ok, found = doctor_says(capsys)
+    assert ok, "both environments drive without"
+    assert found["film"]["found"].startswith("no Xvfb; type: `sb3-torcs install-torcs --film`")
+    assert "`watch --film` and render_mode 'game'" in found["film"]["found"]
+    assert "no display; only for `watch`" in found["window"]["found"]
+    assert "_scr_server" in found["game libraries"]["found"]
+    assert doctor.BUILD in found["game libraries"]["found"]
 
 
 def test_the_doctor_compares_the_layout(capsys, monkeypatch, game):

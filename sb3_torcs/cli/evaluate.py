@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 from typing import TYPE_CHECKING, Any
 
 from sb3_torcs.cli.common import (
@@ -19,12 +18,9 @@ if TYPE_CHECKING:
     from sb3_torcs.evaluation import Episode
     from sb3_torcs.models import TrainingRecord
 
-__all__ = ["add_parser", "environment_kwargs", "run", "time_limit"]
+__all__ = ["add_parser", "environment_kwargs", "run"]
 
 DEFAULT_ENV = "TorcsLite-v0"
-LONGEST_TRACK = 10000.0  # [m] for a random track, whose length is not known beforehand
-KEPT = ("track", "car", "reward", "action_repeat", "range_finders")
-"""What is taken from the training's own environment, unless the command line says otherwise."""
 
 HEADERS = ("episode", "laps", "lap times s", "distance m", "end", "damage", "return")
 
@@ -96,7 +92,7 @@ def run(args: argparse.Namespace) -> int:
 def _drive(args: argparse.Namespace) -> tuple[list[Episode], Any]:
     """Build the environment, load the driver, drive."""
     from sb3_torcs.cli.recording import Recorder
-    from sb3_torcs.evaluation import evaluate
+    from sb3_torcs.evaluation import evaluate, time_limit
     from sb3_torcs.models import TrainingRecord, find_model, load_driver, training_record
     from sb3_torcs.zoo import check_racing
 
@@ -119,28 +115,12 @@ def environment_kwargs(args: argparse.Namespace, record: TrainingRecord) -> dict
     :param record: of the training
     :return: keyword arguments of the environment
     """
+    from sb3_torcs.evaluation import KEPT
+
     kwargs = {name: record.env_kwargs[name] for name in KEPT if name in record.env_kwargs}
     given = {name: getattr(args, name, None) for name in KEPT}
     kwargs.update({name: value for name, value in given.items() if value is not None})
     return {**kwargs, "laps": args.laps}
-
-
-def time_limit(kwargs: dict[str, Any]) -> int:
-    """
-    Work out after how many decisions to give up: later than any drive that is not standing.
-
-    :param kwargs: of the environment, with ``laps``
-    :return: decisions
-    """
-    from sb3_torcs.car import CONTROL_TICK
-    from sb3_torcs.envs.racing import STUCK_SPEED
-    from sb3_torcs.tracks import load_track
-
-    track = kwargs.get("track", "aalborg")
-    length = LONGEST_TRACK if track == "random" else load_track(track).length
-    # One lap more than asked for: the way from the grid to the line, and some patience.
-    seconds = (kwargs["laps"] + 1) * length / STUCK_SPEED
-    return math.ceil(seconds / (kwargs.get("action_repeat", 5) * CONTROL_TICK))
 
 
 def _row(number: int, episode: Episode) -> list[str]:
