@@ -31,6 +31,8 @@ __all__ = ["ScrClient"]
 
 LONGEST = 65535  # [bytes] of a datagram; some servers send pictures
 LOOKS = 50  # for an answer before this process sleeps: some 100 microseconds
+FULL_LUCK = 8  # at two for each look in vain, after how many it sleeps at once ...
+NO_LUCK = -200  # ... for so many answers
 FIRST_PAUSE = 1.0  # [s] before the first message is said again; servers take their time to load
 PAUSE = 1.0  # [s] before an action is said again
 PATIENCE = 10.0  # [s] without a word after which a server is given up
@@ -81,6 +83,7 @@ class ScrClient:
         self._taken = b""  # the last state
         self._buffer = memoryview(bytearray(LONGEST))
         self._timeout = 0.0
+        self._luck = FULL_LUCK
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._end = weakref.finalize(self, self._socket.close)
         try:
@@ -210,14 +213,29 @@ class ScrClient:
             # In Python's own time-out there is one more call of the system for each datagram.
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, times)
             self._timeout = pause
-        # To be woken takes longer than the game needs for a tick, so the answer is looked for a
-        # little while. Whoever else wants the processor has it in between.
-        for _ in range(LOOKS):
-            with suppress(BlockingIOError):
-                return self._take(socket.MSG_DONTWAIT)
-            os.sched_yield()
+        message = self._look()
+        if message is not None:
+            return message
         with suppress(BlockingIOError):
             return self._take()
+        return None
+
+    def _look(self) -> bytes | None:
+        """
+        Look for a datagram for a little while: to be woken takes longer than a tick of the game.
+
+        Not where that is in vain, as with more processes than processors.
+        """
+        if self._luck < 0:
+            self._luck += 1
+            return None
+        for _ in range(LOOKS):
+            with suppress(BlockingIOError):
+                message = self._take(socket.MSG_DONTWAIT)
+                self._luck = min(self._luck + 1, FULL_LUCK)
+                return message
+            os.sched_yield()
+        self._luck = self._luck - 2 if self._luck >= 2 else NO_LUCK
         return None
 
     def _take(self, flags: int = 0) -> bytes:

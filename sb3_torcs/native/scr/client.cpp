@@ -24,6 +24,8 @@ constexpr int FIRST_PORT = 3001;
 constexpr auto DEADLINE = 10ms;  // the server's usual one
 constexpr auto WATCH = 500ms;    // how often a wait looks for the game's owner
 constexpr auto AWAKE = 100us;    // how long a wait looks for an answer before it sleeps
+constexpr int FULL_LUCK = 8;     // at two for each look in vain, after how many it sleeps at once
+constexpr int NO_LUCK = -200;    // ... for so many waits
 
 Owner& owner() {
     static Owner owner;
@@ -140,15 +142,28 @@ void Client::dismiss(std::string_view reason) {
 
 // ---- Datagrams ----------------------------------------------------------------------------------
 
-// To be woken takes longer than many a client thinks: an answer is looked for a little while before
-// the game sleeps. Whoever else wants the processor has it in between.
-bool Client::wait(Clock::time_point until) const {
-    const Clock::time_point awake = std::min(until, Clock::now() + AWAKE);
+// To be woken takes longer than many a client thinks, so an answer is looked for a little while
+// before the game sleeps; but not where that is in vain, as with more processes than processors.
+bool Client::look(Clock::time_point until) {
+    if (luck_ < 0) {
+        ++luck_;
+        return false;
+    }
     pollfd looking{socket_, POLLIN, 0};
+    const Clock::time_point end = std::min(until, Clock::now() + AWAKE);
     do {
-        if (poll(&looking, 1, 0) > 0) return true;
+        if (poll(&looking, 1, 0) > 0) {
+            luck_ = std::min(luck_ + 1, FULL_LUCK);
+            return true;
+        }
         sched_yield();
-    } while (Clock::now() < awake);
+    } while (Clock::now() < end);
+    luck_ = luck_ >= 2 ? luck_ - 2 : NO_LUCK;
+    return false;
+}
+
+bool Client::wait(Clock::time_point until) {
+    if (look(until)) return true;
     const auto left = std::chrono::ceil<std::chrono::nanoseconds>(until - Clock::now());
     const auto nanoseconds = std::max<long>(left.count(), 0);
     const timespec timeout{nanoseconds / 1'000'000'000, nanoseconds % 1'000'000'000};

@@ -46,7 +46,8 @@ public:
 private:
     using Clock = std::chrono::steady_clock;
 
-    bool wait(Clock::time_point until) const;  // whether a datagram came
+    bool look(Clock::time_point until);
+    bool wait(Clock::time_point until);  // whether a datagram came
     std::optional<std::string_view> receive();  // the next one that has come
     bool is_from_client() const;
     // Everything that has come; `answers` is whether to the state that was sent last.
@@ -57,6 +58,7 @@ private:
     void send_state();
 
     int socket_ = -1;
+    int luck_ = 0;  // with looking for answers; below zero it does not
     bool opened_ = false, identified_ = false;
     Clock::duration deadline_{};  // zero waits for ever
     sockaddr_storage client_{}, sender_{};
