@@ -107,6 +107,7 @@ class SplitHeadPolicy(TD3Policy):
         )
 
     def _build(self, lr_schedule: Schedule) -> None:
+        self._exact: tuple[list[int], nn.Module] | None = None
         super()._build(lr_schedule)
         self.average = self._averaged()
         scale = self.own_kwargs["critic_lr_scale"]
@@ -136,7 +137,23 @@ class SplitHeadPolicy(TD3Policy):
         return self.actor if self.average is None else cast(Actor, self.average.module)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        return self.driver(observation) if deterministic else self.actor(observation)
+        if not deterministic:
+            return self.actor(observation)
+        features = self.driver.extract_features(observation, self.driver.features_extractor)
+        return self._exact_heads()(features.double()).float()
+
+    def _exact_heads(self) -> nn.Module:
+        """
+        Return the driver's network in double precision.
+
+        Processors round sums differently, and a car that is steered a hair otherwise is elsewhere
+        after a lap. Rounded from double to single precision, the actions are the same everywhere.
+        """
+        network = self.driver.mu
+        versions = [id(network), *(parameter._version for parameter in network.parameters())]
+        if self._exact is None or self._exact[0] != versions:
+            self._exact = (versions, copy.deepcopy(network).double())
+        return self._exact[1]
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
         """
@@ -170,6 +187,8 @@ class SplitHeadPolicy(TD3Policy):
 
         :param mode: ``True`` to train
         """
+        if mode:
+            self._exact = None  # an update by a fused optimizer leaves the versions as they were
         if mode != self.training:
             super().set_training_mode(mode)
 
@@ -245,7 +264,7 @@ class _EnvUnitActor(nn.Module):
         self.normalize_images = actor.normalize_images
         # Copies of the parts: the actor itself carries its optimizer and the hooks of a noise.
         self.features_extractor = copy.deepcopy(actor.features_extractor)
-        self.mu = copy.deepcopy(actor.mu)
+        self.mu = copy.deepcopy(actor.mu).double()  # as in SplitHeadPolicy
         low = th.as_tensor(actor.action_space.low)
         self.register_buffer("low", low)
         self.register_buffer("span", th.as_tensor(actor.action_space.high) - low)
@@ -253,7 +272,8 @@ class _EnvUnitActor(nn.Module):
     def forward(self, observation: th.Tensor) -> th.Tensor:
         prepared = preprocess_obs(observation, self.observation_space, self.normalize_images)
         # The order of operations is that of BasePolicy.unscale_action: same bits.
-        return self.low + 0.5 * (self.mu(self.features_extractor(prepared)) + 1.0) * self.span
+        scaled = self.mu(self.features_extractor(prepared).double()).float()
+        return self.low + 0.5 * (scaled + 1.0) * self.span
 
 
 def export_actor(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 
@@ -264,6 +265,38 @@ def test_the_average_drives_when_nothing_is_left_to_chance():
     drives, explores = (model.predict(OBSERVATIONS, deterministic=known)[0] for known in (1, 0))
     np.testing.assert_array_equal(drives, model.policy.unscale_action(scaled))
     assert not np.array_equal(drives, explores)
+
+
+@pytest.mark.parametrize("ema_decay", [None, 0.9])
+def test_predictions_follow_the_training(ema_decay):
+    """They come from a copy in double precision, which must not be an old one."""
+    model = make_model(ema_decay=ema_decay, init_std=0.5)
+    for _ in range(3):
+        model.learn(8, reset_num_timesteps=False)
+        expected = model.policy.driver(th.as_tensor(OBSERVATIONS)).detach().numpy()
+        found = model.predict(OBSERVATIONS, deterministic=True)[0]
+        np.testing.assert_allclose(found, model.policy.unscale_action(expected), atol=1e-6)
+
+
+def test_a_processor_that_rounds_otherwise_drives_the_same(tmp_path):
+    """PyTorch's kernels for the oldest processors stand for another machine."""
+    model = make_model(net_arch=[128, 128], layer_norm=True, init_std=0.5)
+    model.save(tmp_path / "model")
+    np.save(tmp_path / "seen.npy", np.random.default_rng(1).uniform(-1, 1, (2000, 29)))
+    code = (
+        "import sys, numpy as np; from stable_baselines3 import DDPG; folder = sys.argv[1];"
+        "model = DDPG.load(folder + '/model', device='cpu');"
+        "seen = np.load(folder + '/seen.npy').astype(np.float32);"
+        "drive = lambda row: model.predict(row, deterministic=True)[0];"
+        "np.save(sys.argv[2], [drive(row) for row in seen])"
+    )
+    drives = []
+    for number, kernels in enumerate(({}, {"ATEN_CPU_CAPABILITY": "default"})):
+        file = tmp_path / f"{number}.npy"
+        command = [sys.executable, "-c", code, str(tmp_path), str(file)]
+        subprocess.run(command, check=True, env={**os.environ, **kernels})
+        drives.append(np.load(file))
+    np.testing.assert_array_equal(*drives)
 
 
 def test_averaging_changes_no_bit_of_the_training():
