@@ -72,7 +72,7 @@ check-codestyle: install ## check the format only
 
 lint: install ## lint code and hyperparameter files
 	$(BIN)/ruff check .
-	$(BIN)/yamllint --strict zoo_configs
+	$(BIN)/yamllint --strict zoo_configs examples/studies
 
 type: install ## check types
 	$(BIN)/mypy

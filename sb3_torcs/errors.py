@@ -28,10 +28,12 @@ __all__ = [
     "NoiseNotBound",
     "OutputNotWritable",
     "PortTaken",
+    "RayUnavailable",
     "RobotUnavailable",
     "Sb3TorcsError",
     "ServerLost",
     "ServerNotFound",
+    "StudyError",
     "TrackFileError",
     "TrackNotFound",
     "UnknownCar",
@@ -151,6 +153,14 @@ class NoiseNotBound(Sb3TorcsError, RuntimeError):
 
 class OutputNotWritable(Sb3TorcsError, OSError):
     """A folder or file that results should go to cannot be written."""
+
+
+class StudyError(Sb3TorcsError, ValueError):
+    """A study's file or folder says something that cannot be done."""
+
+
+class RayUnavailable(Sb3TorcsError, RuntimeError):
+    """A study needs Ray, which is not installed or does not answer."""
 
 
 class ZooConfigError(Sb3TorcsError, ValueError):

@@ -123,6 +123,12 @@ def test_the_vocabulary_is_pure(path):
     assert forbidden(path, packages | {"sb3_torcs.envs"}) == []
 
 
+@pytest.mark.parametrize("path", FILES, ids=named)
+def test_one_file_knows_the_cluster(path):
+    """And imports it only when a study is run: nothing else needs Ray."""
+    assert forbidden(path, {"ray"}, lazy_too=named(path) != "study.py") == []
+
+
 @pytest.mark.parametrize("path", of({"backends"}), ids=named)
 def test_worlds_know_nothing_of_agents(path):
     assert forbidden(path, {"gymnasium", "torch", "stable_baselines3", "rl_zoo3"}) == []

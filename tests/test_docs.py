@@ -24,6 +24,7 @@ from sb3_torcs.envs.torcs import TorcsEnv
 from sb3_torcs.envs.torcs_lite import TorcsLiteEnv
 from sb3_torcs.noise import BLOG
 from sb3_torcs.sensors import RANGE_FINDERS, sensor_table
+from sb3_torcs.study_file import read_study
 from sb3_torcs.tracks import BUNDLED_FOLDER, load_track
 
 ROOT = Path(__file__).parent.parent
@@ -325,8 +326,8 @@ def test_a_command_in_the_docs_parses_and_names_what_exists(page, line, parsed, 
 @pytest.mark.parametrize(("page", "line"), MENTIONED)
 def test_a_command_in_the_text_parses(page, line, parsed):
     match shlex.split(line):
-        case ["sb3-torcs", "evaluate" | "watch" | "compete"]:
-            pass  # the verb alone, which needs to be told who drives
+        case ["sb3-torcs", "evaluate" | "watch" | "compete" | "study" | "report"]:
+            pass  # the verb alone, which needs to be told what to do it with
         case ["sb3-torcs", *words]:
             parsed(words)
         case ["make", target, *_]:
@@ -345,6 +346,8 @@ def check(args, monkeypatch):
         words = ["--algo", args.algo, "--env", args.env, *args.zoo_args]
         changed = parsed_by_the_zoo(["--gym-packages", "sb3_torcs", *words], monkeypatch)
         assert set(changed.hyperparams or ()) <= set(entry)
+    if args.verb == "study":
+        assert read_study(args.file).trials
     if args.verb == "evaluate":
         run = re.fullmatch(
             r"logs/(?:\w+/)?(\w+)/Torcs(?:Lite)?-v0_1(?:/best_model\.zip)?", args.model

@@ -13,8 +13,10 @@ from sb3_torcs.cli import (
     doctor,
     evaluate,
     install_torcs,
+    report,
     robots,
     serve,
+    study,
     tracks,
     train,
     watch,
@@ -26,7 +28,10 @@ __all__ = ["main"]
 USAGE_ERROR = 2
 INTERRUPTED = 130
 READER_LEFT = 141
-VERBS = (doctor, install_torcs, tracks, train, evaluate, watch, robots, serve, compete, bench)
+VERBS = (
+    doctor, install_torcs, tracks, train, evaluate, watch, study, report, robots, serve, compete,
+    bench,
+)  # fmt: skip
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -1,0 +1,47 @@
+"""Measure the laps that the ladder compares with: the scripted driver and robots, on all tracks."""
+
+import argparse
+import csv
+from pathlib import Path
+
+import sb3_torcs
+from sb3_torcs.drivers import ScriptedDriver
+from sb3_torcs.evaluation import RACE_LAPS, evaluate, race_environment
+from sb3_torcs.game import find_game
+from sb3_torcs.ladder import REFERENCE_FIELDS, REFERENCE_FILE, ROBOTS, SCRIPTED
+from sb3_torcs.robots import race
+from sb3_torcs.tracks import available_tracks
+
+CAR = "car1-trb1"
+
+parser = argparse.ArgumentParser(description=__doc__)
+parser.add_argument("--tracks", nargs="+", help="category/name; default: all")
+parser.add_argument("--out", type=Path, default=REFERENCE_FILE)
+args = parser.parse_args()
+
+
+def scripted(track):
+    """Lap times [s] of the driver without a network."""
+    env = race_environment("Torcs-v0", {"car": CAR}, track)
+    (episode,) = evaluate(env, ScriptedDriver())
+    env.close()
+    return episode.lap_times
+
+
+def robot(name, track):
+    """Lap times [s] of a robot in the car of the class."""
+    (result,) = race([find_game().parse_robot(name)], track, RACE_LAPS)
+    return [lap.time for lap in result.laps] if result.car == CAR else []
+
+
+with args.out.open("w", newline="", encoding="utf-8") as file:
+    file.write(f"# python examples/reference_laps.py, sb3_torcs {sb3_torcs.__version__}\n")
+    writer = csv.writer(file, lineterminator="\n")
+    writer.writerow(REFERENCE_FIELDS)
+    for track in args.tracks or [f"{s.category}/{s.name}" for s in available_tracks()]:
+        for driver in (SCRIPTED, *ROBOTS):
+            laps = scripted(track) if driver == SCRIPTED else robot(driver, track)
+            whole = len(laps) == RACE_LAPS
+            times = (f"{laps[0]:.3f}", f"{min(laps[1:]):.3f}") if whole else ("", "")
+            writer.writerow((track.rpartition("/")[2], driver, CAR, *times))
+            print(f"{track}: {driver} {', '.join(f'{lap:.3f}' for lap in laps) or 'no lap'}")

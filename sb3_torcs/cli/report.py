@@ -1,0 +1,39 @@
+"""``sb3-torcs report``: the learning curves and tables of a study."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from sb3_torcs.cli.common import writable_folder
+
+__all__ = ["add_parser", "run"]
+
+
+def add_parser(subparsers: Any) -> None:
+    """
+    :param subparsers: of the command
+    """
+    parser = subparsers.add_parser(
+        "report",
+        help="learning curves and tables of a study, every seed shown",
+        description="Write report.md and its pictures from the results of a study, also while it "
+        "still runs.",
+    )
+    parser.add_argument("folder", metavar="FOLDER", help="of the study, e.g. logs/studies/smoke")
+    parser.add_argument("--output", metavar="DIR", help="for the report; default: FOLDER")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """
+    :param args: from the command line
+    :return: the exit status
+    """
+    from sb3_torcs.study_report import read_results, write_report
+
+    folder = Path(args.folder).expanduser()
+    read_results(folder)  # before anything is made
+    print(write_report(folder, writable_folder(args.output or folder)))
+    return 0

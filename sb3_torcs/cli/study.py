@@ -1,0 +1,161 @@
+"""``sb3-torcs study``: train and measure many agents, on the local cores or a Ray cluster."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sb3_torcs.cli.common import positive, print_json, quiet_output, writable_folder
+
+if TYPE_CHECKING:
+    from sb3_torcs.study_file import Study, Trial
+
+__all__ = ["Board", "add_parser", "run"]
+
+INTERRUPTED = 130
+COLUMNS = ("variant", "seed", "decisions", "laps", "best lap s", "completes", "state")
+
+DESCRIPTION = """\
+Run a study: every variant with every seed is trained, evaluated while it learns, and its best model
+measured on the study's tracks. docs/evaluation.md says what FILE holds and how results are meant.
+
+Ctrl-C, or a kill, loses at most what was learned since the last evaluation: the same command goes
+on, and comes to the same results. So it does when a machine of a cluster is lost.
+"""
+
+
+def add_parser(subparsers: Any) -> None:
+    """
+    :param subparsers: of the command
+    """
+    parser = subparsers.add_parser(
+        "study",
+        help="train and measure many agents: variants by seeds, on all cores or a cluster",
+        description=DESCRIPTION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add("file", metavar="FILE.yml", help="e.g. examples/studies/smoke.yml")
+    add("--folder", metavar="DIR", help="for results; default: logs/studies/NAME")
+    where = parser.add_mutually_exclusive_group().add_argument
+    where("--jobs", type=positive, metavar="N", help="agents at a time; default: one per core")
+    where("--address", metavar="A", help="of a Ray cluster that this machine belongs to, or auto")
+    add("--json", action="store_true", help="print one JSON object and nothing else")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """
+    :param args: from the command line
+    :return: the exit status
+    """
+    from sb3_torcs.study import require_ray, run_study
+    from sb3_torcs.study_file import read_study
+    from sb3_torcs.study_folder import StudyFolder
+
+    require_ray(args.address)
+    study = read_study(args.file)
+    folder = writable_folder(args.folder or Path("logs") / "studies" / study.name)
+    board = Board(study)
+    interrupted = contextlib.suppress(KeyboardInterrupt)  # Tune swallows it, others do not
+    with interrupted, quiet_output(args.json), board.shown():
+        run_study(study, folder, jobs=args.jobs, address=args.address, progress=board.update)
+    place = StudyFolder(folder)
+    results = place.write_results(study)
+    left = [trial for trial in study.trials if not place.ended(trial)]
+    failed = board.errors()
+    if args.json:
+        print_json({"study": study.name, "results": str(results), "trials": board.as_json()})
+    else:
+        for name, error in failed.items():
+            print(f"{name} failed: {error}")
+        ended = len(study.trials) - len(left)
+        print(f"{ended} of {len(study.trials)} agents trained and measured; results: {results}")
+        print("go on with:" if left else "see them:")
+        print(f"  {_command(args) if left else shlex.join(['sb3-torcs', 'report', str(folder)])}")
+    return INTERRUPTED if len(left) > len(failed) else int(bool(failed))
+
+
+def _command(args: argparse.Namespace) -> str:
+    """Compose the command line that goes on."""
+    words = ["sb3-torcs", "study", args.file]
+    for name in ("folder", "jobs", "address"):
+        if getattr(args, name) is not None:
+            words += [f"--{name}", str(getattr(args, name))]
+    return shlex.join(words)
+
+
+class Board:
+    """
+    One line per trial: how far it is, and its best so far.
+
+    :param study: whose trials they are
+    """
+
+    def __init__(self, study: Study) -> None:
+        self._study = study
+        self._rows: dict[str, dict[str, Any]] = {trial.name: {} for trial in study.trials}
+        self._live: Any = None
+
+    def update(self, trial: Trial, row: dict[str, Any]) -> None:
+        """
+        Note what is new.
+
+        :param trial: which one
+        :param row: of its results, or its state
+        """
+        line = self._rows[trial.name]
+        line.update({key: row[key] for key in ("state", "error") if key in row})
+        if row.get("phase") == "train":
+            line["decisions"] = row["decisions"]
+            if row["kept"]:
+                line.update({key: row[key] for key in ("laps", "completes", "best_flying_lap_s")})
+        if self._live is not None:
+            self._live.update(self._table(), refresh=True)
+
+    def errors(self) -> dict[str, str]:
+        """Return what the trials that failed have said, by name."""
+        return {name: row["error"] for name, row in self._rows.items() if "error" in row}
+
+    def as_json(self) -> list[dict[str, Any]]:
+        """Return the lines as plain values."""
+        return [
+            {"variant": trial.variant, "seed": trial.seed, **self._rows[trial.name]}
+            for trial in self._study.trials
+        ]
+
+    @contextlib.contextmanager
+    def shown(self) -> Iterator[None]:
+        """Show the table on standard error as long as it lasts, if somebody looks."""
+        from rich.console import Console
+        from rich.live import Live
+
+        console = Console(stderr=True)
+        if not console.is_terminal:
+            yield
+            return
+        with Live(self._table(), console=console, auto_refresh=False) as self._live:
+            yield
+        self._live = None
+
+    def _table(self) -> Any:
+        from rich.table import Table
+
+        table = Table(*COLUMNS, title=self._study.name, box=None)
+        for trial in self._study.trials:
+            row = self._rows[trial.name]
+            lap, completes = row.get("best_flying_lap_s"), row.get("completes")
+            table.add_row(
+                trial.variant,
+                str(trial.seed),
+                f"{row.get('decisions', 0)} / {trial.budget}",
+                str(row.get("laps", "")),
+                f"{lap:.3f}" if lap else "",
+                {None: "", True: "yes", False: "no"}[completes],
+                row.get("state", "waits"),
+            )
+        return table

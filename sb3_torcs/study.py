@@ -1,0 +1,320 @@
+"""Studies: every variant with every seed, as trials of Ray Tune on the local cores or a cluster.
+
+Whatever a trial has come to goes to one keeper, an actor beside the driver, which writes it to the
+study's folder. A trial that is begun again, because its worker was lost or the whole study was
+killed, asks the keeper what there is and goes on from there; workers need no disk of their own.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sb3_torcs.errors import RayUnavailable
+from sb3_torcs.study_file import Study, Trial
+from sb3_torcs.study_folder import Files, StudyFolder
+
+__all__ = ["Keeper", "Progress", "require_ray", "run_study", "run_trial"]
+
+RETRIES = 3  # of a trial whose worker was lost or whose code failed, per run of the command
+SESSION = ".session"  # where a killed run's temporary files are
+
+Progress = Callable[[Trial, dict[str, Any]], None]
+"""Called with a trial and the last of its rows, or with ``{"state": …}``."""
+
+QUIET = {
+    "RAY_AIR_NEW_OUTPUT": "0",
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
+    "RAY_CHDIR_TO_TRIAL_DIR": "0",
+    "TUNE_DISABLE_AUTO_CALLBACK_LOGGERS": "1",
+    "TUNE_WARN_THRESHOLD_S": "1000000",
+}
+"""Ray shall phone nobody, write no logs of its own, and leave the working folder alone."""
+
+
+IMPATIENT = {"RAY_NUM_REDIS_GET_RETRIES": "1"}
+"""A cluster that does not answer is told within a minute; Ray would try for eight."""
+
+
+@dataclass
+class Keeper:
+    """
+    Keeps what trials have come to. Has the disk to itself, so that nothing is written twice.
+
+    :param study: that is run
+    :param folder: its folder
+    """
+
+    study: Study
+    folder: StudyFolder
+
+    def state(self, trial: Trial) -> tuple[Files | None, bool, list[str]]:
+        """
+        Tell what there is of a trial.
+
+        :param trial: of the study
+        :return: the files to go on from, if any; whether the training is over; tracks on which the
+            best model is still to be measured
+        """
+        over = self.folder.trained(trial)
+        source = self.folder.of(trial) if over else self.folder.checkpoint(trial)
+        files = None
+        if source is not None:
+            files = {file.name: file.read_bytes() for file in source.iterdir() if file.is_file()}
+        return files, over, self.folder.missing(trial)
+
+    def put(self, trial: Trial, files: Files, rows: list[dict[str, Any]]) -> None:
+        """
+        Take the state after an evaluation.
+
+        :param trial: of the study
+        :param files: of its checkpoint
+        :param rows: of its evaluations so far
+        """
+        self.folder.put(trial, files, rows)
+        self.folder.write_results(self.study)
+
+    def put_finals(self, trial: Trial, rows: list[dict[str, Any]]) -> None:
+        """
+        Take the final measurements.
+
+        :param trial: of the study
+        :param rows: one per track
+        """
+        self.folder.put_finals(trial, rows)
+        self.folder.write_results(self.study)
+
+    def rows(self, trial: Trial) -> list[dict[str, Any]]:
+        """
+        Tell the evaluations of a trial.
+
+        :param trial: of the study
+        :return: its rows
+        """
+        return self.folder.rows(trial)
+
+
+def run_trial(trial: Trial, keeper: Any, report: Callable[[dict[str, Any]], None]) -> None:
+    """
+    Train and measure one agent, or go on with it.
+
+    :param trial: which one
+    :param keeper: has the methods of :class:`Keeper`
+    :param report: called with the newest row
+    """
+    from sb3_torcs.study_training import Training, final_row
+
+    files, over, missing = keeper.state(trial)
+    if not over:
+        with _unpacked(files) as checkpoint:
+            training = Training(trial, checkpoint)
+
+        def after_slice() -> None:
+            with tempfile.TemporaryDirectory() as scratch:
+                training.save(Path(scratch))
+                packed = {file.name: file.read_bytes() for file in Path(scratch).iterdir()}
+            keeper.put(trial, packed, training.rows)
+            report(training.rows[-1])
+
+        training.run(after_slice)
+        training.close()
+        files, _, missing = keeper.state(trial)
+    chosen = [row for row in keeper.rows(trial) if row["phase"] == "train" and row["kept"]][-1]
+    with _unpacked(files) as folder:
+        assert folder is not None
+        model = folder / "best_model.zip"
+        finals = [final_row(trial, model, track, chosen) for track in missing]
+    if finals:
+        keeper.put_finals(trial, finals)
+        report(finals[-1])
+
+
+@contextlib.contextmanager
+def _unpacked(files: Files | None) -> Iterator[Path | None]:
+    """Put files into a folder for a while."""
+    if files is None:
+        yield None
+        return
+    with tempfile.TemporaryDirectory() as scratch:
+        for name, content in files.items():
+            (Path(scratch) / name).write_bytes(content)
+        yield Path(scratch)
+
+
+def run_study(
+    study: Study,
+    folder: Path,
+    *,
+    jobs: int | None = None,
+    address: str | None = None,
+    progress: Progress | None = None,
+) -> Path:
+    """
+    Run what is left of a study.
+
+    :param study: what is to be run
+    :param folder: of the study; what is there of it is not done again
+    :param jobs: trials at a time on this machine; by default one per core
+    :param address: of a Ray cluster that this machine belongs to; ``None`` uses this machine alone
+    :param progress: called when a trial has something new
+    :return: the table of the results
+    :raises RayUnavailable: if Ray is missing, or the cluster does not answer
+    :raises StudyError: if the folder is of another study, or in use
+    """
+    require_ray(address)
+    tell = progress or _nobody
+    place = StudyFolder(folder)
+    with place.locked():
+        place.begin(study)
+        left = [trial for trial in study.trials if not place.ended(trial)]
+        for trial in study.trials:
+            for row in place.rows(trial):
+                tell(trial, row)
+            if trial not in left:
+                tell(trial, {"state": "done"})
+        if left:
+            with _ray(place, jobs, address) as scratch:
+                _tune(study, left, place, scratch, tell)
+        return place.write_results(study)
+
+
+def require_ray(address: str | None = None) -> None:
+    """
+    Make sure that Ray can be imported, and that it will be quiet.
+
+    :param address: of a cluster that is to be joined
+    :raises RayUnavailable: if it is not installed
+    """
+    settings = QUIET if address is None else {**QUIET, **IMPATIENT}
+    for name, value in settings.items():
+        os.environ.setdefault(name, value)
+    try:
+        import ray.tune  # noqa: F401
+    except ImportError as error:
+        raise RayUnavailable(
+            f"a study needs Ray Tune, which does not import ({error}); type: "
+            'pip install "sb3-torcs[study]"'
+        ) from error
+
+
+@contextlib.contextmanager
+def _ray(place: StudyFolder, jobs: int | None, address: str | None) -> Iterator[Path]:
+    """Start Ray or join a cluster, and clean up, after a killed run too."""
+    import ray
+
+    session = place.path / SESSION
+    if session.is_file():
+        shutil.rmtree(session.read_text(encoding="utf-8"), ignore_errors=True)
+    scratch = Path(tempfile.mkdtemp(prefix="st-"))  # short: sockets lie in it
+    session.write_text(str(scratch), encoding="utf-8")
+    options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
+    if address is None:
+        options.update(
+            address="local", num_cpus=jobs or len(os.sched_getaffinity(0)),
+            include_dashboard=False, _temp_dir=str(scratch),
+        )  # fmt: skip
+    else:
+        options["address"] = address
+    try:
+        ray.init(**options)
+    except (ConnectionError, RuntimeError, ValueError) as error:
+        shutil.rmtree(scratch, ignore_errors=True)
+        raise RayUnavailable(
+            f"no Ray cluster at '{address}' ({error}); start one with `ray start --head` and give "
+            "the address that it prints, or leave --address out"
+        ) from error
+    try:
+        yield scratch
+    finally:
+        ray.shutdown()
+        shutil.rmtree(scratch, ignore_errors=True)
+        session.unlink(missing_ok=True)
+
+
+def _tune(
+    study: Study, trials: list[Trial], place: StudyFolder, scratch: Path, progress: Progress
+) -> None:
+    """Let Ray Tune run the trials."""
+    import ray
+    from ray import tune
+    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+    here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=False)
+    keeper = ray.remote(Keeper).options(num_cpus=0, scheduling_strategy=here).remote(study, place)
+
+    def trainable(config: dict[str, Any]) -> None:
+        run_trial(trials[config["trial"]], _Remote(keeper), tune.report)
+
+    here_only = _HereOnly(progress)
+
+    class Watch(tune.Callback):
+        """Hands what Tune hears on to whoever watches."""
+
+        def on_trial_start(self, **heard: Any) -> None:
+            here_only.call(trials[heard["trial"].config["trial"]], {"state": "running"})
+
+        def on_trial_result(self, **heard: Any) -> None:
+            trial, row = trials[heard["trial"].config["trial"]], heard["result"]
+            here_only.call(trial, row)
+            if row["phase"] == "final":
+                here_only.call(trial, {"state": "done"})
+
+    results = tune.Tuner(
+        tune.with_resources(trainable, {"cpu": 1}),
+        param_space={"trial": tune.grid_search(list(range(len(trials))))},
+        run_config=tune.RunConfig(
+            name="trials",
+            storage_path=str(scratch),
+            verbose=0,
+            callbacks=[Watch()],
+            failure_config=tune.FailureConfig(max_failures=RETRIES),
+        ),
+    ).fit()
+    for number in range(len(results)):
+        result = results[number]
+        trial = trials[result.config["trial"]]
+        if place.ended(trial):
+            progress(trial, {"state": "done"})
+        elif result.error is None:
+            progress(trial, {"state": "stopped"})
+        else:
+            progress(trial, {"state": "failed", "error": _last_line(result.error)})
+
+
+def _nobody(trial: Trial, row: dict[str, Any]) -> None:
+    """Watch nothing."""
+    del trial, row
+
+
+def _last_line(error: Exception) -> str:
+    """Return what a worker's traceback ends with."""
+    return str(error).strip().splitlines()[-1]
+
+
+class _HereOnly:
+    """A function that is left behind when Tune pickles all that it was given."""
+
+    def __init__(self, call: Callable[..., None] | None = None) -> None:
+        self.call: Any = call
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (_HereOnly, ())
+
+
+class _Remote:
+    """An actor that is called like the object that it is."""
+
+    def __init__(self, actor: Any) -> None:
+        self._actor = actor
+
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        import ray
+
+        return lambda *args: ray.get(getattr(self._actor, name).remote(*args))

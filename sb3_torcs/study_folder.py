@@ -1,0 +1,213 @@
+"""The folder of a study: what there is of each trial, written so that a kill breaks nothing.
+
+::
+
+    FOLDER/
+      results.csv                 all rows of all trials
+      VARIANT-seed0/
+        recipe.yml                what the training depends on
+        rows.json                 of the evaluations so far
+        best_model.zip, …         what `sb3-torcs evaluate` reads
+        checkpoint-000012/        to go on from; gone when the training is over
+"""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import fcntl
+import json
+import shutil
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from sb3_torcs.errors import StudyError
+from sb3_torcs.study_file import FIELDS, Study, Trial, track_name
+
+__all__ = ["RESULTS", "Files", "StudyFolder"]
+
+Files = dict[str, bytes]
+"""Contents of files by name."""
+
+RESULTS = "results.csv"
+RECIPE, ROWS, LOCK = "recipe.yml", "rows.json", ".lock"
+CHECKPOINT = "checkpoint-"
+FOR_DRIVERS = ("best_model.zip", "vecnormalize.pkl", "config.yml", "args.yml")
+
+
+class StudyFolder:
+    """
+    What a study has come to.
+
+    :param path: of the folder; it is made
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        path.mkdir(parents=True, exist_ok=True)
+
+    @contextlib.contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keep others out; a killed process lets go of the lock by itself."""
+        with (self.path / LOCK).open("w") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as error:
+                raise StudyError(
+                    f"another process runs the study in '{self.path}'; wait for it, or give "
+                    "another --folder"
+                ) from error
+            yield
+
+    def of(self, trial: Trial) -> Path:
+        """
+        Return the folder of a trial.
+
+        :param trial: of the study
+        :return: where its files are
+        """
+        return self.path / trial.name
+
+    def begin(self, study: Study) -> None:
+        """
+        Make a folder for each trial, and make sure that those that are there are of this study.
+
+        :param study: to be run here
+        :raises StudyError: if a trial was begun with another recipe
+        """
+        for trial in study.trials:
+            file = self.of(trial) / RECIPE
+            recipe = trial.recipe()
+            if not file.is_file():
+                file.parent.mkdir(exist_ok=True)
+                _write(file, yaml.safe_dump(recipe, sort_keys=False).encode())
+                continue
+            before = yaml.safe_load(file.read_text(encoding="utf-8"))
+            if before != recipe:
+                changed = [key for key in recipe if recipe[key] != before.get(key)]
+                raise StudyError(
+                    f"'{file.parent}' was begun with another {', '.join(changed)}; give another "
+                    "--folder, or remove that one to begin it anew"
+                )
+
+    def rows(self, trial: Trial) -> list[dict[str, Any]]:
+        """
+        Read the evaluations of a trial.
+
+        :param trial: of the study
+        :return: its rows, those during the training first
+        """
+        file = self.of(trial) / ROWS
+        return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else []
+
+    def trained(self, trial: Trial) -> bool:
+        """
+        Say whether the training of a trial is over.
+
+        :param trial: of the study
+        :return: whether all its decisions were learned from
+        """
+        learned = [row["decisions"] for row in self.rows(trial) if row["phase"] == "train"]
+        return bool(learned) and learned[-1] >= trial.budget
+
+    def missing(self, trial: Trial) -> list[str]:
+        """
+        List the tracks on which the best model was not measured yet.
+
+        :param trial: of the study
+        :return: tracks, as the study file calls them
+        """
+        done = {row["track"] for row in self.rows(trial) if row["phase"] == "final"}
+        return [track for track in trial.final_tracks if track_name(track) not in done]
+
+    def ended(self, trial: Trial) -> bool:
+        """
+        Say whether there is nothing left to do for a trial.
+
+        :param trial: of the study
+        :return: whether it is trained and measured
+        """
+        return self.trained(trial) and not self.missing(trial)
+
+    def checkpoint(self, trial: Trial) -> Path | None:
+        """
+        Find what a trial goes on from.
+
+        :param trial: of the study
+        :return: a folder; ``None`` if the trial has not come so far
+        """
+        return max(self.of(trial).glob(f"{CHECKPOINT}*"), default=None)
+
+    def put(self, trial: Trial, files: Mapping[str, bytes], rows: list[dict[str, Any]]) -> None:
+        """
+        Write the newest state of a trial, and take the one before away.
+
+        :param trial: of the study
+        :param files: of its checkpoint
+        :param rows: of its evaluations so far
+        :raises StudyError: if the trial is already as far: two workers drive it
+        """
+        if len(rows) <= len(self.rows(trial)):
+            raise StudyError(f"{trial.name} has come farther elsewhere; this worker is not needed")
+        folder = self.of(trial)
+        over = rows[-1]["decisions"] >= trial.budget
+        kept = [name for name in FOR_DRIVERS if name in files] + ["last_model.zip"] * over
+        before = [*folder.glob(f"{CHECKPOINT}*"), *folder.glob(f".{CHECKPOINT}*")]
+        if not over:
+            aside = folder / f".{CHECKPOINT}new"
+            shutil.rmtree(aside, ignore_errors=True)
+            aside.mkdir()
+            for file, content in files.items():
+                (aside / file).write_bytes(content)
+            aside.rename(folder / f"{CHECKPOINT}{len(rows):06d}")
+        for file in kept:
+            _write(folder / file, files[file])
+        _write(folder / ROWS, json.dumps(rows).encode())
+        for old in before:
+            shutil.rmtree(old, ignore_errors=True)
+
+    def put_finals(self, trial: Trial, rows: Iterable[dict[str, Any]]) -> None:
+        """
+        Add the final measurements of a trial.
+
+        :param trial: of the study
+        :param rows: one per track
+        """
+        done = self.rows(trial)
+        known = {row["track"] for row in done if row["phase"] == "final"}
+        done += [row for row in rows if row["track"] not in known]
+        _write(self.of(trial) / ROWS, json.dumps(done).encode())
+
+    def write_results(self, study: Study) -> Path:
+        """
+        Write all rows of all trials into one table, in the order of the study file.
+
+        :param study: whose trials they are
+        :return: the file
+        """
+        file = self.path / RESULTS
+        aside = file.with_suffix(".new")
+        with aside.open("w", newline="", encoding="utf-8") as output:
+            writer = csv.writer(output, lineterminator="\n")
+            writer.writerow(FIELDS)
+            for trial in study.trials:
+                writer.writerows([_cell(row[f]) for f in FIELDS] for row in self.rows(trial))
+        aside.replace(file)
+        return file
+
+
+def _cell(value: Any) -> Any:
+    """Write lists of lap times with spaces, truth as 1 and 0, and nothing as nothing."""
+    if isinstance(value, list):
+        return " ".join(str(item) for item in value)
+    return int(value) if isinstance(value, bool) else value
+
+
+def _write(file: Path, content: bytes) -> None:
+    """Write a file that is there whole, or not at all."""
+    aside = file.with_name(f".{file.name}")
+    aside.write_bytes(content)
+    aside.replace(file)

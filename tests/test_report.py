@@ -1,0 +1,130 @@
+"""The report says what the table of results says: every seed, failures too, and always the same."""
+
+import csv
+import math
+
+import numpy as np
+import pytest
+from rliable.metrics import aggregate_iqm
+
+from sb3_torcs.cli import main
+from sb3_torcs.study_file import FIELDS
+from sb3_torcs.study_report import estimate, iqm, read_results, share, write_report
+
+LAPS = (97.0, 84.0, 83.5)
+
+
+def row(seed, phase="train", decisions=100, track="aalborg", laps=LAPS, ladder="finishes", **more):
+    whole = len(laps) == 3
+    return {
+        "study": "demo", "variant": "base", "seed": seed, "phase": phase, "decisions": decisions,
+        "episodes": decisions // 10, "wall_s": decisions / 2, "cpu_s": decisions / 3,
+        "track": track, "laps": len(laps), "completes": int(whole),
+        "lap_times_s": " ".join(map(str, laps)), "best_flying_lap_s": min(laps[1:], default=""),
+        "race_time_s": sum(laps) if whole else "", "distance_m": 7000.0 if whole else 900.0,
+        "end": "laps" if whole else "off_track", "damage": 0.0, "return": 1.0, "kept": int(whole),
+        "ladder": ladder if whole else "", **more,
+    }  # fmt: skip
+
+
+def written(folder, rows):
+    folder.mkdir(exist_ok=True)
+    with (folder / "results.csv").open("w", newline="") as file:
+        table = csv.DictWriter(file, FIELDS)
+        table.writeheader()
+        table.writerows(rows)
+    return folder
+
+
+@pytest.fixture
+def study(tmp_path):
+    """Two seeds that complete, one of them elsewhere too, and one that never laps."""
+    rows = []
+    for seed in (0, 1):
+        rows += [
+            row(seed, laps=()),
+            row(seed, decisions=200, laps=LAPS[:2]),
+            row(seed, decisions=300),
+        ]
+        rows += [row(seed, "final", 300, ladder=("finishes", "beats bt")[seed])]
+        rows += [row(seed, "final", 300, "alpine-1", laps=LAPS if seed else ())]
+    rows += [
+        row(2, laps=(), kept=1),
+        row(2, decisions=200, laps=()),
+        row(2, decisions=300, laps=()),
+    ]
+    rows += [row(2, "final", 100, laps=()), row(2, "final", 100, "alpine-1", laps=())]
+    return written(tmp_path / "study", rows)
+
+
+def lines_of(report, start):
+    return [line for line in report.read_text().splitlines() if line.startswith(start)]
+
+
+def test_every_seed_is_in_the_report_failures_too(study, tmp_path):
+    report = write_report(study, tmp_path / "out")
+    (summary,) = lines_of(report, "| base |")
+    assert "| 2 of 3 | 83.500 | 83.500 |" in summary
+    assert summary.endswith("| 200 | 20 | 2 |")
+    one, _, failed = [line for line in lines_of(report, "| base, ") if "of 300" in line]
+    assert "| base, 0 | yes | 97.000, 84.000, 83.500 | 7000 | laps | 300 of 300 | 1 of 3 |" in one
+    assert "| base, 2 | no | - | 900 | off_track | 100 of 300 | 0 of 3 | never | - | - |" in failed
+    assert lines_of(report, "| base, aalborg") == ["| base, aalborg | 3 | 2 | 1 | 1 | 0 | 83.500 |"]
+    assert lines_of(report, "| base, alpine-1")[0].startswith("| base, alpine-1 | 3 | 1 | 0 |")
+    assert "| base, 1 | 2 of 2 (100 %) | 1 of 1 (100 %) |" in report.read_text()
+    assert "| base, 2 | 0 of 2 (0 %) | 0 of 1 (0 %) |" in report.read_text()
+
+
+def test_the_same_results_give_the_same_report_to_the_byte(study, tmp_path, capsys):
+    assert main(["report", str(study), "--output", str(tmp_path / "one")]) == 0
+    assert capsys.readouterr().out == f"{tmp_path}/one/report.md\n"
+    np.random.default_rng().random()
+    write_report(study, tmp_path / "two")
+    names = sorted(path.name for path in (tmp_path / "one").iterdir())
+    assert names == ["learning-base.png", "report.md"]
+    for name in names:
+        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
+
+
+def test_a_study_that_still_runs_can_be_reported(tmp_path):
+    """One seed is two evaluations ahead, and nothing is measured yet."""
+    rows = [row(0), row(0, decisions=200), row(0, decisions=300), row(1, laps=(), kept=1)]
+    report = write_report(written(tmp_path / "study", rows), tmp_path / "out")
+    assert "not measured yet" in report.read_text()
+    assert [len(trial.train) for trial in read_results(tmp_path / "study")] == [3, 1]
+
+
+def test_what_is_no_study_is_told(tmp_path, capsys):
+    assert main(["report", str(tmp_path)]) == 2
+    assert "holds no results.csv; give the folder of a study" in capsys.readouterr().err
+    assert main(["report", str(written(tmp_path / "empty", []))]) == 2
+    assert "no agent was evaluated yet" in capsys.readouterr().err
+
+
+def test_the_interquartile_mean_is_rliables():
+    scores = np.arange(24.0).reshape(8, 1, 3) ** 2
+    assert iqm(scores).tolist() == [aggregate_iqm(scores[..., point]) for point in range(3)]
+
+
+def test_a_seed_without_a_lap_counts_as_infinitely_slow():
+    laps = np.array([[80.0], [81.0], [82.0], [math.inf]])
+    assert estimate(laps).value.tolist() == [81.5]  # the best and the worst quarter are cut
+    assert estimate(laps).high.tolist() == [math.inf]
+    assert 80.0 <= estimate(laps).low[0] <= 81.5
+    two = np.array([[80.0], [81.0], [math.inf], [math.inf]])
+    assert estimate(two).value.tolist() == [math.inf]
+
+
+def test_an_interval_lies_around_its_figure_and_is_the_same_each_time():
+    scores = np.random.default_rng(0).random((15, 4)).round()
+    first, again = estimate(scores, share), estimate(scores, share)
+    assert (first.low <= first.value).all()
+    assert (first.value <= first.high).all()
+    assert first.low.tolist() == again.low.tolist()
+    assert (first.high - first.low > 0.1).all()
+
+
+def test_a_study_in_which_nobody_laps_is_reported_too(tmp_path):
+    rows = [row(seed, laps=(), kept=1, decisions=n) for seed in (0, 1) for n in (100, 200)]
+    report = write_report(written(tmp_path / "study", rows), tmp_path / "out")
+    assert lines_of(report, "| base |") == ["| base | 0 of 0 | - | - | - | - | - | - |"]

@@ -1,0 +1,134 @@
+"""Studies run on Ray Tune, and come to the same results whatever happens to the machines."""
+
+import csv
+import json
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import pytest
+import yaml
+
+from sb3_torcs.cli import main
+from sb3_torcs.study import Keeper, run_study, run_trial
+from sb3_torcs.study_file import read_study
+from sb3_torcs.study_folder import StudyFolder
+
+CLOCKS = ("wall_s", "cpu_s")
+
+
+def study_file(folder, **changes):
+    said = {
+        "name": "tiny", "env": "TorcsLite-v0", "seeds": 2, "n_timesteps": 1920,
+        "eval_interval": 240, "final_tracks": ["g-track-1"],
+        "variants": {
+            "small nets": {
+                "learning_starts": 100, "buffer_size": 1000, "batch_size": 16,
+                "policy_kwargs": {"net_arch": [16, 16], "head_bias": [0.0, 1.0, -3.0]},
+            },
+        },
+        **changes,
+    }  # fmt: skip
+    file = folder / "tiny.yml"
+    file.write_text(yaml.safe_dump(said))
+    return file
+
+
+def results(folder):
+    with (Path(folder) / "results.csv").open(newline="") as file:
+        return [{k: v for k, v in row.items() if k not in CLOCKS} for row in csv.DictReader(file)]
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory):
+    """The same study without Ray: one trial after the other, in this process."""
+    folder = tmp_path_factory.mktemp("undisturbed")
+    study = read_study(study_file(folder))
+    keeper = Keeper(study, StudyFolder(folder / "out"))
+    keeper.folder.begin(study)
+    for trial in study.trials:
+        run_trial(trial, keeper, lambda row: None)
+    return results(folder / "out")
+
+
+def test_the_table_has_every_evaluation_of_every_trial(undisturbed):
+    for seed in "01":
+        rows = [row for row in undisturbed if row["seed"] == seed]
+        assert [row["decisions"] for row in rows[:-1]] == [str(240 * n) for n in range(1, 9)]
+        assert [row["phase"] for row in rows] == ["train"] * 8 + ["final"]
+        assert {row["track"] for row in rows[:-1]} == {"aalborg"}
+        assert rows[-1]["track"] == "g-track-1"
+        assert len({row["return"] for row in rows[:-1]}) == 8  # each drives what was learned
+
+
+@pytest.fixture
+def short_folder():
+    """Ray's sockets lie in it, and their paths must not be long."""
+    with tempfile.TemporaryDirectory(prefix="st-") as folder:
+        yield folder
+
+
+@pytest.mark.slow
+def test_a_lost_machine_costs_one_interval_at_most_and_changes_no_result(
+    undisturbed, tmp_path, short_folder
+):
+    """Two machines, one trial on each; the second is killed in mid-study."""
+    from ray.cluster_utils import Cluster
+
+    study = read_study(study_file(tmp_path))
+    node = {"num_cpus": 1, "include_dashboard": False, "temp_dir": short_folder}
+    cluster = Cluster(initialize_head=True, head_node_args=node)
+    second = cluster.add_node(**node)
+    reports = []
+
+    def watch(trial, row):
+        if "phase" in row:
+            reports.append((trial.seed, row["phase"], row["decisions"]))
+        if second in cluster.worker_nodes and len({seed for seed, *_ in reports}) == 2:
+            cluster.remove_node(second, allow_graceful=False)
+
+    try:
+        run_study(study, tmp_path / "out", address=cluster.address, progress=watch)
+        assert second not in cluster.worker_nodes
+    finally:
+        cluster.shutdown()
+    assert results(tmp_path / "out") == undisturbed
+    assert sorted(seed for seed, phase, _ in reports if phase == "final") == [0, 1]
+    assert len(reports) == len(set(reports))  # no evaluation was done twice
+
+
+@pytest.mark.slow
+def test_a_killed_study_goes_on_with_the_same_command(undisturbed, tmp_path, capsys):
+    words = ["study", str(study_file(tmp_path)), "--folder", str(tmp_path / "out"), "--jobs", "2"]
+    command = [sys.executable, "-m", "sb3_torcs.cli", *words]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        while not seeds_so_far(tmp_path / "out") >= {"0", "1"}:
+            assert process.poll() is None, "it ended before it could be killed"
+            time.sleep(0.05)
+    finally:
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    session = Path((tmp_path / "out" / ".session").read_text())
+    assert session.is_dir()
+    before = results(tmp_path / "out")
+    assert len(before) < len(undisturbed)
+    capsys.readouterr()
+
+    assert main([*words, "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert {(line["seed"], line["state"]) for line in said["trials"]} == {(0, "done"), (1, "done")}
+    assert results(tmp_path / "out") == undisturbed
+    assert not session.exists()
+    assert not (tmp_path / "out" / ".session").exists()
+    assert not list((tmp_path / "out").rglob("*checkpoint-*"))
+
+    assert main(words) == 0  # there is nothing left to do, and Ray is not started
+    assert "2 of 2 agents" in capsys.readouterr().out
+
+
+def seeds_so_far(folder):
+    return {row["seed"] for row in results(folder)} if (folder / "results.csv").is_file() else set()
