@@ -25,12 +25,15 @@ __all__ = [
     "check_spaces",
     "find_model",
     "load_driver",
+    "one_track",
     "saved_spaces",
     "saved_steps",
+    "shipped_agents",
     "training_record",
 ]
 
 BEST_MODEL = "best_model.zip"
+AGENTS = Path(__file__).parent / "agents"
 
 # What only one family of algorithms saves; the first that is there names it. DDPG saves what TD3
 # does, and either class drives the other's models.
@@ -102,7 +105,8 @@ def find_model(path: str | Path, *, prefer_last: bool = False) -> Path:
     """
     Find a saved model.
 
-    :param path: of a ``.zip`` file, with or without its suffix, or of a run's folder
+    :param path: of a ``.zip`` file, with or without its suffix, or of a run's folder; or the name
+        of a shipped agent, e.g. ``"ddpg-aalborg"``
     :param prefer_last: of a folder take the last model rather than the best one
     :return: the file
     :raises InvalidOption: if there is none
@@ -112,11 +116,14 @@ def find_model(path: str | Path, *, prefer_last: bool = False) -> Path:
         return given
     if given.with_name(f"{given.name}.zip").is_file():
         return given.with_name(f"{given.name}.zip")
+    if not given.is_dir() and str(path) in shipped_agents():
+        given = AGENTS / str(path)
     if not given.is_dir():
-        siblings = [file.name for file in given.parent.glob("*.zip")]
+        known = [*(file.name for file in given.parent.glob("*.zip")), *shipped_agents()]
         raise InvalidOption(
-            f"there is no model '{given}'{near_miss(given.name, siblings)} "
-            "give the .zip that a training saved, or the folder of its run"
+            f"there is no model '{given}'{near_miss(given.name, known)} give the .zip that a "
+            "training saved, the folder of its run, or a shipped agent: "
+            f"{', '.join(shipped_agents())}"
         )
     best = given / BEST_MODEL
     last = [
@@ -127,6 +134,15 @@ def find_model(path: str | Path, *, prefer_last: bool = False) -> Path:
         if candidate.is_file():
             return candidate
     raise InvalidOption(f"the folder '{given}' holds no model; give the .zip that a training saved")
+
+
+def shipped_agents() -> list[str]:
+    """
+    List the agents that come with the package.
+
+    :return: their names
+    """
+    return sorted(path.parent.name for path in AGENTS.glob(f"*/{BEST_MODEL}"))
 
 
 def training_record(model: Path) -> TrainingRecord:
@@ -149,6 +165,22 @@ def training_record(model: Path) -> TrainingRecord:
             statistics=statistics if statistics.is_file() else None,
         )
     return TrainingRecord()
+
+
+def one_track(track: Any) -> Any:
+    """
+    Make sure that a drive has one track, where a training may have had several.
+
+    :param track: of the record, or what was given instead
+    :return: the same
+    :raises InvalidOption: if it is a list
+    """
+    if isinstance(track, list):
+        raise InvalidOption(
+            f"the model was trained on {len(track)} tracks, {', '.join(track)}; say which one it "
+            f"shall drive on: --track {track[0]}"
+        )
+    return track
 
 
 def _read_plain(path: Path) -> dict[str, Any]:

@@ -216,7 +216,7 @@ def _trials(
     if type(interval) is not int or interval < 1:
         raise StudyError(f"{file}: eval_interval is {interval!r}; expected decisions, e.g. 5000")
     env_kwargs = entry.get("env_kwargs") or {}
-    own = [env_kwargs.get("track", "aalborg")]
+    own = env_kwargs.get("track", "aalborg")
     eval_tracks = _tracks(source["eval_tracks"] or own, f"{place}: eval_tracks")
     final_tracks = _tracks(said.get("final_tracks") or list(eval_tracks), f"{file}: final_tracks")
     gym.make(env_id, **env_kwargs).close()

@@ -16,7 +16,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_torcs import bench, evaluation, game_process, models
 from sb3_torcs.cli import VERBS, common, doctor, evaluate, main, recording, train
 from sb3_torcs.cli.train import TrainOptions
-from sb3_torcs.errors import BackendUnavailable
+from sb3_torcs.errors import BackendUnavailable, InvalidOption
 
 NAMES = [verb.__name__.rpartition(".")[2].replace("_", "-") for verb in VERBS]
 PNG = b"\x89PNG"
@@ -239,6 +239,15 @@ def test_the_environment_is_that_of_the_training_unless_the_words_say_otherwise(
     assert evaluate.environment_kwargs(args, record) == {**kept, "laps": 3}
     args.track = "aalborg"
     assert evaluate.environment_kwargs(args, record) == {**kept, "track": "aalborg", "laps": 3}
+
+
+def test_a_model_of_several_tracks_has_to_be_told_one():
+    record = models.TrainingRecord(env_kwargs={"track": ["alpine-1", "forza"]})
+    args = types.SimpleNamespace(laps=3, track=None)
+    with pytest.raises(InvalidOption, match=r"2 tracks, alpine-1, forza; .* --track alpine-1"):
+        evaluate.environment_kwargs(args, record)
+    args.track = "forza"
+    assert evaluate.environment_kwargs(args, record)["track"] == "forza"
 
 
 def test_the_time_limit_cuts_no_lap_of_a_car_that_does_not_count_as_standing():

@@ -52,13 +52,14 @@ def run(args: argparse.Namespace) -> int:
     :return: the exit status
     """
     from sb3_torcs.driving import Agent
-    from sb3_torcs.models import TrainingRecord, find_model, training_record
+    from sb3_torcs.models import TrainingRecord, find_model, one_track, training_record
 
     scripted = args.model == "scripted"
     record = TrainingRecord() if scripted else training_record(find_model(args.model))
     settings = {name: record.env_kwargs[name] for name in KEPT if name in record.env_kwargs}
     given = {"track": args.track, "car": args.car, "host": args.host, "port": args.port}
     settings |= {name: value for name, value in given.items() if value is not None}
+    one_track(settings.get("track"))
     with quiet_output(args.json):
         agent = Agent(args.model, settings, args.algo)
         agent.drive()

@@ -79,7 +79,7 @@ class Run:
     wanted: int  # decisions that were asked for
     interrupted: bool
     last_model: Path
-    track: str | None
+    track: Any  # a name, or a list of them
 
     @property
     def best_model(self) -> Path:
@@ -319,8 +319,9 @@ def _closing_words(options: TrainOptions, result: Run) -> list[str]:
             options, resume=result.last_model, timesteps=result.wanted - result.steps
         )
         lines += ["go on with:", f"  {_command(more)}"]
-    track = ["--track", result.track] if result.track else []
-    words = ["sb3-torcs", "evaluate", str(result.best_model), "--env", options.env, *track]
+    track = result.track[0] if isinstance(result.track, list) else result.track
+    words = ["sb3-torcs", "evaluate", str(result.best_model), "--env", options.env]
+    words += ["--track", track] if track else []
     lines += ["see what it learned:", f"  {shlex.join(words)}"]
     return lines
 

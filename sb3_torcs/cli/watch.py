@@ -103,7 +103,7 @@ def _show(game: Game, name: str, args: argparse.Namespace) -> Show:
     :param name: of a model or a robot
     :param args: from the command line
     """
-    from sb3_torcs.models import TrainingRecord, find_model, training_record
+    from sb3_torcs.models import TrainingRecord, find_model, one_track, training_record
     from sb3_torcs.watching import Show
 
     robot, record = None, TrainingRecord()
@@ -116,7 +116,7 @@ def _show(game: Game, name: str, args: argparse.Namespace) -> Show:
         settings["car"] = args.car
     words = args.robots.split(",") if args.robots else []
     opponents = [game.parse_robot(word) for word in words]
-    track = args.track or record.env_kwargs.get("track", "aalborg")
+    track = one_track(args.track or record.env_kwargs.get("track", "aalborg"))
     return Show(game, track, robot, name, settings, opponents, args.laps)
 
 
