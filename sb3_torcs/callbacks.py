@@ -252,23 +252,29 @@ class RandomStartCallback(BaseCallback):
     The first episode has begun before any callback is called, and keeps the environment's start.
 
     :param start: ``"random"`` or ``"grid"``
+    :param speed: that random starts do not exceed [m/s]; by default the environment's own
     :param verbose: as in ``BaseCallback``
     """
 
-    def __init__(self, *, start: str = "random", verbose: int = 0) -> None:
+    def __init__(
+        self, *, start: str = "random", speed: float | None = None, verbose: int = 0
+    ) -> None:
         super().__init__(verbose)
         self.start = start
-        self._switch: _Switch | None = None
+        self.speed = speed
+        self._switches: list[_Switch] = []
 
     def _on_training_start(self) -> None:
-        self._switch = _Switch(self.training_env, "set_start", self.start)
+        self._switches = [_Switch(self.training_env, "set_start", self.start)]
+        if self.speed is not None:
+            self._switches.append(_Switch(self.training_env, "set_random_speed", self.speed))
 
     def _on_step(self) -> bool:
         return True
 
     def _on_training_end(self) -> None:
-        if self._switch is not None:
-            self._switch.undo()
+        for switch in self._switches:
+            switch.undo()
 
 
 class _Switch:

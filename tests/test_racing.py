@@ -140,6 +140,18 @@ def test_setting_the_start_returns_the_one_before(oval):
     assert any(call[1] is not None for call in env.backend.calls)
 
 
+def test_random_starts_are_as_fast_as_asked(oval):
+    env = RacingEnv(ScriptedBackend(oval), start="random")
+    assert env.set_random_speed(90.0) == 40.0
+    env.reset(seed=0)
+    for _ in range(50):
+        env.reset()
+    speeds = [call[1].speed for call in env.backend.calls if call[1] is not None]
+    assert 80.0 < max(speeds) <= 90.0
+    with pytest.raises(InvalidOption, match="expected 0 to 150 m/s"):
+        env.set_random_speed(-1.0)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -33,7 +33,7 @@ BACKWARDS_ANGLE = 0.5 * math.pi  # [rad] to the road from which the car faces ba
 RANDOM_GRID_SHARE = 0.1
 RANDOM_TRACK_POSITION = 0.6  # [-]
 RANDOM_HEADING_ERROR = 0.25  # [rad]
-RANDOM_SPEED = 40.0  # [m/s]
+RANDOM_SPEED = 40.0  # [m/s] unless somebody sets another
 STARTS = ("grid", "random")
 MAX_START_SPEED = 150.0  # [m/s] what the observation of the speed can say
 RESET_OPTIONS = ("distance", "track_position", "heading_error", "speed")
@@ -101,6 +101,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         )
         self.set_reward(reward)
         self.set_start(start)
+        self.set_random_speed(RANDOM_SPEED)
         self.car: CarState | None = None
         self._controls = Controls(0.0, 0.0, 0.0)
         self._viewer: Any = None
@@ -137,6 +138,21 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
             raise InvalidOption(f"start is {start!r}; expected 'grid' or 'random'")
         previous = getattr(self, "_start", None)
         self._start = start
+        return previous
+
+    def set_random_speed(self, speed: float) -> float | None:
+        """
+        Let random starts be faster or slower from the next reset on.
+
+        :param speed: that they do not exceed [m/s]
+        :return: the one until now
+        """
+        if not is_number(speed) or not 0.0 <= speed <= MAX_START_SPEED:
+            raise InvalidOption(
+                f"speed of random starts is {speed!r}; expected 0 to {MAX_START_SPEED:g} m/s"
+            )
+        previous = getattr(self, "_random_speed", None)
+        self._random_speed = float(speed)
         return previous
 
     def reset(
@@ -280,7 +296,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
             draw(0.0, self.backend.track.length),
             draw(-RANDOM_TRACK_POSITION, RANDOM_TRACK_POSITION),
             draw(-RANDOM_HEADING_ERROR, RANDOM_HEADING_ERROR),
-            draw(0.0, RANDOM_SPEED),
+            draw(0.0, self._random_speed),
         )
 
     def _place(self, options: dict[str, Any]) -> Start:

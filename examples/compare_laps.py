@@ -1,0 +1,157 @@
+"""Draw how drivers take a lap: speed, pedals and place on the road, and their lines in the bends.
+
+python examples/compare_laps.py ddpg-aalborg inferno --track aalborg
+"""
+
+import argparse
+import csv
+import tempfile
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from sb3_torcs.evaluation import drive, race_environment
+from sb3_torcs.game import find_game
+from sb3_torcs.models import find_model, load_driver, training_record
+from sb3_torcs.robots import race
+from sb3_torcs.track_plot import edges
+from sb3_torcs.tracks import load_track
+
+KMH = 3.6  # [km/h per m/s]
+BRAKING = 0.05  # of the brake that counts as braking
+COLOURS = ("tab:blue", "tab:red", "tab:green", "tab:purple", "tab:orange")
+BENDS = 3  # that are shown from above
+VIEW = 70.0  # [m] around their middle
+
+
+class Lap(NamedTuple):
+    """The best flying lap of a driver, sampled as often as it decides."""
+
+    name: str
+    seconds: float
+    distance: np.ndarray  # (n,) [m] from the line
+    speed: np.ndarray  # (n,) [m/s]
+    place: np.ndarray  # (n,) -1 to 1, left positive
+    gas: np.ndarray  # (n,)
+    brake: np.ndarray  # (n,)
+    line: np.ndarray  # (n, 2) [m] x and y
+
+
+def robot_samples(name, track):
+    """What a robot does in three laps, every 0.02 s."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "telemetry.csv"
+        race([find_game().parse_robot(name)], track, 3, telemetry=file)
+        with file.open(newline="") as lines:
+            return [{key: float(row[key]) for key in row if key != "robot"}
+                    for row in csv.DictReader(lines)]  # fmt: skip
+
+
+def model_samples(name, track):
+    """What a model does in three laps, once per decision."""
+    record = training_record(find_model(name))
+    env = race_environment(record.env_id or "Torcs-v0", record.env_kwargs, track)
+    rows = [
+        {**step.car._asdict(), "throttle": step.action[1], "brake": step.action[2]}
+        for step in drive(env, load_driver(name, env))
+    ]
+    env.close()
+    return rows
+
+
+def best_lap(name, track):
+    """Drive three laps, and cut the best flying one out."""
+    robot = name.partition(":")[0] in find_game().robots()
+    rows = (robot_samples if robot else model_samples)(name, track)
+    laps = {}
+    for row in rows:
+        laps.setdefault(int(row["laps"]), []).append(row)
+    times = {lap: laps[lap + 1][0]["last_lap_time"] for lap in laps if lap >= 1 and lap + 1 in laps}
+    if not times:
+        raise SystemExit(f"{name} does not drive a whole flying lap of {track}")
+    lap = min(times, key=times.get)
+    columns = {key: np.array([row[key] for row in laps[lap]]) for key in laps[lap][0]
+               if np.isscalar(laps[lap][0][key])}  # fmt: skip
+    return Lap(
+        name=name,
+        seconds=times[lap],
+        distance=columns["distance_from_start"],
+        speed=columns["speed_x"],
+        place=2.0 * columns["distance_from_axis"] / columns["track_width"],
+        gas=columns["throttle"],
+        brake=columns["brake"],
+        line=np.stack([columns["x"], columns["y"]], axis=1),
+    )
+
+
+def tightest_bends(track):
+    """Where the road bends most: distances of the middles, well apart."""
+    places = np.arange(0.0, track.length, 5.0)
+    heading = np.array([track.pose(place).heading for place in places])
+    turn = np.abs(np.convolve(np.gradient(heading), np.ones(12), "same"))
+    found = []
+    for index in np.argsort(-turn):
+        near = [abs(places[index] - place) for place in found]
+        if all(min(gap, track.length - gap) > 3.0 * VIEW for gap in near):
+            found.append(places[index])
+        if len(found) == BENDS:
+            return sorted(found)
+    return sorted(found)
+
+
+def draw_along(figure, laps):
+    """Speed, pedals and place over the distance."""
+    speed, pedals, place = figure.subplots(3, 1, sharex=True)
+    for lap, colour in zip(laps, COLOURS, strict=False):
+        label = f"{lap.name}, {lap.seconds:.2f} s"
+        speed.plot(lap.distance, KMH * lap.speed, color=colour, label=label)
+        pedals.plot(lap.distance, lap.gas, color=colour, linewidth=0.8)
+        pedals.fill_between(lap.distance, -lap.brake, color=colour, alpha=0.5, linewidth=0.0)
+        place.plot(lap.distance, lap.place, color=colour)
+    speed.set_ylabel("speed [km/h]")
+    speed.legend(fontsize=8, ncols=len(laps))
+    pedals.set_ylabel("brake (down), gas (up)")
+    pedals.axhline(0.0, color="black", linewidth=0.6)
+    place.set_ylabel("right edge to left edge")
+    place.axhline(0.0, color="black", linewidth=0.6, linestyle="--")
+    place.set_ylim(-1.05, 1.05)
+    place.set_xlabel("distance from the line [m]")
+    for axes in (speed, pedals, place):
+        axes.grid(alpha=0.3)
+
+
+def draw_bends(figure, laps, track):
+    """The lines through the tightest bends, from above."""
+    centre = np.array([track.pose(place)[:2] for place in np.arange(0.0, track.length, 2.0)])
+    panels = figure.subplots(1, BENDS)
+    for axes, place in zip(panels, tightest_bends(track), strict=False):
+        x, y, _ = track.pose(place)
+        for edge in edges(track):
+            axes.plot(*edge.T, color="#4a4f57", linewidth=1.0)
+        axes.plot(*centre.T, color="#4a4f57", linewidth=0.7, linestyle="--")
+        for lap, colour in zip(laps, COLOURS, strict=False):
+            axes.plot(*lap.line.T, color=colour, linewidth=1.8)
+        axes.set(xlim=(x - VIEW, x + VIEW), ylim=(y - VIEW, y + VIEW), aspect="equal")
+        axes.set_title(f"{place:.0f} m", fontsize=9)
+        axes.set(xticks=[], yticks=[])
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("drivers", nargs="+", help="models, shipped agents or robots")
+    parser.add_argument("--track", default="aalborg")
+    parser.add_argument("--out", type=Path, default=Path("laps.png"))
+    args = parser.parse_args()
+    laps = [best_lap(name, args.track) for name in args.drivers]
+    for lap in laps:
+        print(
+            f"{lap.name}: {lap.seconds:.3f} s, on the brake in {np.mean(lap.brake > BRAKING):.0%}"
+        )
+    figure = Figure(figsize=(12.0, 11.0), layout="constrained")
+    along, bends = figure.subfigures(2, 1, height_ratios=[1.7, 1.0])
+    draw_along(along, laps)
+    draw_bends(bends, laps, load_track(args.track))
+    figure.savefig(args.out, dpi=100)
+    print(args.out)
