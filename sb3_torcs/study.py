@@ -277,15 +277,17 @@ def _tune(
             failure_config=tune.FailureConfig(max_failures=RETRIES),
         ),
     ).fit()
-    for number in range(len(results)):
-        result = results[number]
-        trial = trials[result.config["trial"]]
+    # One that Ctrl-C found waiting for its turn has no config.
+    found = [results[number] for number in range(len(results))]
+    errors = {result.config["trial"]: result.error for result in found if result.config}
+    for number, trial in enumerate(trials):
+        error = errors.get(number)
         if place.ended(trial):
             progress(trial, {"state": "done"})
-        elif result.error is None:
+        elif error is None:
             progress(trial, {"state": "stopped"})
         else:
-            progress(trial, {"state": "failed", "error": _last_line(result.error)})
+            progress(trial, {"state": "failed", "error": _last_line(error)})
 
 
 def _nobody(trial: Trial, row: dict[str, Any]) -> None:

@@ -130,5 +130,23 @@ def test_a_killed_study_goes_on_with_the_same_command(undisturbed, tmp_path, cap
     assert "2 of 2 agents" in capsys.readouterr().out
 
 
+@pytest.mark.slow
+def test_ctrl_c_keeps_everything_and_says_how_to_go_on(tmp_path):
+    """Also while a trial still waits for its turn."""
+    words = ["study", str(study_file(tmp_path)), "--folder", str(tmp_path / "out"), "--jobs", "1"]
+    command = [sys.executable, "-m", "sb3_torcs.cli", *words]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    while not seeds_so_far(tmp_path / "out"):
+        assert process.poll() is None, "it ended before it could be interrupted"
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 130, err
+    assert "0 of 2 agents trained and measured" in out
+    assert f"go on with:\n  sb3-torcs {' '.join(words)}" in out
+    assert "Traceback" not in err
+    assert not (tmp_path / "out" / ".session").exists()
+
+
 def seeds_so_far(folder):
     return {row["seed"] for row in results(folder)} if (folder / "results.csv").is_file() else set()
