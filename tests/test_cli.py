@@ -1,3 +1,4 @@
+import dataclasses
 import itertools
 import json
 import shlex
@@ -421,6 +422,17 @@ def test_an_interrupted_training_keeps_what_it_learned_and_says_how_to_go_on(cap
 def test_the_shipped_hyperparameters_train(tmp_path):
     run_folder = train.train(TrainOptions(timesteps=150, folder=tmp_path, progress=False))
     assert (run_folder / "best_model.zip").is_file()
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("game")
+def test_those_of_the_real_game_train_and_go_on(tmp_path):
+    """With returns over several steps, whose memory SB3 makes anew in its own way."""
+    options = TrainOptions(env="Torcs-v0", timesteps=1100, folder=tmp_path, progress=False)
+    first = train.train(options)
+    second = train.train(dataclasses.replace(options, timesteps=100, resume=first))
+    model = DDPG.load(second / "best_model.zip", replay_buffer_class=None)
+    assert (model.n_steps, model.replay_buffer.n_steps) == (3, 3)
 
 
 # doctor

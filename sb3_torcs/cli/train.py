@@ -212,6 +212,9 @@ def _resumed(options: TrainOptions, entry: dict[str, Any]) -> Path | None:
     env.close()
     if "learning_starts" in entry and (path.parent / "replay_buffer.pkl").is_file():
         entry["learning_starts"] = 0
+    if "n_steps" in entry:
+        # SB3 chooses the class of the memory as before; given its own choice, it would warn.
+        entry.setdefault("replay_buffer_class", None)
     return path
 
 
