@@ -47,9 +47,7 @@ class Training:
     """
 
     def __init__(self, trial: Trial, checkpoint: Path | None = None) -> None:
-        th.set_num_threads(
-            1
-        )  # trials run side by side, and torch's own threads would get in the way
+        th.set_num_threads(1)  # trials run side by side: torch's threads would get in the way
         self.trial = trial
         self.rows: list[Row] = []
         self.episodes = 0  # that have ended, in all training environments together
@@ -186,7 +184,9 @@ class Training:
     def _model_files(self) -> dict[str, bytes]:
         """Return the present model as files that ``sb3-torcs evaluate`` reads."""
         buffer = io.BytesIO()
-        self.model.save(buffer)
+        # A class of memory that SB3 chose itself would be taken for the user's when it is loaded.
+        chosen = "replay_buffer_class" not in self.trial.entry
+        self.model.save(buffer, exclude=["replay_buffer_class"] if chosen else None)
         files = {BEST_MODEL: buffer.getvalue()}
         if self.normalizer is not None:
             with tempfile.NamedTemporaryFile() as file:

@@ -22,6 +22,7 @@ from sb3_torcs import cli, rewards, zoo
 from sb3_torcs.driving_metrics import DrivingMetricsCallback
 from sb3_torcs.envs.torcs import TorcsEnv
 from sb3_torcs.envs.torcs_lite import TorcsLiteEnv
+from sb3_torcs.models import shipped_agents
 from sb3_torcs.noise import BLOG
 from sb3_torcs.sensors import RANGE_FINDERS, sensor_table
 from sb3_torcs.study_file import read_study
@@ -352,7 +353,7 @@ def check(args, monkeypatch):
         run = re.fullmatch(
             r"logs/(?:\w+/)?(\w+)/Torcs(?:Lite)?-v0_1(?:/best_model\.zip)?", args.model
         )
-        assert args.model == "scripted" or zoo.config_file(run[1])
+        assert args.model in ("scripted", *shipped_agents()) or zoo.config_file(run[1])
 
 
 def check_zoo(args):
