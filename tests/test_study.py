@@ -65,9 +65,11 @@ def test_the_table_has_every_evaluation_of_every_trial(undisturbed):
 
 
 @pytest.fixture
-def short_folder():
+def short_folder(monkeypatch):
     """Ray's sockets lie in it, and their paths must not be long."""
     with tempfile.TemporaryDirectory(prefix="st-") as folder:
+        monkeypatch.setenv("RAY_TMPDIR", folder)  # where a cluster writes down its address
+        (Path(folder) / "ray").mkdir()
         yield folder
 
 
