@@ -32,6 +32,7 @@ from sb3_torcs.noise import (
 
 __all__ = [
     "DrivingMetricsCallback",
+    "GradientStepsCallback",
     "NoiseCallback",
     "NoiseDecayCallback",
     "RandomStartCallback",
@@ -275,6 +276,53 @@ class RandomStartCallback(BaseCallback):
     def _on_training_end(self) -> None:
         for switch in self._switches:
             switch.undo()
+
+
+class GradientStepsCallback(BaseCallback):
+    """
+    Learn more from each decision at the beginning of a training, when there are few.
+
+    Every saved model keeps its own ``gradient_steps``: the other number holds only from the end of
+    a rollout, where the algorithm reads it, to the beginning of the next.
+
+    :param gradient_steps: instead of the model's own, for the first decisions
+    :param frames: number of these decisions, of all environments together
+    :param verbose: as in ``BaseCallback``
+    """
+
+    def __init__(self, *, gradient_steps: int, frames: int, verbose: int = 0) -> None:
+        super().__init__(verbose)
+        if gradient_steps < 1 or frames < 1:
+            raise InvalidOption(
+                f"gradient_steps={gradient_steps!r}, frames={frames!r}: pass at least 1 of each"
+            )
+        self.gradient_steps = gradient_steps
+        self.frames = frames
+
+    def _on_training_start(self) -> None:
+        if not isinstance(self.model, OffPolicyAlgorithm):
+            raise InvalidOption(
+                f"{type(self).__name__} sets the gradient steps of off-policy algorithms, but the "
+                f"model is a {type(self.model).__name__}; take it out of the callbacks"
+            )
+        self._own = self.model.gradient_steps
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:
+        if self.num_timesteps <= self.frames:
+            self._set(self.gradient_steps)
+
+    def _on_rollout_start(self) -> None:
+        self._set(self._own)
+
+    def _on_training_end(self) -> None:
+        self._set(self._own)
+
+    def _set(self, gradient_steps: int) -> None:
+        assert isinstance(self.model, OffPolicyAlgorithm)
+        self.model.gradient_steps = gradient_steps
 
 
 class _Switch:

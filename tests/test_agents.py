@@ -1,4 +1,4 @@
-"""The agents that come with the package: small, loadable by stock SB3, and as good as their cards."""
+"""The agents of the package: small, loadable by stock SB3, and as good as their cards say."""
 
 from __future__ import annotations
 

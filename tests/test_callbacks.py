@@ -13,6 +13,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 from toy import ToyRace
 
 from sb3_torcs.callbacks import (
+    GradientStepsCallback,
     NoiseCallback,
     NoiseDecayCallback,
     RandomStartCallback,
@@ -312,6 +313,57 @@ def test_an_environment_without_the_setting_is_named(callback):
         model.learn(1, callback=callback)
 
 
+# ------------------------------------------------------------------------------- gradient steps
+
+
+class Updates(BaseCallback):
+    """Notes the updates made before each rollout, and what a model saved in it would say."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.counts: list[int] = []
+        self.saved: list[int] = []
+
+    def _on_rollout_start(self) -> None:
+        self.counts.append(self.model._n_updates)
+
+    def _on_step(self) -> bool:
+        self.saved.append(self.model.gradient_steps)
+        return True
+
+
+def test_a_young_training_learns_more_from_each_decision():
+    """Three updates in each of the first four rollouts, one thereafter; saved models say one."""
+    model, updates = make_model(2, gradient_steps=1), Updates()
+    learn(model, 12, GradientStepsCallback(gradient_steps=3, frames=8), updates)
+    assert updates.counts == [0, 3, 6, 9, 12, 13]
+    assert updates.saved == [1] * 6
+    assert (model._n_updates, model.gradient_steps) == (14, 1)
+
+
+def test_a_training_that_goes_on_is_no_longer_young():
+    """The decisions are counted over all its parts."""
+    model = make_model(gradient_steps=1)
+    callback = GradientStepsCallback(gradient_steps=3, frames=6)
+    learn(model, 4, callback)
+    model.learn(4, callback=callback, reset_num_timesteps=False)
+    assert model._n_updates == 6 * 3 + 2
+
+
+def test_gradient_steps_need_an_algorithm_with_a_replay():
+    """PPO has none to set."""
+    model = PPO("MlpPolicy", make_vec_env(ToyRace), n_steps=8, batch_size=8, device="cpu")
+    with pytest.raises(InvalidOption, match="off-policy algorithms, but the model is a PPO"):
+        model.learn(8, callback=GradientStepsCallback(gradient_steps=2, frames=10))
+
+
+@pytest.mark.parametrize("options", [{"gradient_steps": 0}, {"frames": 0}])
+def test_gradient_steps_are_at_least_one(options):
+    """None at all is what `learning_starts` is for."""
+    with pytest.raises(InvalidOption, match="at least 1 of each"):
+        GradientStepsCallback(**{"gradient_steps": 2, "frames": 10, **options})
+
+
 @pytest.mark.parametrize(
     "callback",
     [
@@ -320,6 +372,7 @@ def test_an_environment_without_the_setting_is_named(callback):
         StochasticBrakeCallback,
         RandomStartCallback,
         lambda *args: RewardCallback(*args, reward="blog"),
+        lambda *args: GradientStepsCallback(*args, gradient_steps=2, frames=10),
     ],
 )
 def test_arguments_are_by_name_only(callback):
