@@ -21,9 +21,11 @@ import numpy as np
 import torch as th
 import yaml
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecNormalize
 
 import sb3_torcs  # noqa: F401  registers the environments, in a worker too
+from sb3_torcs.errors import StudyError
 from sb3_torcs.evaluation import Episode, Merit, evaluate, merit, race_environment
 from sb3_torcs.ladder import rung
 from sb3_torcs.models import BEST_MODEL, NormalizedDriver, load_driver
@@ -75,6 +77,7 @@ class Training:
         Learn to the end of the budget.
 
         :param after_slice: called after each evaluation; may call :meth:`save`
+        :raises StudyError: if a callback stops the training before
         """
         remaining = self.trial.budget - self.model.num_timesteps
         self._clock = _clocks()
@@ -83,9 +86,17 @@ class Training:
             env = self.model.get_env()
             # Anything but None: SB3 shall not reset the environments, a slice does.
             self.model._last_obs = np.zeros((env.num_envs, *env.observation_space.shape))
-            callbacks = [slices, *self.callbacks]
+            self.model.set_logger(Logger(None, []))  # SB3's own leaves an empty folder behind
+            # Slices come last: what others change for a rollout is changed back when one ends.
+            callbacks = [*self.callbacks, slices]
             # As one learn() to the end, so that schedules fall over the whole budget.
             self.model.learn(remaining, callback=callbacks, reset_num_timesteps=False)
+            if self.model.num_timesteps < self.trial.budget:
+                raise StudyError(
+                    f"a callback stopped the training at {self.model.num_timesteps} of "
+                    f"{self.trial.budget} decisions; those of a study go to the end of the budget: "
+                    "take that callback away"
+                )
             slices.end()
 
     def begin_slice(self) -> None:

@@ -8,6 +8,7 @@ import torch as th
 import yaml
 
 from sb3_torcs.cli import main
+from sb3_torcs.errors import StudyError
 from sb3_torcs.evaluation import Episode
 from sb3_torcs.study_file import read_study
 from sb3_torcs.study_training import Training, final_row
@@ -23,6 +24,17 @@ CASES = {
         "n_envs": 1, "n_steps": 3, "learning_rate": "lin_2e-4",
     },
     "normalized observations": {"normalize": {"norm_obs": True, "norm_reward": False}},
+    "what the default on the real game has": {
+        "n_steps": 3,
+        "learning_rate": "lin_2e-4",
+        "policy_kwargs": {**TINY["policy_kwargs"], "ema_decay": 0.9},
+        "callback": {
+            "sb3_torcs.callbacks.RandomStartCallback": {"speed": 30.0},
+            "sb3_torcs.callbacks.NoiseCallback": {"kind": "ou", "dt": 0.1},
+            "sb3_torcs.callbacks.NoiseDecayCallback": {"frames": 200, "floor": 0.35},
+            "sb3_torcs.callbacks.GradientStepsCallback": {"gradient_steps": 5, "frames": 120},
+        },
+    },
     "the post's noise and brake": {
         "n_envs": 2,
         "callback": {
@@ -108,6 +120,17 @@ def test_an_algorithm_without_memory_goes_on_the_same(tmp_path):
     resumed, _ = killed_after_every_slice(wanted, tmp_path)
     assert without_clocks(resumed.rows) == without_clocks(undisturbed.rows)
     assert weights(resumed.model) == weights(undisturbed.model)
+
+
+def test_a_callback_that_stops_the_training_is_told(tmp_path):
+    path = "stable_baselines3.common.callbacks.StopTrainingOnMaxEpisodes"
+    changes = {**TINY, "callback": {path: {"max_episodes": 1}}}
+    training = Training(trial(tmp_path, changes, n_timesteps=5000, eval_interval=5000))
+    with pytest.raises(
+        StudyError, match=r"a callback stopped the training at .* of 5000 decisions"
+    ):
+        training.run(lambda: None)
+    training.close()
 
 
 @pytest.mark.parametrize("changes", [{}, {"normalize": {"norm_obs": True}}], ids=["", "normalized"])
