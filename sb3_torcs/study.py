@@ -24,6 +24,7 @@ __all__ = ["Keeper", "Progress", "require_ray", "run_study", "run_trial"]
 
 RETRIES = 3  # of a trial whose worker was lost or whose code failed, per run of the command
 SESSION = ".session"  # where a killed run's temporary files are
+SCRATCH = "st-"  # what folders with temporary files are called: short, since sockets lie in them
 
 Progress = Callable[[Trial, dict[str, Any]], None]
 """Called with a trial and the last of its rows, or with ``{"state": …}``."""
@@ -123,8 +124,8 @@ def run_trial(trial: Trial, keeper: Any, report: Callable[[dict[str, Any]], None
             keeper.put(trial, packed, training.rows)
             report(training.rows[-1])
 
-        training.run(after_slice)
-        training.close()
+        with contextlib.closing(training):
+            training.run(after_slice)
         files, _, missing = keeper.state(trial)
     chosen = [row for row in keeper.rows(trial) if row["phase"] == "train" and row["kept"]][-1]
     with _unpacked(files) as folder:
@@ -211,8 +212,8 @@ def _ray(place: StudyFolder, jobs: int | None, address: str | None) -> Iterator[
 
     session = place.path / SESSION
     if session.is_file():
-        shutil.rmtree(session.read_text(encoding="utf-8"), ignore_errors=True)
-    scratch = Path(tempfile.mkdtemp(prefix="st-"))  # short: sockets lie in it
+        _remove_scratch(Path(session.read_text(encoding="utf-8")))
+    scratch = Path(tempfile.mkdtemp(prefix=SCRATCH))
     session.write_text(str(scratch), encoding="utf-8")
     options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
     if address is None:
@@ -224,11 +225,15 @@ def _ray(place: StudyFolder, jobs: int | None, address: str | None) -> Iterator[
         options["address"] = address
     try:
         ray.init(**options)
-    except (ConnectionError, RuntimeError, ValueError) as error:
+    except (OSError, RuntimeError, ValueError) as error:
         shutil.rmtree(scratch, ignore_errors=True)
+        session.unlink(missing_ok=True)
         raise RayUnavailable(
-            f"no Ray cluster at '{address}' ({error}); start one with `ray start --head` and give "
-            "the address that it prints, or leave --address out"
+            f"Ray does not start in '{scratch}' ({error}); is there room, and the path short? "
+            "Otherwise choose another place: TMPDIR=/tmp"
+            if address is None
+            else f"no Ray cluster at '{address}' ({error}); start one with `ray start --head` and "
+            "give the address that it prints, or leave --address out"
         ) from error
     try:
         yield scratch
@@ -236,6 +241,12 @@ def _ray(place: StudyFolder, jobs: int | None, address: str | None) -> Iterator[
         ray.shutdown()
         shutil.rmtree(scratch, ignore_errors=True)
         session.unlink(missing_ok=True)
+
+
+def _remove_scratch(folder: Path) -> None:
+    """Remove what a killed run has left, and nothing else, whatever the file says."""
+    if folder.parent == Path(tempfile.gettempdir()) and folder.name.startswith(SCRATCH):
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _tune(

@@ -26,9 +26,11 @@ REQUIRED = ("name", "seeds", "eval_interval")
 SOURCE = ("algo", "env", "conf_file", "entry", "n_timesteps", "eval_tracks")
 """What a study says for all its variants, and a variant may say for itself."""
 
+WORDS = ("algo", "env", "conf_file", "entry")
 KEYS = (*REQUIRED, *SOURCE, "variants", "final_tracks")
 WRAPPERS = ("env_wrapper", "vec_env_wrapper", "frame_stack")
 ROAD = "road"
+SEEDS = 2**32  # that NumPy takes
 
 FIELDS = (
     "study", "variant", "seed", "phase", "decisions", "episodes", "wall_s", "cpu_s", "track",
@@ -164,11 +166,27 @@ def slug(text: str) -> str:
     return re.sub(r"[^\w.]+", "-", text).strip("-.").lower()
 
 
+class _Once(yaml.SafeLoader):
+    """Refuses a key that is there twice; YAML's own loader takes the last of two variants."""
+
+    def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
+        mapping: yaml.MappingNode = super().compose_mapping_node(anchor)
+        seen = set()
+        for key in (key for key, _ in mapping.value if isinstance(key, yaml.ScalarNode)):
+            if key.value in seen:
+                problem = f"key '{key.value}' is there twice; rename one"
+                raise yaml.MarkedYAMLError(problem=problem, problem_mark=key.start_mark)
+            seen.add(key.value)
+        return mapping
+
+
 def _read(file: Path) -> dict[str, Any]:
-    if not file.is_file():
-        raise StudyError(f"there is no study file '{file}'; give a .yml file")
     try:
-        said = yaml.safe_load(file.read_text(encoding="utf-8"))
+        if not file.is_file():
+            raise StudyError(f"there is no study file '{file}'; give a .yml file")
+        said = yaml.load(file.read_text(encoding="utf-8"), Loader=_Once)
+    except OSError as error:
+        raise StudyError(f"{file} cannot be read: {error.strerror or error}") from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise StudyError(f"{file}: not YAML: {error}") from error
     if not isinstance(said, dict):
@@ -182,12 +200,12 @@ def _seeds(value: Any, file: Path) -> list[int]:
     if (
         not isinstance(seeds, list)
         or not seeds
-        or not all(type(seed) is int and seed >= 0 for seed in seeds)
+        or not all(type(seed) is int and 0 <= seed < SEEDS for seed in seeds)
         or len(set(seeds)) < len(seeds)
     ):
         raise StudyError(
             f"{file}: seeds is {value!r}; expected how many (at least 1), or a list of different "
-            "whole numbers, e.g. [0, 1, 2]"
+            "whole numbers from 0 to 2**32 - 1, e.g. [0, 1, 2]"
         )
     return seeds
 
@@ -199,7 +217,7 @@ def _trials(
     place = zoo.Place(file, f"variants: {variant}")
     if not isinstance(changes, dict) or not slug(variant):
         raise StudyError(f"{place}: expected 'NAME: {{key: value}}', got {changes!r}")
-    source = {key: changes.get(key, said.get(key)) for key in SOURCE}
+    source = _source(said, changes, place)
     algo, env_id = source["algo"] or "ddpg", source["env"] or "Torcs-v0"
     zoo.check_racing(env_id)
     conf_file = source["conf_file"] and file.parent / Path(source["conf_file"]).expanduser()
@@ -211,6 +229,7 @@ def _trials(
     except StudyError as error:
         raise StudyError(f"{place}: {error}") from None
     zoo.check_entry(entry, algo, env_id, place)
+    entry["n_timesteps"] = int(float(entry["n_timesteps"]))  # YAML takes 1e5 for a word
     _check_evaluable(entry, place)
     interval = said["eval_interval"]
     if type(interval) is not int or interval < 1:
@@ -227,8 +246,23 @@ def _trials(
         )  # fmt: skip
 
 
+def _source(
+    said: Mapping[str, Any], changes: Mapping[str, Any], place: zoo.Place
+) -> dict[str, Any]:
+    """Collect what a variant says for itself, or the study for all."""
+    source = {key: changes.get(key, said.get(key)) for key in SOURCE}
+    for key in WORDS:
+        if not isinstance(source[key], str | None):
+            raise StudyError(f"{place}: {key} is {source[key]!r}; expected a word")
+    return source
+
+
 def _check_evaluable(entry: Mapping[str, Any], place: zoo.Place) -> None:
-    """Wrappers would have to be around the car of an evaluation, too, wherever it drives."""
+    """Make sure that evaluations can be driven in the training's environment."""
+    env_kwargs = entry.get("env_kwargs")
+    if not isinstance(env_kwargs, dict | None):
+        raise StudyError(f"{place}: env_kwargs is {env_kwargs!r}; expected '{{key: value}}'")
+    # Wrappers would have to be around the car of an evaluation, too, wherever it drives.
     for key in WRAPPERS:
         if key in entry:
             raise StudyError(

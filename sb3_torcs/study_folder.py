@@ -16,15 +16,17 @@ from __future__ import annotations
 import contextlib
 import csv
 import fcntl
+import io
 import json
+import os
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from sb3_torcs.errors import StudyError
+from sb3_torcs.errors import OutputNotWritable, StudyError
 from sb3_torcs.study_file import FIELDS, Study, Trial, track_name
 
 __all__ = ["RESULTS", "Files", "StudyFolder"]
@@ -55,7 +57,7 @@ class StudyFolder:
         with (self.path / LOCK).open("w") as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as error:
+            except BlockingIOError as error:
                 raise StudyError(
                     f"another process runs the study in '{self.path}'; wait for it, or give "
                     "another --folder"
@@ -85,9 +87,10 @@ class StudyFolder:
                 file.parent.mkdir(exist_ok=True)
                 _write(file, yaml.safe_dump(recipe, sort_keys=False).encode())
                 continue
-            before = yaml.safe_load(file.read_text(encoding="utf-8"))
+            before = _parsed(file, yaml.safe_load) or {}
             if before != recipe:
-                changed = [key for key in recipe if recipe[key] != before.get(key)]
+                keys = {**recipe, **before}
+                changed = [key for key in keys if recipe.get(key) != before.get(key)]
                 raise StudyError(
                     f"'{file.parent}' was begun with another {', '.join(changed)}; give another "
                     "--folder, or remove that one to begin it anew"
@@ -101,7 +104,7 @@ class StudyFolder:
         :return: its rows, those during the training first
         """
         file = self.of(trial) / ROWS
-        return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else []
+        return _parsed(file, json.loads) if file.is_file() else []
 
     def trained(self, trial: Trial) -> bool:
         """
@@ -149,6 +152,7 @@ class StudyFolder:
         :param files: of its checkpoint
         :param rows: of its evaluations so far
         :raises StudyError: if the trial is already as far: two workers drive it
+        :raises OutputNotWritable: if there is no room; the state before is still there
         """
         if len(rows) <= len(self.rows(trial)):
             raise StudyError(f"{trial.name} has come farther elsewhere; this worker is not needed")
@@ -161,7 +165,7 @@ class StudyFolder:
             shutil.rmtree(aside, ignore_errors=True)
             aside.mkdir()
             for file, content in files.items():
-                (aside / file).write_bytes(content)
+                _write(aside / file, content)
             aside.rename(folder / f"{CHECKPOINT}{len(rows):06d}")
         for file in kept:
             _write(folder / file, files[file])
@@ -188,15 +192,13 @@ class StudyFolder:
         :param study: whose trials they are
         :return: the file
         """
-        file = self.path / RESULTS
-        aside = file.with_suffix(".new")
-        with aside.open("w", newline="", encoding="utf-8") as output:
-            writer = csv.writer(output, lineterminator="\n")
-            writer.writerow(FIELDS)
-            for trial in study.trials:
-                writer.writerows([_cell(row[f]) for f in FIELDS] for row in self.rows(trial))
-        aside.replace(file)
-        return file
+        table = io.StringIO()
+        writer = csv.writer(table, lineterminator="\n")
+        writer.writerow(FIELDS)
+        for trial in study.trials:
+            writer.writerows([_cell(row[f]) for f in FIELDS] for row in self.rows(trial))
+        _write(self.path / RESULTS, table.getvalue().encode())
+        return self.path / RESULTS
 
 
 def _cell(value: Any) -> Any:
@@ -206,8 +208,28 @@ def _cell(value: Any) -> Any:
     return int(value) if isinstance(value, bool) else value
 
 
+def _parsed(file: Path, parse: Callable[[str], Any]) -> Any:
+    """Read a file that was written here."""
+    try:
+        return parse(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError, yaml.YAMLError) as error:
+        raise StudyError(
+            f"'{file}' cannot be read ({error}); repair it, or remove '{file.parent}' to begin "
+            "this agent anew"
+        ) from error
+
+
 def _write(file: Path, content: bytes) -> None:
-    """Write a file that is there whole, or not at all."""
+    """Write a file that is there whole, or not at all, after a power cut too."""
     aside = file.with_name(f".{file.name}")
-    aside.write_bytes(content)
-    aside.replace(file)
+    try:
+        with aside.open("wb") as output:
+            output.write(content)
+            output.flush()
+            os.fsync(output.fileno())
+        aside.replace(file)
+    except OSError as error:
+        raise OutputNotWritable(
+            f"cannot write '{file}': {error.strerror or error}; make room, and type the same "
+            "command again: what was written before is kept"
+        ) from error

@@ -220,7 +220,7 @@ def _check_numbers(entry: Entry, place: Place) -> None:
     """Check the values that the zoo turns into numbers only when the training begins."""
     steps = entry["n_timesteps"]
     try:
-        good = not isinstance(steps, bool) and float(steps) >= 1.0
+        good = not isinstance(steps, bool) and 1.0 <= float(steps) < float("inf")
     except (TypeError, ValueError):
         good = False
     if not good:

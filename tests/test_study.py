@@ -1,7 +1,9 @@
 """Studies run on Ray Tune, and come to the same results whatever happens to the machines."""
 
 import csv
+import errno
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -13,6 +15,8 @@ import pytest
 import yaml
 
 from sb3_torcs.cli import main
+from sb3_torcs.cli.study import Board
+from sb3_torcs.errors import RayUnavailable, StudyError
 from sb3_torcs.study import Keeper, run_study, run_trial
 from sb3_torcs.study_file import read_study
 from sb3_torcs.study_folder import StudyFolder
@@ -62,6 +66,91 @@ def test_the_table_has_every_evaluation_of_every_trial(undisturbed):
         assert {row["track"] for row in rows[:-1]} == {"aalborg"}
         assert rows[-1]["track"] == "g-track-1"
         assert len({row["return"] for row in rows[:-1]}) == 8  # each drives what was learned
+
+
+@pytest.fixture
+def begun(tmp_path):
+    """A study of two trials, of which the first has one evaluation."""
+    study = read_study(study_file(tmp_path))
+    place = StudyFolder(tmp_path / "out")
+    place.begin(study)
+    place.put(study.trials[0], {"state.json": b"1"}, [{"phase": "train", "decisions": 240}])
+    return study, place
+
+
+def test_the_table_shows_how_far_everybody_is_and_the_best_so_far(begun, monkeypatch, capsys):
+    for name, value in (("FORCE_COLOR", "1"), ("TERM", "xterm"), ("COLUMNS", "100")):
+        monkeypatch.setenv(name, value)
+    study, _ = begun
+    row = {"phase": "train", "decisions": 240, "kept": True, "laps": 3, "completes": True}
+    board = Board(study)
+    with board.shown():
+        board.update(study.trials[0], {**row, "best_flying_lap_s": 83.5})
+        board.update(study.trials[0], {**row, "decisions": 480, "kept": False})
+        board.update(study.trials[1], {"state": "failed", "error": "why"})
+    lines = [" ".join(line.split()) for line in capsys.readouterr().err.splitlines()]
+    assert "small nets 0 480 / 1920 3 83.500 yes waits" in lines
+    assert "small nets 1 0 / 1920 failed" in lines
+    assert board.errors() == {"small-nets-seed1": "why"}
+
+
+def test_a_full_disk_is_told_and_takes_nothing_away(begun, monkeypatch, capsys):
+    study, place = begun
+    before = place.rows(study.trials[0])
+
+    def full(descriptor):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left on device; make room"):
+        place.put(study.trials[0], {"state.json": b"2"}, [*before, {"decisions": 480}])
+    assert place.rows(study.trials[0]) == before
+    assert (place.checkpoint(study.trials[0]) / "state.json").read_bytes() == b"1"
+    assert main(["study", str(study.path), "--folder", str(place.path.parent / "new")]) == 2
+    assert "make room, and type the same command again" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["rows.json", "recipe.yml"])
+def test_a_damaged_folder_is_told(begun, capsys, name):
+    study, place = begun
+    (place.of(study.trials[0]) / name).write_bytes(b"{\xff")
+    assert main(["study", str(study.path), "--folder", str(place.path)]) == 2
+    assert f"small-nets-seed0/{name}' cannot be read (" in capsys.readouterr().err
+
+
+def test_another_recipe_is_told_by_what_is_different(begun, tmp_path):
+    _, place = begun
+    with pytest.raises(StudyError, match="was begun with another eval_interval; give another"):
+        place.begin(read_study(study_file(tmp_path, eval_interval=100)))
+
+
+def test_a_worker_that_is_behind_is_not_needed(begun):
+    study, place = begun
+    with pytest.raises(StudyError, match="small-nets-seed0 has come farther elsewhere"):
+        place.put(study.trials[0], {}, [{"phase": "train", "decisions": 240}])
+
+
+def test_two_runs_do_not_share_a_folder(begun, capsys):
+    study, place = begun
+    with place.locked():
+        assert main(["study", str(study.path), "--folder", str(place.path)]) == 2
+    assert "another process runs the study" in capsys.readouterr().err
+
+
+def test_where_ray_does_not_start_it_is_said_and_nothing_else_is_removed(
+    begun, tmp_path, monkeypatch
+):
+    """Its sockets lie in the folder for temporary files, and their paths must not be long."""
+    study, place = begun
+    far = tmp_path / ("far" * 20)
+    far.mkdir()
+    (place.path / ".session").write_text(str(tmp_path))
+    monkeypatch.setattr(tempfile, "tempdir", str(far))
+    with pytest.raises(RayUnavailable, match=r"Ray does not start in .* TMPDIR=/tmp"):
+        run_study(study, place.path, jobs=1)
+    assert study.path.is_file()
+    assert not list(far.iterdir())
+    assert not (place.path / ".session").exists()
 
 
 @pytest.fixture

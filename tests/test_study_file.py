@@ -34,6 +34,7 @@ def test_the_shipped_studies_can_be_run(path):
         ({"seeds": 0}, "seeds is 0; expected how many"),
         ({"seeds": [1, 1]}, "a list of different whole numbers"),
         ({"seeds": [-1]}, "a list of different whole numbers"),
+        ({"seeds": [2**32]}, "whole numbers from 0 to 2**32 - 1"),
         ({"seeds": True}, "seeds is True"),
         ({"seeds": None}, "key 'seeds' is missing"),
         ({"sedes": 3}, "unknown key 'sedes'; did you mean 'seeds'?"),
@@ -47,6 +48,9 @@ def test_the_shipped_studies_can_be_run(path):
         ({"conf_file": "none.yml"}, "there is no hyperparameter file"),
         ({"entry": "as the pots"}, "did you mean 'as the post'?"),
         ({"n_timesteps": 0}, "n_timesteps is 0; expected a number >= 1"),
+        ({"n_timesteps": float("inf")}, "n_timesteps is inf; expected a number >= 1"),
+        ({"algo": 3}, "algo is 3; expected a word"),
+        ({"entry": 3}, "entry is 3; expected a word"),
         ({"variants": ["a"]}, "expected 'NAME: {key: value}'"),
         ({"variants": {"a": 3}}, "variants: a': expected 'NAME: {key: value}'"),
         ({"variants": {"a b": {}, "a-b": {}}}, "names that differ in signs only"),
@@ -56,6 +60,7 @@ def test_the_shipped_studies_can_be_run(path):
             "argument 'knd'; did you mean 'kind'?",
         ),
         ({"variants": {"a": {"env_kwargs": {"track": "nowhere"}}}}, "no track 'nowhere'"),
+        ({"variants": {"a": {"env_kwargs": 3}}}, "env_kwargs is 3; expected '{key: value}'"),
         ({"variants": {"a": {"env_kwargs": {"reward": "blgo"}}}}, "did you mean 'blog'?"),
         ({"variants": {"a": {"n_steps": None}}}, "null takes 'n_steps' away, but it is not there"),
         ({"variants": {"a": {"frame_stack": 2}}}, "frame_stack is not for studies"),
@@ -68,7 +73,14 @@ def test_a_mistake_is_told_before_anything_starts(tmp_path, capsys, changes, say
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(("text", "says"), [("a: [", "not YAML"), ("- 1", "expected 'key: value'")])
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("a: [", "not YAML"),
+        ("- 1", "expected 'key: value'"),
+        ("variants:\n  a: {}\n  a: {}\n", "key 'a' is there twice; rename one"),
+    ],
+)
 def test_a_file_that_is_no_study_is_told(tmp_path, text, says):
     (tmp_path / "s.yml").write_text(text)
     with pytest.raises(StudyError, match=says):
@@ -103,6 +115,11 @@ def test_a_study_is_its_variants_by_its_seeds(tmp_path):
     assert [trial.algo for trial in study.trials] == ["ddpg", "ddpg", "sac", "sac"]
     assert study.trials[2].entry["gamma"] == 0.5
     assert study.trials[0].final_tracks == study.trials[0].eval_tracks == ("aalborg",)
+
+
+def test_the_budget_may_be_written_as_people_do(tmp_path):
+    study = read_study(written(tmp_path, n_timesteps="2e2"))
+    assert study.trials[0].budget == study.trials[0].entry["n_timesteps"] == 200
 
 
 def test_a_file_of_hyperparameters_lies_beside_the_study(tmp_path):

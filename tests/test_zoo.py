@@ -188,7 +188,7 @@ def test_an_argument_of_the_normalization_that_it_does_not_have_is_unknown(tmp_p
     accepted({"normalize": True})
 
 
-@pytest.mark.parametrize("steps", ["abc", 0, -5, True, None])
+@pytest.mark.parametrize("steps", ["abc", 0, -5, True, None, float("inf")])
 def test_the_budget_must_be_a_number(tmp_path, steps):
     said = complaint(tmp_path, {"n_timesteps": steps})
     assert said == f"n_timesteps is {steps!r}; expected a number >= 1"

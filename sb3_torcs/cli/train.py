@@ -159,7 +159,7 @@ def train_run(options: TrainOptions) -> Run:
     resume = _resumed(options, entry)
     folder = writable_folder(options.folder)
     tensorboard = writable_folder(options.tensorboard or folder / "tensorboard")
-    wanted = options.timesteps or int(entry["n_timesteps"])
+    wanted = options.timesteps or int(float(entry["n_timesteps"]))
     if options.progress:
         entry["callback"] = _with_progress(entry.get("callback"))
     with tempfile.TemporaryDirectory() as scratch:
