@@ -19,7 +19,7 @@ import numpy.typing as npt
 from sb3_torcs.errors import StudyError
 from sb3_torcs.ladder import RUNGS
 from sb3_torcs.study_file import slug
-from sb3_torcs.study_folder import RESULTS
+from sb3_torcs.study_folder import RECIPE, RESULTS, ROWS
 
 __all__ = ["Estimate", "Results", "estimate", "iqm", "read_results", "write_report"]
 
@@ -66,12 +66,18 @@ def read_results(folder: Path) -> list[Results]:
     :raises StudyError: if there is nothing to report
     """
     file = folder / RESULTS
-    if not file.is_file():
+    try:
+        with file.open(newline="", encoding="utf-8") as lines:
+            rows = [_read(row) for row in csv.DictReader(lines, restval="")]
+    except (FileNotFoundError, NotADirectoryError):
         raise StudyError(
             f"'{folder}' holds no {RESULTS}; give the folder of a study: sb3-torcs study FILE.yml"
-        )
-    with file.open(newline="", encoding="utf-8") as lines:
-        rows = [_read(row) for row in csv.DictReader(lines)]
+        ) from None
+    except (OSError, csv.Error, KeyError, ValueError) as error:
+        raise StudyError(
+            f"{file} cannot be read as results ({type(error).__name__}: {error}); the command that "
+            "ran the study writes it anew: sb3-torcs study FILE.yml"
+        ) from error
     if not rows:
         raise StudyError(f"{file} is empty: no agent was evaluated yet; let the study run on")
     trials = []
@@ -159,6 +165,7 @@ def write_report(folder: Path, output: Path) -> Path:
         "evaluations of its training, and measured afresh; *completes* is three laps in a row from "
         "the grid without leaving the road. Intervals are 95 % stratified bootstrap intervals.",
         "",
+        *_waiting(folder),
         *_summary(trials),
         *_seeds(trials),
         *_ladder(trials),
@@ -170,12 +177,26 @@ def write_report(folder: Path, output: Path) -> Path:
         lines += [f"## Learning: {variant}", "", f"![{variant}]({picture.name})", ""]
     lines += [
         "Thin: every seed; bold: the interquartile mean of the seeds. A seed without a lap counts "
-        "as infinitely slow, so the mean of the lap times begins when enough seeds have one.",
+        "as infinitely slow, so the mean of the lap times begins when enough seeds have one. "
+        "Curves end where the seed ends that has come least far.",
         "",
     ]
     report = output / "report.md"
     report.write_text("\n".join(lines), encoding="utf-8")
     return report
+
+
+def _waiting(folder: Path) -> list[str]:
+    """Name the agents that no figure can speak of, so that whoever failed early is not left out."""
+    recipes = sorted(folder.glob(f"*/{RECIPE}"))
+    waiting = [file.parent.name for file in recipes if not (file.parent / ROWS).is_file()]
+    return [f"Not evaluated yet, and in no figure: {', '.join(waiting)}.", ""] if waiting else []
+
+
+def _homes(trials: Sequence[Results]) -> str:
+    """Name the track that chose the models, the first if there are several."""
+    names = {trial.train[0]["track"] for trial in trials}
+    return f"on {names.pop()}" if len(names) == 1 else "each on the first that chose its model"
 
 
 def _variants(trials: Sequence[Results]) -> dict[str, list[Results]]:
@@ -207,7 +228,7 @@ def _summary(trials: Sequence[Results]) -> list[str]:
         rows.append(
             [
                 variant,
-                f"{sum(row['completes'] for row in homes)} of {len(homes)}",
+                _completing(homes, len(group)),
                 _seconds(min(laps, default=None)),
                 _seconds(_median(laps)),
                 "-" if middle is None else _with_interval(middle),
@@ -221,7 +242,13 @@ def _summary(trials: Sequence[Results]) -> list[str]:
         "variant", "seeds that complete", "best flying lap s", "median s", "IQM s",
         "first whole lap: decisions", "episodes", "minutes",
     ]  # fmt: skip
-    return _markdown("Summary", headers, rows)
+    return _markdown(f"Summary, {_homes(trials)}", headers, rows)
+
+
+def _completing(homes: Sequence[dict[str, Any]], seeds: int) -> str:
+    """Count the seeds that complete, and say how many are not counted."""
+    counted = f"{sum(row['completes'] for row in homes)} of {len(homes)}"
+    return counted if len(homes) == seeds else f"{counted}, {seeds - len(homes)} not measured"
 
 
 def _median(values: Sequence[float]) -> float | None:
@@ -257,7 +284,7 @@ def _seeds(trials: Sequence[Results]) -> list[str]:
         rows.append(
             [
                 f"{trial.variant}, {trial.seed}",
-                "not measured yet" if home is None else "yes" if home["completes"] else "no",
+                "not measured" if home is None else "yes" if home["completes"] else "no",
                 ", ".join(laps) or "-",
                 "-" if home is None else f"{home['distance_m']:.0f}",
                 "-" if home is None else home["end"],
@@ -272,7 +299,7 @@ def _seeds(trials: Sequence[Results]) -> list[str]:
         "variant, seed", "completes", "laps s", "distance m", "end", "model kept at",
         "evaluations that complete", "first whole lap: decisions", "episodes", "minutes",
     ]  # fmt: skip
-    return _markdown(f"Every seed, on {trials[0].train[0]['track']}", headers, rows)
+    return _markdown(f"Every seed, {_homes(trials)}", headers, rows)
 
 
 def _ladder(trials: Sequence[Results]) -> list[str]:
@@ -358,7 +385,7 @@ def _draw(variant: str, group: Sequence[Results], path: Path) -> None:
     _band(panels[2], decisions, estimate(curves["completes"], share))
     so_far = np.maximum.accumulate(curves["completes"], axis=1).mean(axis=0)
     panels[2].plot(decisions, so_far, color="tab:blue", linestyle="--")
-    panels[2].set_ylabel("share of seeds that complete")
+    panels[2].set_ylabel("share of races that complete")
     panels[2].set_ylim(-0.03, 1.03)
     panels[2].legend(["in this evaluation", "95 %", "in one so far"], fontsize=8)
     for panel in panels:

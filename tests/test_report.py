@@ -90,13 +90,42 @@ def test_a_study_that_still_runs_can_be_reported(tmp_path):
     """One seed is two evaluations ahead, and nothing is measured yet."""
     rows = [row(0), row(0, decisions=200), row(0, decisions=300), row(1, laps=(), kept=1)]
     report = write_report(written(tmp_path / "study", rows), tmp_path / "out")
-    assert "not measured yet" in report.read_text()
+    assert lines_of(report, "| base, 0 | not measured |")
     assert [len(trial.train) for trial in read_results(tmp_path / "study")] == [3, 1]
+
+
+def test_who_was_never_evaluated_is_named(study, tmp_path):
+    for name, rows in (("base-seed0", True), ("base-seed3", False), ("base-seed4", False)):
+        (study / name).mkdir()
+        (study / name / "recipe.yml").touch()
+        if rows:
+            (study / name / "rows.json").touch()
+    (said,) = lines_of(write_report(study, tmp_path / "out"), "Not evaluated yet")
+    assert said == "Not evaluated yet, and in no figure: base-seed3, base-seed4."
+
+
+def test_the_track_that_chose_the_models_is_named(tmp_path):
+    rows = [row(0), row(0, "final"), row(0, variant="other", track="forza")]
+    report = write_report(written(tmp_path / "study", rows[:2]), tmp_path / "out")
+    assert lines_of(report, "## ")[:2] == ["## Summary, on aalborg", "## Every seed, on aalborg"]
+    report = write_report(written(tmp_path / "study", rows), tmp_path / "out")
+    assert lines_of(report, "## Sum") == ["## Summary, each on the first that chose its model"]
+
+
+@pytest.mark.parametrize("text", ["a,b\n1,2\n", "{}\nbase,0\n", "\xff"])
+def test_a_table_that_is_damaged_is_told(tmp_path, capsys, text):
+    heading = ",".join(FIELDS)
+    (tmp_path / "results.csv").write_bytes(text.format(heading).encode("latin-1"))
+    assert main(["report", str(tmp_path)]) == 2
+    assert "results.csv cannot be read as results (" in capsys.readouterr().err
 
 
 def test_what_is_no_study_is_told(tmp_path, capsys):
     assert main(["report", str(tmp_path)]) == 2
     assert "holds no results.csv; give the folder of a study" in capsys.readouterr().err
+    (tmp_path / "folder" / "results.csv").mkdir(parents=True)
+    assert main(["report", str(tmp_path / "folder")]) == 2
+    assert "cannot be read as results (IsADirectoryError" in capsys.readouterr().err
     assert main(["report", str(written(tmp_path / "empty", []))]) == 2
     assert "no agent was evaluated yet" in capsys.readouterr().err
 
@@ -127,4 +156,6 @@ def test_an_interval_lies_around_its_figure_and_is_the_same_each_time():
 def test_a_study_in_which_nobody_laps_is_reported_too(tmp_path):
     rows = [row(seed, laps=(), kept=1, decisions=n) for seed in (0, 1) for n in (100, 200)]
     report = write_report(written(tmp_path / "study", rows), tmp_path / "out")
-    assert lines_of(report, "| base |") == ["| base | 0 of 0 | - | - | - | - | - | - |"]
+    assert lines_of(report, "| base |") == [
+        "| base | 0 of 0, 2 not measured | - | - | - | - | - | - |"
+    ]
