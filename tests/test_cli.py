@@ -23,7 +23,7 @@ NAMES = [verb.__name__.rpartition(".")[2].replace("_", "-") for verb in VERBS]
 PNG = b"\x89PNG"
 
 ENTRY = {
-    "n_timesteps": 60,
+    "n_timesteps": "6e1",  # YAML takes it for a word
     "policy": "MlpPolicy",
     "learning_starts": 20,
     "buffer_size": 100,

@@ -36,7 +36,11 @@ def add_parser(subparsers: Any) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
-    add("model", metavar="MODEL", help="a saved .zip, a run's folder, or 'scripted'")
+    add(
+        "model",
+        metavar="MODEL",
+        help="a saved .zip, a run's folder, a shipped agent, or 'scripted'",
+    )
     add("--host", default="127.0.0.1", metavar="H", help="default: 127.0.0.1")
     add("--port", type=positive, default=3001, metavar="P", help="default: 3001")
     add("--track", metavar="T", help="that runs there; default: that of the training, or aalborg")

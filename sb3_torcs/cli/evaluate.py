@@ -47,7 +47,11 @@ def add_parser(subparsers: Any) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
-    add("model", metavar="MODEL", help="a saved .zip, a run's folder, or 'scripted'")
+    add(
+        "model",
+        metavar="MODEL",
+        help="a saved .zip, a run's folder, a shipped agent, or 'scripted'",
+    )
     add("--env", metavar="ID", help=f"default: that of the training, or {DEFAULT_ENV}")
     add("--track", metavar="T", help="`sb3-torcs tracks` lists them")
     add("--car", metavar="C", help="e.g. car1-trb1")

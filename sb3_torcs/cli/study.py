@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 __all__ = ["Board", "add_parser", "run"]
 
 INTERRUPTED = 130
+REFRESHES = 2  # [1/s] of the table
 COLUMNS = ("variant", "seed", "decisions", "laps", "best lap s", "completes", "state")
 
 DESCRIPTION = """\
@@ -99,7 +100,6 @@ class Board:
     def __init__(self, study: Study) -> None:
         self._study = study
         self._rows: dict[str, dict[str, Any]] = {trial.name: {} for trial in study.trials}
-        self._live: Any = None
 
     def update(self, trial: Trial, row: dict[str, Any]) -> None:
         """
@@ -114,8 +114,6 @@ class Board:
             line["decisions"] = row["decisions"]
             if row["kept"]:
                 line.update({key: row[key] for key in ("laps", "completes", "best_flying_lap_s")})
-        if self._live is not None:
-            self._live.update(self._table(), refresh=True)
 
     def errors(self) -> dict[str, str]:
         """Return what the trials that failed have said, by name."""
@@ -138,9 +136,9 @@ class Board:
         if not console.is_terminal:
             yield
             return
-        with Live(self._table(), console=console, auto_refresh=False) as self._live:
+        # By the clock and not by the rows, of which a study that goes on has hundreds at once.
+        with Live(get_renderable=self._table, console=console, refresh_per_second=REFRESHES):
             yield
-        self._live = None
 
     def _table(self) -> Any:
         from rich.table import Table
