@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from sb3_torcs import models
 from sb3_torcs.cli import main
+from sb3_torcs.ladder import REFERENCE_FILE
 
 MAX_SIZE = 8_000_000  # [bytes]
 SECTIONS = ("## How it was made", "## What it drives", "## Limits")
 AGENTS = models.shipped_agents()
+DRIVE = re.compile(r"\n(sb3-torcs evaluate .*)\n```\n\nLaps: ([\d., ]*) s\.")  # in a card
+LINE = re.compile(  # of the leaderboard: driver, flying lap, standing lap, how it was made
+    r"^\| \[?([\w-]+).*? \| ([\d.]+) \| ([\d.]+) \|.*`(sb3-torcs .*? --track (\S+).*)` \|$", re.M
+)
 
 
 def card_of(name):
@@ -49,10 +56,32 @@ def test_stock_sb3_loads_it(name):
 @pytest.mark.parametrize("name", AGENTS)
 def test_it_drives_what_its_card_says(name, capsys):
     """To the digit, whatever the machine: every command of the card with the laps beneath it."""
-    drives = re.findall(r"\n(sb3-torcs evaluate .*)\n```\n\n(.*)", card_of(name))
+    drives = DRIVE.findall(card_of(name))
     assert drives
     for command, said in drives:
         assert main([*command.split()[1:], "--json"]) == 0
         (episode,) = json.loads(capsys.readouterr().out)["episodes"]
-        laps = ", ".join(f"{seconds:.3f}" for seconds in episode["lap_times"])
-        assert said.startswith(f"Laps: {laps} s."), command
+        assert said == ", ".join(f"{seconds:.3f}" for seconds in episode["lap_times"]), command
+
+
+def test_the_leaderboard_says_what_cards_and_reference_laps_say():
+    """Which the engine drives, as other tests see."""
+    text = (Path(__file__).parent.parent / "LEADERBOARD.md").read_text(encoding="utf-8")
+    known = {}
+    with REFERENCE_FILE.open(encoding="utf-8") as file:
+        for row in csv.DictReader(line for line in file if not line.startswith("#")):
+            known[row["driver"], row["track"]] = row["best_flying_lap_s"], row["standing_lap_s"]
+    for name in AGENTS:
+        for command, said in DRIVE.findall(card_of(name)):
+            standing, *flying = said.split(", ")
+            track = re.findall(r"--track (\S+)", command)
+            known.update({(name, *track): (min(flying, key=float), standing)})
+    ours = {driver for driver, *_ in known}
+    lines = {
+        (driver, track): laps
+        for driver, *laps, command, track in LINE.findall(text)
+        if "--index" not in command  # other cars of the robots have no reference laps
+    }
+    told = {key: tuple(laps) for key, laps in lines.items() if key[0] in ours}
+    assert {driver for driver, _ in told} >= {"inferno", "scripted", *AGENTS}
+    assert told == {key: known.get(key) for key in told}
