@@ -52,7 +52,7 @@ Each episode's row of ``monitor.csv`` then holds these, too. Monitor adds the tw
 default for the first is a tuple: hence the empty list. An empty ``best_lap_time`` is no whole lap.
 """
 
-ENDS = ("off_track", "backwards", "stuck", "damage", "laps", "time_limit")
+ENDS = ("off_track", "backwards", "stuck", "damage", "lost", "laps", "time_limit")
 
 BRAKING = 0.05  # [-] of the pedal's way; less is a network's idea of nothing
 SATURATED = 0.01  # [-] of an actuator's range: nearer to a limit than this counts as at it

@@ -11,6 +11,7 @@ from collections.abc import Iterable
 __all__ = [
     "BackendUnavailable",
     "CarFileError",
+    "CarLost",
     "DisplayUnavailable",
     "EngineBusy",
     "EngineForked",
@@ -101,6 +102,10 @@ class EngineBusy(Sb3TorcsError, RuntimeError):
 
 class EngineForked(Sb3TorcsError, RuntimeError):
     """An engine is used in a child process that was forked after it was made."""
+
+
+class CarLost(Sb3TorcsError, RuntimeError):
+    """The game's physics has divided by zero: a car is nowhere, and this race cannot go on."""
 
 
 class GameFailed(Sb3TorcsError, RuntimeError):

@@ -59,7 +59,7 @@ TERMS: dict[str, Term] = {
 }
 
 SCALE = 0.1  # [1/m] a reward of 1 for ten metres along the road
-CRASH = -1.0  # what an episode that ends off the road, backwards, stuck or damaged costs
+CRASH = -1.0  # what an episode that ends off the road, backwards, stuck and so on costs
 
 PRESETS: dict[str, dict[str, float]] = {
     "progress": {"speed_along": 1.0, "scale": SCALE, "crash": CRASH},
@@ -75,7 +75,7 @@ PRESETS: dict[str, dict[str, float]] = {
 """``progress``: Lillicrap et al.; ``blog``: the post's; ``apex``: its final update, which leaves
 out the pull to the middle of the road."""
 
-CRASHES = frozenset({"off_track", "backwards", "stuck", "damage"})
+CRASHES = frozenset({"off_track", "backwards", "stuck", "damage", "lost"})
 
 
 class Reward:

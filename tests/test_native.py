@@ -17,7 +17,7 @@ from sb3_torcs.actions import controls_from_action
 from sb3_torcs.backends.native import AGENT, Fleet, NativeBackend, make_engine
 from sb3_torcs.car import Controls, Start
 from sb3_torcs.drivers import ScriptedDriver
-from sb3_torcs.errors import InvalidOption
+from sb3_torcs.errors import CarLost, InvalidOption
 from sb3_torcs.game import find_game
 from sb3_torcs.sensors import encode
 
@@ -341,6 +341,33 @@ class TestStarts:
         backend.reset(rng, Start(place + off))
         for _ in range(10):
             assert np.isfinite([*backend.step(Controls(0.0, 0.5, 0.0), 1)[:23]]).all()
+
+    def test_a_division_by_zero_is_told(self, rng):
+        """A learner slid along a wall so that a steered wheel went sideways and nowhere else."""
+        start = Start(
+            593.074358493905, -0.2728089577556073, -0.028781531394979465, 55.77088799243907
+        )
+        *drive, last = [
+            Controls(-0.9758033752441406, 0.765198826789856, 0.8796617388725281),
+            Controls(-1.0, 0.8305118083953857, 0.9072043895721436),
+            Controls(-1.0, 0.7145910859107971, 1.0),
+            Controls(-0.7505556344985962, 0.0, 0.018453478813171387),
+            Controls(-1.0, 0.0, 0.10761964321136475),
+            Controls(-0.80303955078125, 0.0, 0.1278386116027832),
+            Controls(-0.15662217140197754, 0.0, 0.1056486964225769),
+            Controls(-0.33580005168914795, 0.0, 0.02483975887298584),
+            Controls(-1.0, 0.0, 0.07539516687393188),
+        ]
+        backend = NativeBackend("aalborg")
+        backend.reset(rng, start)
+        for controls in drive:
+            before = backend.step(controls, 5)
+        with pytest.raises(CarLost, match="divided by zero, agent is nowhere; call reset"):
+            backend.step(last, 5)
+        anew = pickle.loads(pickle.dumps(backend))
+        assert anew.engine.read(0)[:23] == before[:23]
+        again = backend.reset(rng, start)
+        assert again[:23] == NativeBackend("aalborg").reset(rng, start)[:23]
 
     @pytest.mark.parametrize("error", [-3.1, -1.5, 1.5, 3.1])
     def test_facing_any_way(self, rng, error):

@@ -6,6 +6,7 @@ import gc
 import multiprocessing
 import pickle
 import threading
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -16,7 +17,14 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 import sb3_torcs
 from sb3_torcs.drivers import ScriptedDriver
 from sb3_torcs.envs.torcs_vector import TorcsVectorEnv
-from sb3_torcs.errors import EngineForked, EnvClosed, InvalidAction, InvalidOption, TrackNotFound
+from sb3_torcs.errors import (
+    CarLost,
+    EngineForked,
+    EnvClosed,
+    InvalidAction,
+    InvalidOption,
+    TrackNotFound,
+)
 
 pytestmark = pytest.mark.usefixtures("game")
 
@@ -210,6 +218,22 @@ def test_a_fault_of_one_engine_is_raised_with_its_class(make, threads):
     with pytest.raises(EnvClosed, match="this engine is closed"):
         envs.step(np.stack([GAS] * 3))
     assert np.isfinite(envs.envs[2].step(GAS)[0]).all()  # no thread holds it any more
+
+
+def test_a_car_that_is_lost_ends_its_own_race_only(make):
+    envs = make(num_envs=2)
+    envs.reset(seed=0)
+    fleet = envs._fleet
+
+    def wait(place):
+        if place == 1:
+            raise CarLost("the car is nowhere")
+        return fleet.wait(place)
+
+    envs._fleet = SimpleNamespace(begin=fleet.begin, finish=fleet.finish, wait=wait)
+    _, _, terminated, truncated, infos = envs.step(np.stack([GAS] * 2))
+    assert (terminated.tolist(), truncated.tolist()) == ([False, True], [False, False])
+    assert infos["end"].tolist() == [None, "lost"]
 
 
 def test_before_a_reset_and_after_close_there_is_no_step(make):

@@ -222,8 +222,8 @@ class NativeBackend:
 
     def step(self, controls: Controls, ticks: int) -> CarState:
         """Drive on; see :class:`~sb3_torcs.backends.base.Backend`."""
-        self._drive.append((controls, ticks))
         self._state = self.engine.step(*controls, ticks)
+        self._drive.append((controls, ticks))
         return self._state
 
     def focus(self, direction: float) -> FloatArray:

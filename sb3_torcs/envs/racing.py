@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, TypedDict
 
 import gymnasium as gym
@@ -14,7 +15,7 @@ from gymnasium import spaces
 from sb3_torcs.actions import ACTION_HIGH, ACTION_LOW, controls_from_action
 from sb3_torcs.backends.base import Backend
 from sb3_torcs.car import CONTROL_TICK, MAX_DAMAGE, CarState, Controls, Start, is_count, is_number
-from sb3_torcs.errors import EnvClosed, InvalidOption
+from sb3_torcs.errors import CarLost, EnvClosed, InvalidOption
 from sb3_torcs.rewards import Reward
 from sb3_torcs.sensors import OBSERVATION_HIGH, OBSERVATION_LOW, encode
 from sb3_torcs.tracks import Track
@@ -191,7 +192,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         :raises InvalidAction: if the action has another shape or is not a number
         """
         controls = self.begin_step(action)
-        return self.finish_step(self.backend.step(controls, self.action_repeat))
+        return self.finish_step(partial(self.backend.step, controls, self.action_repeat))
 
     def begin_step(self, action: npt.NDArray[np.float32]) -> Controls:
         """
@@ -207,16 +208,24 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         self._controls = controls_from_action(action)
         return self._controls
 
-    def finish_step(self, after: CarState) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def finish_step(
+        self, drive: Callable[[], CarState]
+    ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """
-        Do what comes after the world has moved.
+        Let the world move, and do what comes after.
 
-        :param after: what the backend returned
+        :param drive: returns what the backend's ``step`` does
         :return: as ``step``
         """
-        before, self.car = self.car, after
+        before = self.car
         assert before is not None, "begin_step raises before the first reset"
-        end = self._end(after)
+        try:
+            after = drive()
+            end = self._end(after)
+        except CarLost:
+            # A training of millions of decisions shall not end with this episode.
+            after, end = before, "lost"
+        self.car = after
         terms = self._reward(before, after, self._controls, end)
         info = self._info(after, terms, end)
         if after.laps > before.laps:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -141,7 +142,9 @@ class TorcsVectorEnv(SyncVectorEnv):
             if anew[place]:
                 observation, info = env.reset()
             else:
-                observation, reward, end, cut, info = env.finish_step(self._fleet.wait(place))
+                observation, reward, end, cut, info = env.finish_step(
+                    partial(self._fleet.wait, place)
+                )
                 rewards[place] = reward
                 if end or cut:
                     terminated[place], truncated[place] = end, cut
@@ -203,8 +206,8 @@ class _Race(TorcsEnv):
         self._elapsed = 0
         return super().reset(**kwargs)
 
-    def finish_step(self, after: CarState) -> Answer:
-        observation, reward, terminated, truncated, info = super().finish_step(after)
+    def finish_step(self, drive: Callable[[], CarState]) -> Answer:
+        observation, reward, terminated, truncated, info = super().finish_step(drive)
         self._elapsed += 1
         truncated = truncated or self._elapsed >= self._decisions
         return observation, reward, terminated, truncated, info

@@ -451,9 +451,9 @@ void Race::drive(const Controls& controls, int ticks) {
     }
     for (int i = 0; i < cars_number(); i++)
         if (!std::isfinite(car(i).pub.local.vel.x) || !std::isfinite(car(i).pub.local.pos.x))
-            throw Error("GameFailed", "the game's physics has divided by zero, " +
-                                          std::string(car(i).info.name) +
-                                          " is nowhere; call reset to go on");
+            throw Error("CarLost", "the game's physics has divided by zero, " +
+                                       std::string(car(i).info.name) +
+                                       " is nowhere; call reset to go on");
 }
 
 void Race::update_physics(int steps) {
