@@ -51,6 +51,7 @@ class Backend(Protocol):
         :param controls: finite and within their ranges
         :param ticks: control ticks of 0.02 s, at least 1
         :return: the car after the last tick
+        :raises CarLost: if this race cannot go on; a reset begins another
         """
 
     def close(self) -> None:
