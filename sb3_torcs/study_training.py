@@ -142,7 +142,7 @@ class Training:
 
         :param folder: an empty one
         """
-        self.model.save(folder / LAST_MODEL)
+        self._save_model(folder / LAST_MODEL)
         if getattr(self.model, "replay_buffer", None) is not None:
             memory: dict[str, Any] = dict(_memory(self.model.replay_buffer))
             np.savez(folder / MEMORY, **memory)
@@ -168,12 +168,7 @@ class Training:
         env = self.model.get_env()
         if (folder / STATISTICS).is_file():
             env = VecNormalize.load(str(folder / STATISTICS), env.venv)
-        # SB3 chooses the class of the memory as before; given its own choice, it would warn.
-        chosen = "replay_buffer_class" not in self.trial.entry
-        anew = {"replay_buffer_class": None} if chosen else None
-        self.model = type(self.model).load(
-            folder / LAST_MODEL, env=env, device="cpu", custom_objects=anew
-        )
+        self.model = type(self.model).load(folder / LAST_MODEL, env=env, device="cpu")
         if (folder / MEMORY).is_file():
             with np.load(folder / MEMORY) as memory:
                 _remember(self.model.replay_buffer, memory)
@@ -192,12 +187,15 @@ class Training:
         (episode,) = evaluate(self._races[track], driver)
         return episode
 
+    def _save_model(self, file: Path | io.BytesIO) -> None:
+        # A class of memory that SB3 chose itself would be taken for the user's when it is loaded.
+        chosen = "replay_buffer_class" not in self.trial.entry
+        self.model.save(file, exclude=["replay_buffer_class"] if chosen else None)
+
     def _model_files(self) -> dict[str, bytes]:
         """Return the present model as files that ``sb3-torcs evaluate`` reads."""
         buffer = io.BytesIO()
-        # A class of memory that SB3 chose itself would be taken for the user's when it is loaded.
-        chosen = "replay_buffer_class" not in self.trial.entry
-        self.model.save(buffer, exclude=["replay_buffer_class"] if chosen else None)
+        self._save_model(buffer)
         files = {BEST_MODEL: buffer.getvalue()}
         if self.normalizer is not None:
             with tempfile.NamedTemporaryFile() as file:
