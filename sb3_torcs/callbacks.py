@@ -211,7 +211,17 @@ class StochasticBrakeCallback(_NoiseUser):
             noise.stochastic_brake = None
 
 
-class RewardCallback(BaseCallback):
+class _SwitchUser(BaseCallback):
+    """Base of callbacks that change settings of environments, and give them back at the end."""
+
+    _switches: Sequence[_Switch] = ()
+
+    def _on_training_end(self) -> None:
+        for switch in self._switches:
+            switch.undo()
+
+
+class RewardCallback(_SwitchUser):
     """
     Let the training environments give another reward, and log the mean of each of its terms.
 
@@ -226,7 +236,6 @@ class RewardCallback(BaseCallback):
         super().__init__(verbose)
         self.reward = reward
         self.also_eval = also_eval
-        self._switches: list[_Switch] = []
 
     def _on_training_start(self) -> None:
         envs = [self.training_env]
@@ -241,12 +250,8 @@ class RewardCallback(BaseCallback):
                 self.logger.record_mean(f"reward/{term}", value)
         return True
 
-    def _on_training_end(self) -> None:
-        for switch in self._switches:
-            switch.undo()
 
-
-class RandomStartCallback(BaseCallback):
+class RandomStartCallback(_SwitchUser):
     """
     Let training episodes start elsewhere; evaluation keeps its own start.
 
@@ -263,27 +268,23 @@ class RandomStartCallback(BaseCallback):
         super().__init__(verbose)
         self.start = start
         self.speed = speed
-        self._switches: list[_Switch] = []
 
     def _on_training_start(self) -> None:
-        self._switches = [_Switch(self.training_env, "set_start", self.start)]
+        settings: list[tuple[str, Any]] = [("set_start", self.start)]
         if self.speed is not None:
-            self._switches.append(_Switch(self.training_env, "set_random_speed", self.speed))
+            settings.append(("set_random_speed", self.speed))
+        self._switches = [_Switch(self.training_env, *setting) for setting in settings]
 
     def _on_step(self) -> bool:
         return True
-
-    def _on_training_end(self) -> None:
-        for switch in self._switches:
-            switch.undo()
 
 
 class GradientStepsCallback(BaseCallback):
     """
     Learn more from each decision at the beginning of a training, when there are few.
 
-    Every saved model keeps its own ``gradient_steps``: the other number holds only from the end of
-    a rollout, where the algorithm reads it, to the beginning of the next.
+    Models that callbacks save keep their own ``gradient_steps``: the other number holds only from
+    the end of a rollout, where the algorithm reads it, to the beginning of the next.
 
     :param gradient_steps: instead of the model's own, for the first decisions
     :param frames: number of these decisions, of all environments together
@@ -305,24 +306,20 @@ class GradientStepsCallback(BaseCallback):
                 f"{type(self).__name__} sets the gradient steps of off-policy algorithms, but the "
                 f"model is a {type(self.model).__name__}; take it out of the callbacks"
             )
-        self._own = self.model.gradient_steps
+        self._algorithm, self._own = self.model, self.model.gradient_steps
 
     def _on_step(self) -> bool:
         return True
 
     def _on_rollout_end(self) -> None:
         if self.num_timesteps <= self.frames:
-            self._set(self.gradient_steps)
+            self._algorithm.gradient_steps = self.gradient_steps
 
     def _on_rollout_start(self) -> None:
-        self._set(self._own)
+        self._algorithm.gradient_steps = self._own
 
     def _on_training_end(self) -> None:
-        self._set(self._own)
-
-    def _set(self, gradient_steps: int) -> None:
-        assert isinstance(self.model, OffPolicyAlgorithm)
-        self.model.gradient_steps = gradient_steps
+        self._algorithm.gradient_steps = self._own
 
 
 class _Switch:
