@@ -229,7 +229,7 @@ def _trials(
     except StudyError as error:
         raise StudyError(f"{place}: {error}") from None
     zoo.check_entry(entry, algo, env_id, place)
-    entry["n_timesteps"] = int(float(entry["n_timesteps"]))  # YAML takes 1e5 for a word
+    entry["n_timesteps"] = zoo.decisions(entry)
     _check_evaluable(entry, place)
     interval = said["eval_interval"]
     if type(interval) is not int or interval < 1:

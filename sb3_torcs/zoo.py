@@ -27,6 +27,7 @@ __all__ = [
     "check_racing",
     "check_registered",
     "config_file",
+    "decisions",
     "read_config",
     "read_entry",
 ]
@@ -214,6 +215,16 @@ def check_racing(env_id: str) -> None:
     built = _env_class(env_id)
     if not (isinstance(built, type) and issubclass(built, (RacingEnv, TorcsEnv))):
         raise ZooConfigError(f"{env_id} is no racing environment; ours: {', '.join(OURS)}")
+
+
+def decisions(entry: Entry) -> int:
+    """
+    Read how many decisions an entry asks for; YAML takes ``1e5`` for a word.
+
+    :param entry: that :func:`check_entry` has seen
+    :return: its ``n_timesteps``
+    """
+    return int(float(entry["n_timesteps"]))
 
 
 def _check_numbers(entry: Entry, place: Place) -> None:

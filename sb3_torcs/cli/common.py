@@ -15,6 +15,7 @@ from typing import Any
 from sb3_torcs.errors import OutputNotWritable
 
 __all__ = [
+    "MODEL_HELP",
     "natural",
     "positive",
     "print_json",
@@ -23,6 +24,8 @@ __all__ = [
     "writable_file",
     "writable_folder",
 ]
+
+MODEL_HELP = "a saved .zip, a run's folder, a shipped agent, or 'scripted'"
 
 
 def positive(text: str) -> int:

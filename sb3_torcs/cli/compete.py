@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from sb3_torcs.cli.common import positive, print_json, quiet_output
+from sb3_torcs.cli.common import MODEL_HELP, positive, print_json, quiet_output
 
 if TYPE_CHECKING:
     from sb3_torcs.driving import Agent
@@ -36,11 +36,7 @@ def add_parser(subparsers: Any) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
-    add(
-        "model",
-        metavar="MODEL",
-        help="a saved .zip, a run's folder, a shipped agent, or 'scripted'",
-    )
+    add("model", metavar="MODEL", help=MODEL_HELP)
     add("--host", default="127.0.0.1", metavar="H", help="default: 127.0.0.1")
     add("--port", type=positive, default=3001, metavar="P", help="default: 3001")
     add("--track", metavar="T", help="that runs there; default: that of the training, or aalborg")

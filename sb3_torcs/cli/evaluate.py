@@ -6,6 +6,7 @@ import argparse
 from typing import TYPE_CHECKING, Any
 
 from sb3_torcs.cli.common import (
+    MODEL_HELP,
     natural,
     positive,
     print_json,
@@ -47,11 +48,7 @@ def add_parser(subparsers: Any) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
-    add(
-        "model",
-        metavar="MODEL",
-        help="a saved .zip, a run's folder, a shipped agent, or 'scripted'",
-    )
+    add("model", metavar="MODEL", help=MODEL_HELP)
     add("--env", metavar="ID", help=f"default: that of the training, or {DEFAULT_ENV}")
     add("--track", metavar="T", help="`sb3-torcs tracks` lists them")
     add("--car", metavar="C", help="e.g. car1-trb1")

@@ -153,13 +153,14 @@ def train_run(options: TrainOptions) -> Run:
     :raises ZooConfigError: if the hyperparameters have something that nothing would read
     :raises OutputNotWritable: if a folder cannot be written
     """
+    from sb3_torcs import zoo
     from sb3_torcs.models import saved_steps
 
     entry = _entry(options)
     resume = _resumed(options, entry)
     folder = writable_folder(options.folder)
     tensorboard = writable_folder(options.tensorboard or folder / "tensorboard")
-    wanted = options.timesteps or int(float(entry["n_timesteps"]))
+    wanted = options.timesteps or zoo.decisions(entry)
     if options.progress:
         entry["callback"] = _with_progress(entry.get("callback"))
     with tempfile.TemporaryDirectory() as scratch:

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sb3_torcs.cli.common import positive, writable_file
+from sb3_torcs.cli.common import MODEL_HELP, positive, writable_file
 from sb3_torcs.cli.results import show_results
 
 if TYPE_CHECKING:
@@ -42,8 +42,7 @@ def add_parser(subparsers: Any) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
-    add("name", metavar="MODEL|ROBOT",
-        help="a saved .zip, a run's folder, 'scripted', or a robot, e.g. inferno")  # fmt: skip
+    add("name", metavar="MODEL|ROBOT", help=f"{MODEL_HELP}; or a robot, e.g. inferno")
     add("--track", metavar="T", help="default: that of the training, or aalborg")
     add("--car", metavar="C", help="of a model; default: that of its training")
     add("--robots", metavar="NAME:I,…", help="of the game, who start behind")
