@@ -12,15 +12,14 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
+from sb3_torcs.driving_metrics import BRAKING
 from sb3_torcs.evaluation import drive, race_environment
 from sb3_torcs.game import find_game
 from sb3_torcs.models import find_model, load_driver, training_record
 from sb3_torcs.robots import race
-from sb3_torcs.track_plot import edges
+from sb3_torcs.track_plot import KMH, edges
 from sb3_torcs.tracks import load_track
 
-KMH = 3.6  # [km/h per m/s]
-BRAKING = 0.05  # of the brake that counts as braking
 COLOURS = ("tab:blue", "tab:red", "tab:green", "tab:purple", "tab:orange")
 BENDS = 3  # that are shown from above
 VIEW = 70.0  # [m] around their middle
