@@ -8,16 +8,20 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import (
     BaseCallback,
     EvalCallback,
 )
 from stable_baselines3.common.noise import VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_torcs.driving_metrics import DrivingMetricsCallback, callbacks_in
 from sb3_torcs.errors import InvalidOption, near_miss
+from sb3_torcs.mirror import mirror_half
 from sb3_torcs.noise import (
     BLOG,
     ActuatorNoise,
@@ -33,6 +37,7 @@ from sb3_torcs.noise import (
 __all__ = [
     "DrivingMetricsCallback",
     "GradientStepsCallback",
+    "MirrorCallback",
     "NoiseCallback",
     "NoiseDecayCallback",
     "RandomStartCallback",
@@ -322,16 +327,74 @@ class GradientStepsCallback(BaseCallback):
         self._algorithm.gradient_steps = self._own
 
 
+class MirrorCallback(BaseCallback):
+    """
+    Learn from half of each batch as seen in a mirror, where every bend goes the other way.
+
+    The replay buffer holds what was driven, and is the stock one wherever it is saved: it mirrors
+    only from the end of a rollout, where the algorithm learns, to the beginning of the next.
+
+    :param verbose: as in ``BaseCallback``
+    """
+
+    def _on_training_start(self) -> None:
+        buffer = getattr(self.model, "replay_buffer", None)
+        if not isinstance(buffer, ReplayBuffer):
+            raise InvalidOption(
+                f"{type(self).__name__} mirrors what a replay buffer holds, and "
+                f"{type(self.model).__name__} has none; take it out of the callbacks"
+            )
+        if self.model.get_vec_normalize_env() is not None:
+            raise InvalidOption(
+                f"{type(self).__name__} needs observations whose middle is 0, which VecNormalize "
+                "moves; take 'normalize' away: the observations are scaled already"
+            )
+        for angles in _attributes(self.training_env, "range_finder_angles"):
+            if not np.allclose(angles, -angles[::-1]):
+                raise InvalidOption(
+                    f"{type(self).__name__} needs range finders that look equally far to both "
+                    f"sides, not {np.degrees(angles).round(3).tolist()}; pass 'scr' or 'narrow'"
+                )
+        self._buffer = buffer
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:
+        stock = self._buffer.sample
+
+        def sample(batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
+            return mirror_half(stock(batch_size, env))
+
+        self._buffer.sample = sample  # type: ignore[method-assign]
+
+    def _on_rollout_start(self) -> None:
+        vars(self._buffer).pop("sample", None)
+
+    def _on_training_end(self) -> None:
+        vars(self._buffer).pop("sample", None)
+
+
+def _attributes(env: VecEnv, name: str) -> list[Any]:
+    """Return an attribute of all environments of a vector."""
+    _require(env, name)
+    return env.get_attr(name)
+
+
+def _require(env: VecEnv, name: str) -> None:
+    """Make sure of an attribute. A worker process that lacks it would die of it."""
+    if not env.has_attr(name):
+        raise InvalidOption(
+            f"the environment has no {name}; use Torcs-v0, TorcsLite-v0 or another RacingEnv of "
+            "sb3_torcs"
+        )
+
+
 class _Switch:
     """A setting of all environments of a vector, which can be undone once."""
 
     def __init__(self, env: VecEnv, setter: str, value: Any) -> None:
-        # A worker process that lacks the method would die of it.
-        if not env.has_attr(setter):
-            raise InvalidOption(
-                f"the environment has no {setter}(); use Torcs-v0, TorcsLite-v0 or another "
-                "RacingEnv of sb3_torcs"
-            )
+        _require(env, setter)
         self.env = env
         self.setter = setter
         self.previous: list[Any] = env.env_method(setter, value)

@@ -14,7 +14,16 @@ from gymnasium import spaces
 
 from sb3_torcs.actions import ACTION_HIGH, ACTION_LOW, controls_from_action
 from sb3_torcs.backends.base import Backend
-from sb3_torcs.car import CONTROL_TICK, MAX_DAMAGE, CarState, Controls, Start, is_count, is_number
+from sb3_torcs.car import (
+    CONTROL_TICK,
+    MAX_DAMAGE,
+    CarState,
+    Controls,
+    FloatArray,
+    Start,
+    is_count,
+    is_number,
+)
 from sb3_torcs.errors import CarLost, EnvClosed, InvalidOption
 from sb3_torcs.rewards import Reward
 from sb3_torcs.sensors import OBSERVATION_HIGH, OBSERVATION_LOW, encode
@@ -115,6 +124,11 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
     def track(self) -> Track:
         """The track of the present episode."""
         return self.backend.track
+
+    @property
+    def range_finder_angles(self) -> FloatArray:
+        """Where the range finders look [rad], (19,), left negative."""
+        return self.backend.range_finder_angles
 
     def set_reward(self, reward: str | Mapping[str, float]) -> str | Mapping[str, float] | None:
         """

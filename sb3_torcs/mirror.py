@@ -1,0 +1,88 @@
+"""A drive seen in a mirror: left is right.
+
+A car is built alike on both sides, so what was driven on a road is also a drive on the road that
+bends the other way. Who learns from both has twice the experience, and has met every bend from
+either side.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+
+from sb3_torcs.actions import ACTION_HIGH
+from sb3_torcs.sensors import OBSERVATION_SIZE, feature_slices
+
+__all__ = ["mirror_actions", "mirror_half", "mirror_observations"]
+
+STEERING = 0  # index of the actuator
+SIDED = ("heading_error", "track_position", "speed_y")
+"""Sensors that are positive on one side."""
+
+OTHER_WHEEL = (1, 0, 3, 2)
+"""Front right and left, rear right and left change places."""
+
+
+def _order() -> th.Tensor:
+    """Where in an observation stands what its mirror image has in each place."""
+    order, where = np.arange(OBSERVATION_SIZE), feature_slices()
+    beams, wheels = where["range_finders"], where["wheel_speeds"]
+    order[beams] = order[beams][::-1].copy()
+    order[wheels] = order[wheels][list(OTHER_WHEEL)]
+    return th.from_numpy(order)
+
+
+def _signs() -> th.Tensor:
+    """What each number of a mirrored observation is multiplied with."""
+    signs, where = np.ones(OBSERVATION_SIZE, np.float32), feature_slices()
+    for name in SIDED:
+        signs[where[name]] = -1.0
+    return th.from_numpy(signs)
+
+
+_ORDER, _SIGNS = _order(), _signs()
+_ACTION_SIGNS = th.ones(len(ACTION_HIGH))
+_ACTION_SIGNS[STEERING] = -1.0
+
+
+def mirror_observations(observations: th.Tensor) -> th.Tensor:
+    """
+    Look at the world in a mirror. Twice gives the same observations back.
+
+    :param observations: (n, 29) with range finders that look equally far to both sides
+    :return: (n, 29)
+    """
+    device = observations.device
+    return observations[:, _ORDER.to(device)] * _SIGNS.to(device)
+
+
+def mirror_actions(actions: th.Tensor) -> th.Tensor:
+    """
+    Steer to the other side.
+
+    :param actions: (n, 3), in the environment's units or scaled to [-1, 1]
+    :return: (n, 3)
+    """
+    return actions * _ACTION_SIGNS.to(actions.device)
+
+
+def mirror_half(batch: ReplayBufferSamples) -> ReplayBufferSamples:
+    """
+    Mirror the first half of a batch, whose order is by chance anyway.
+
+    :param batch: of a replay buffer; left as it is
+    :return: as many transitions
+    """
+    half = len(batch.actions) // 2
+
+    def joined(images: th.Tensor, whole: th.Tensor) -> th.Tensor:
+        return th.cat((images, whole[half:]))
+
+    return batch._replace(
+        observations=joined(mirror_observations(batch.observations[:half]), batch.observations),
+        actions=joined(mirror_actions(batch.actions[:half]), batch.actions),
+        next_observations=joined(
+            mirror_observations(batch.next_observations[:half]), batch.next_observations
+        ),
+    )
