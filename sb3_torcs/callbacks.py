@@ -337,6 +337,9 @@ class MirrorCallback(BaseCallback):
     :param verbose: as in ``BaseCallback``
     """
 
+    def __init__(self, *, verbose: int = 0) -> None:
+        super().__init__(verbose)
+
     def _on_training_start(self) -> None:
         buffer = getattr(self.model, "replay_buffer", None)
         if not isinstance(buffer, ReplayBuffer):

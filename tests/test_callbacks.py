@@ -14,6 +14,7 @@ from toy import ToyRace
 
 from sb3_torcs.callbacks import (
     GradientStepsCallback,
+    MirrorCallback,
     NoiseCallback,
     NoiseDecayCallback,
     RandomStartCallback,
@@ -371,6 +372,7 @@ def test_gradient_steps_are_at_least_one(options):
         NoiseDecayCallback,
         StochasticBrakeCallback,
         RandomStartCallback,
+        MirrorCallback,
         lambda *args: RewardCallback(*args, reward="blog"),
         lambda *args: GradientStepsCallback(*args, gradient_steps=2, frames=10),
     ],

@@ -33,6 +33,7 @@ CASES = {
             "sb3_torcs.callbacks.NoiseCallback": {"kind": "ou", "dt": 0.1},
             "sb3_torcs.callbacks.NoiseDecayCallback": {"frames": 200, "floor": 0.35},
             "sb3_torcs.callbacks.GradientStepsCallback": {"gradient_steps": 5, "frames": 120},
+            "sb3_torcs.callbacks.MirrorCallback": {},
         },
     },
     "the post's noise and brake": {

@@ -1,0 +1,174 @@
+"""Mirrored drives: what they are, that cars drive so, and the callback that learns from them."""
+
+from __future__ import annotations
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from conftest import car_state
+from stable_baselines3 import DDPG, PPO, SAC
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecNormalize
+from toy import ToyRace
+
+from sb3_torcs.callbacks import MirrorCallback
+from sb3_torcs.errors import InvalidOption
+from sb3_torcs.mirror import mirror_actions, mirror_observations
+from sb3_torcs.sensors import encode, feature_slices
+
+STRAIGHT = 4050.0  # [m] of forza, where nearly a kilometre of straight road begins
+
+
+def mirrored(observation):
+    return mirror_observations(th.from_numpy(observation)[None])[0].numpy()
+
+
+# ------------------------------------------------------------------------------ what is mirrored
+
+
+def test_twice_mirrored_is_as_before():
+    """So each number has its place, and each place one number."""
+    observations = th.arange(58.0).reshape(2, 29)
+    assert mirror_observations(mirror_observations(observations)).equal(observations)
+    assert not mirror_observations(observations).equal(observations)
+
+
+def test_a_car_on_the_right_becomes_one_on_the_left():
+    """All that has a side changes it; speed along the road and engine have none."""
+    beams, wheels = np.arange(19.0), np.array([10.0, 20.0, 30.0, 40.0])
+    right = car_state(
+        heading_error=0.3, distance_from_axis=-2.0, speed_x=30.0, speed_y=1.5, speed_z=0.2,
+        engine_speed=500.0, range_finders=beams, wheel_speeds=wheels,
+    )  # fmt: skip
+    left = right._replace(
+        heading_error=-0.3, distance_from_axis=2.0, speed_y=-1.5,
+        range_finders=beams[::-1], wheel_speeds=wheels[[1, 0, 3, 2]],
+    )  # fmt: skip
+    assert np.array_equal(mirrored(encode(right)), encode(left))
+
+
+def test_steering_changes_sides_and_pedals_stay():
+    """Scaled for the networks or not."""
+    actions = th.tensor([[0.5, 0.2, 0.1], [-1.0, -1.0, 1.0]])
+    assert mirror_actions(actions).tolist() == th.tensor([[-0.5, 0.2, 0.1], [1, -1, 1]]).tolist()
+
+
+@pytest.mark.parametrize("env_id", ["TorcsLite-v0", "Torcs-v0"])
+def test_a_car_that_is_driven_mirrored_drives_mirrored(env_id):
+    """On a straight, two seconds long; not to the bit, since sums have an order."""
+    env = gym.make(env_id, track="forza", range_finders="narrow")
+    drives = []
+    for side in (1.0, -1.0):
+        start = {"track_position": 0.2 * side, "heading_error": 0.03 * side, "speed": 40.0}
+        env.reset(seed=0, options={"distance": STRAIGHT, **start})
+        rows = []
+        for step in range(20):
+            action = np.array([side * 0.05 * np.sin(step / 3.0), 0.8, 0.0], np.float32)
+            rows.append(env.step(action)[0])
+        drives.append(np.array(rows))
+    env.close()
+    there, image = drives[0], np.array([mirrored(row) for row in drives[1]])
+    beams = feature_slices()["range_finders"]
+    near = there[:, beams] < 0.1  # others see the bend at the end
+    np.testing.assert_allclose(image[:, beams][near], there[:, beams][near], atol=2e-4)
+    rest = np.delete(np.arange(29), np.arange(29)[beams])
+    np.testing.assert_allclose(image[:, rest], there[:, rest], atol=2e-4)
+    assert np.abs(there[:, feature_slices()["speed_y"]]).max() > 1e-3  # it was steered
+
+
+# ---------------------------------------------------------------------------------- the callback
+
+
+class MirrorToy(ToyRace):
+    """Range finders that look equally far to both sides."""
+
+    range_finder_angles = np.linspace(-1.0, 1.0, 19)
+
+
+class Batches(BaseCallback):
+    """Draws a batch in each rollout, and notes those that were learned from."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.learned: list[th.Tensor] = []
+        self.drawn: list[th.Tensor] = []
+
+    def _on_training_start(self) -> None:
+        self.critic = self.model.policy.critic
+        self.handle = self.critic.register_forward_hook(
+            lambda _module, inputs, _output: self.learned.append(inputs[0].clone())
+        )
+
+    def _on_step(self) -> bool:
+        if self.model.replay_buffer.size():
+            self.drawn.append(self.model.replay_buffer.sample(8).observations)
+        return True
+
+
+def make_model(algorithm=DDPG, env=MirrorToy, **kwargs):
+    options = {"learning_starts": 8, "batch_size": 8, "buffer_size": 100, "seed": 0}
+    return algorithm("MlpPolicy", make_vec_env(env), device="cpu", **{**options, **kwargs})
+
+
+def known(rows, buffer):
+    """Whether each row is an observation of the buffer."""
+    held = buffer.observations[: buffer.size(), 0]
+    return [bool((row.numpy() == held).all(axis=1).any()) for row in rows]
+
+
+@pytest.mark.parametrize("options", [{}, {"n_steps": 3}, {"batch_size": 9}])
+@pytest.mark.parametrize("algorithm", [DDPG, SAC])
+def test_half_of_what_is_learned_from_is_mirrored(algorithm, options):
+    """The buffer itself holds what was driven, and who draws from it elsewhere gets that."""
+    model, batches = make_model(algorithm, **options), Batches()
+    model.learn(12, callback=[MirrorCallback(), batches])
+    buffer = model.replay_buffer
+    size = options.get("batch_size", 8)
+    half = size // 2
+    assert batches.learned
+    for batch in batches.learned:
+        assert known(mirror_observations(batch[:half]), buffer) == [True] * half
+        assert known(batch, buffer) == [False] * half + [True] * (size - half)
+    for batch in batches.drawn:
+        assert all(known(batch, buffer))
+    assert "sample" not in vars(buffer)
+
+
+def test_all_of_a_transition_is_mirrored(monkeypatch):
+    """Its action and what came of it, too; reward, end and discount stay."""
+    model = make_model(n_steps=2)
+    model.learn(12)
+    stock = model.replay_buffer.sample(8)
+    monkeypatch.setattr(model.replay_buffer, "sample", lambda *_: stock)
+    callback = MirrorCallback()
+    callback.init_callback(model)
+    callback.on_training_start({}, {})
+    callback.on_rollout_end()
+    batch = model.replay_buffer.sample(8)
+    assert batch.actions[:4].equal(mirror_actions(stock.actions[:4]))
+    assert batch.next_observations[:4].equal(mirror_observations(stock.next_observations[:4]))
+    for name in ("observations", "actions", "next_observations"):
+        assert getattr(batch, name)[4:].equal(getattr(stock, name)[4:])
+    for name in ("dones", "rewards", "discounts"):
+        assert getattr(batch, name) is getattr(stock, name)
+
+
+def test_what_has_no_mirror_image_is_told_at_once():
+    """An algorithm without memory, statistics with a side, beams with a side, another world."""
+
+    class OneSided(MirrorToy):
+        range_finder_angles = np.linspace(-1.0, 0.5, 19)
+
+    ppo = PPO("MlpPolicy", make_vec_env(MirrorToy), n_steps=8, batch_size=8, device="cpu")
+    normalized = make_model(env=MirrorToy)
+    normalized.set_env(VecNormalize(normalized.get_env()))
+    for model, message in (
+        (ppo, "PPO has none"),
+        (normalized, "take 'normalize' away"),
+        (make_model(env=OneSided), "pass 'scr' or 'narrow'"),
+        (make_model(env=ToyRace), "has no range_finder_angles"),
+    ):
+        with pytest.raises(InvalidOption, match=message):
+            model.learn(10, callback=MirrorCallback())
