@@ -310,7 +310,7 @@ def test_evaluation_keeps_its_reward_unless_asked(also_eval, expected):
 def test_an_environment_without_the_setting_is_named(callback):
     """A worker process would die of the missing method, without a word."""
     model = DDPG("MlpPolicy", "Pendulum-v1", buffer_size=10, device="cpu")
-    with pytest.raises(InvalidOption, match="has no set_(reward|start)"):
+    with pytest.raises(InvalidOption, match=r"has no set_(reward|start)"):
         model.learn(1, callback=callback)
 
 
