@@ -15,6 +15,9 @@ from sb3_torcs.errors import InvalidOption, UnknownRewardTerm, near_miss
 
 __all__ = ["PRESETS", "TERMS", "Reward"]
 
+BRAKING = 10.0  # [m/s²] a car on asphalt can do twice that, but not while it turns in
+BEND_SPEED = 12.0  # [m/s] in a bend behind which nothing is seen; the tightest hairpins need it
+
 Term = Callable[[CarState, CarState, Controls], float]
 
 
@@ -53,10 +56,20 @@ def pedals(before: CarState, after: CarState, controls: Controls) -> float:
     return controls.throttle * controls.brake
 
 
+def overspeed(before: CarState, after: CarState, controls: Controls) -> float:
+    """Speed beyond √(12² + 2 · 10 · d) [m/s], from which 10 m/s² slow down to 12 m/s within the
+    longest range finder's d metres.
+    """
+    sight = max(float(after.range_finders.max()), 0.0)
+    return max(after.speed_x - math.sqrt(BEND_SPEED**2 + 2.0 * BRAKING * sight), 0.0)
+
+
 TERMS: dict[str, Term] = {
     term.__name__: term
-    for term in (speed_along, speed_across, speed_off_axis, progress, time, damage, pedals)
-}
+    for term in (
+        speed_along, speed_across, speed_off_axis, progress, time, damage, pedals, overspeed,
+    )
+}  # fmt: skip
 
 SCALE = 0.1  # [1/m] a reward of 1 for ten metres along the road
 CRASH = -1.0  # what an episode that ends off the road, backwards, stuck and so on costs

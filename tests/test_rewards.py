@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 from conftest import car_state
 
@@ -28,10 +29,23 @@ AFTER = car_state(
         ("time", 1.0),
         ("damage", 0.0),
         ("pedals", 0.0),
+        ("overspeed", 0.0),
     ],
 )
 def test_a_term_has_its_known_value(term, value):
     assert TERMS[term](BEFORE, AFTER, GAS) == value
+
+
+@pytest.mark.parametrize(
+    ("sight", "speed", "value"),
+    [(12.8, 30.0, 10.0), (12.8, 20.0, 0.0), (200.0, 64.0, 0.0), (-1.0, 20.0, 8.0)],
+)
+def test_overspeed_is_what_cannot_be_lost_within_sight(sight, speed, value):
+    """12² + 2 · 10 · 12.8 is 20²; off the road nothing is seen."""
+    beams = np.full(19, -1.0)
+    beams[9] = sight
+    car = AFTER._replace(speed_x=speed, range_finders=beams)
+    assert TERMS["overspeed"](BEFORE, car, GAS) == value
 
 
 def test_a_weight_multiplies_duration_and_scale():
