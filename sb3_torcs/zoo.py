@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import yaml
 
+from sb3_torcs.car import is_count
 from sb3_torcs.errors import ZooConfigError, near_miss
 
 __all__ = [
@@ -48,6 +49,8 @@ GIVEN_BY_ZOO = ("self", "env", "tensorboard_log", "seed", "verbose", "device", "
 
 GIVEN_BY_POLICY_OWNER = ("self", "observation_space", "action_space", "lr_schedule")
 """Arguments of a policy that the algorithm passes itself."""
+
+TIME_LIMIT = "max_episode_steps"  # what ``gym.make`` itself takes of the env_kwargs
 
 REQUIRED = ("n_timesteps", "policy")
 
@@ -166,8 +169,20 @@ def check_entry(entry: Entry, algo: str, env_id: str, place: Place) -> None:
     for key in ("callback", "env_wrapper", "vec_env_wrapper"):
         for path, arguments in _items(entry.get(key), key, place):
             _check_call(f"{key} {path}", _imported(path, key, place), arguments, place)
-    _check_call("env_kwargs", _env_class(env_id), entry.get("env_kwargs"), place)
+    _check_env_kwargs(entry.get("env_kwargs"), env_id, place)
     _check_wrappers(entry, place)
+
+
+def _check_env_kwargs(env_kwargs: Any, env_id: str, place: Place) -> None:
+    """Check what goes to ``gym.make``."""
+    if isinstance(env_kwargs, Mapping) and TIME_LIMIT in env_kwargs:
+        limit = env_kwargs[TIME_LIMIT]
+        if not is_count(limit):
+            raise ZooConfigError(
+                f"{place}: {TIME_LIMIT} is {limit!r}; expected a whole number of decisions >= 1"
+            )
+        env_kwargs = {key: value for key, value in env_kwargs.items() if key != TIME_LIMIT}
+    _check_call("env_kwargs", _env_class(env_id), env_kwargs, place)
 
 
 def _check_wrappers(entry: Entry, place: Place) -> None:

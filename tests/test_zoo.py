@@ -172,6 +172,13 @@ def test_an_argument_of_the_environment_that_it_does_not_have_is_unknown(tmp_pat
     accepted({"env_kwargs": {"track": "aalborg"}})
 
 
+def test_a_time_limit_is_among_the_arguments_of_the_environment(tmp_path):
+    """``gym.make`` itself takes it."""
+    accepted({"env_kwargs": {"track": "aalborg", "max_episode_steps": 200}})
+    said = complaint(tmp_path, {"env_kwargs": {"max_episode_steps": 0.5}})
+    assert said == "max_episode_steps is 0.5; expected a whole number of decisions >= 1"
+
+
 def test_monitor_gets_both_of_its_lists_or_none(tmp_path):
     """Monitor adds the two together, and a tuple is its default: it would fail later."""
     said = complaint(tmp_path, {"monitor_kwargs": {"info_keywords": ["laps"]}})
