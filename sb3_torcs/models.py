@@ -149,22 +149,28 @@ def training_record(model: Path) -> TrainingRecord:
     """
     Read what the zoo wrote beside a model: ``config.yml``, ``args.yml``, ``vecnormalize.pkl``.
 
+    They lie in the model's folder, or in the one folder below it that has some.
+
     :param model: the file
     :return: what is known
     """
-    folders = [model.parent, *sorted(path for path in model.parent.iterdir() if path.is_dir())]
-    for folder in folders:
-        config, arguments = _read_plain(folder / "config.yml"), _read_plain(folder / "args.yml")
-        if not config and not arguments:
-            continue
-        statistics = folder / "vecnormalize.pkl"
-        return TrainingRecord(
-            algo=arguments.get("algo"),
-            env_id=arguments.get("env"),
-            env_kwargs=config.get("env_kwargs") or {},
-            statistics=statistics if statistics.is_file() else None,
-        )
-    return TrainingRecord()
+    below = sorted(path for path in model.parent.iterdir() if path.is_dir())
+    records = [record for record in map(_record, below) if record is not None]
+    return _record(model.parent) or (records[0] if len(records) == 1 else TrainingRecord())
+
+
+def _record(folder: Path) -> TrainingRecord | None:
+    """Read what the zoo wrote in a folder."""
+    config, arguments = _read_plain(folder / "config.yml"), _read_plain(folder / "args.yml")
+    if not config and not arguments:
+        return None
+    statistics = folder / "vecnormalize.pkl"
+    return TrainingRecord(
+        algo=arguments.get("algo"),
+        env_id=arguments.get("env"),
+        env_kwargs=config.get("env_kwargs") or {},
+        statistics=statistics if statistics.is_file() else None,
+    )
 
 
 def one_track(track: Any) -> Any:

@@ -1,3 +1,5 @@
+import shutil
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -59,6 +61,15 @@ def test_the_record_of_the_zoo_names_the_algorithm_and_the_environment(saved, en
     assert (record.algo, record.env_id) == ("ddpg", "TorcsLite-v0")
     assert record.env_kwargs == {"track": "alpine-1", "range_finders": "narrow"}
     assert isinstance(models.load_driver(path, env), DDPG)
+
+
+def test_a_record_below_belongs_to_the_model_only_if_it_is_the_only_one(saved):
+    """The zoo puts it into a folder beside the model; beside several runs, nobody knows whose."""
+    _, path = saved
+    zoo_record(path.parent, track="alpine-1")
+    assert models.training_record(path).env_kwargs == {"track": "alpine-1"}
+    shutil.copytree(path.parent / "TorcsLite-v0", path.parent / "TorcsLite-v0_2")
+    assert models.training_record(path) == models.TrainingRecord()
 
 
 def test_a_record_that_is_broken_is_as_good_as_none(saved):
