@@ -22,6 +22,7 @@ from sb3_torcs.car import is_count
 from sb3_torcs.errors import ZooConfigError, near_miss
 
 __all__ = [
+    "TIME_LIMIT",
     "ZOO_KEYS",
     "Place",
     "check_entry",
@@ -50,7 +51,8 @@ GIVEN_BY_ZOO = ("self", "env", "tensorboard_log", "seed", "verbose", "device", "
 GIVEN_BY_POLICY_OWNER = ("self", "observation_space", "action_space", "lr_schedule")
 """Arguments of a policy that the algorithm passes itself."""
 
-TIME_LIMIT = "max_episode_steps"  # what ``gym.make`` itself takes of the env_kwargs
+TIME_LIMIT = "max_episode_steps"
+"""What ``gym.make`` itself takes of an entry's ``env_kwargs``: it holds for training episodes."""
 
 REQUIRED = ("n_timesteps", "policy")
 

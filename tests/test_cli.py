@@ -349,7 +349,8 @@ def test_numbers_of_steps_have_to_be_positive(capsys):
 
 def test_the_words_for_the_zoo_say_what_was_asked():
     asked = TrainOptions(eval_episodes=2, seed=7)
-    words = train._zoo_words(asked, 100000, {"track": "aalborg", "start": "random", "laps": 2})
+    training = {"track": "aalborg", "start": "random", "max_episode_steps": 200, "laps": 2}
+    words = train._zoo_words(asked, 100000, training)
     pairs = dict(itertools.pairwise(words))
     assert (pairs["--seed"], pairs["--eval-freq"], pairs["--eval-episodes"]) == ("7", "2500", "2")
     assert (pairs["--num-threads"], pairs["--device"]) == ("1", "cpu")

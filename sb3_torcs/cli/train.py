@@ -229,6 +229,8 @@ def _write_entry(path: Path, env_id: str, entry: dict[str, Any]) -> Path:
 
 def _zoo_words(options: TrainOptions, wanted: int, env_kwargs: dict[str, Any]) -> list[str]:
     """Compose the zoo's command line, files and folders aside."""
+    from sb3_torcs.zoo import TIME_LIMIT
+
     eval_freq = options.eval_freq
     if eval_freq is None:
         eval_freq = max(wanted // EVALUATIONS, min(wanted, SHORTEST_EVAL_FREQ))
@@ -238,8 +240,10 @@ def _zoo_words(options: TrainOptions, wanted: int, env_kwargs: dict[str, Any]) -
     words += ["--num-threads", "1", "--device", "cpu", "--verbose", "0", "--save-replay-buffer"]
     if env_kwargs:
         # The zoo does not give the file's env_kwargs to the evaluation's environment; and an
-        # evaluation is from the grid, wherever the training starts.
-        evaluation = {name: value for name, value in env_kwargs.items() if name != "start"}
+        # evaluation is from the grid and long enough, wherever and how long the training drives.
+        evaluation = {
+            name: value for name, value in env_kwargs.items() if name not in ("start", TIME_LIMIT)
+        }
         words += ["--eval-env-kwargs", *(f"{name}:{value!r}" for name, value in evaluation.items())]
     return words
 
