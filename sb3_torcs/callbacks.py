@@ -6,6 +6,7 @@ They go by their dotted path, e.g. ``sb3_torcs.callbacks.NoiseCallback: {kind: o
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -364,18 +365,27 @@ class MirrorCallback(BaseCallback):
         return True
 
     def _on_rollout_end(self) -> None:
-        stock = self._buffer.sample
-
-        def sample(batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
-            return mirror_half(stock(batch_size, env))
-
-        self._buffer.sample = sample  # type: ignore[method-assign]
+        self._buffer.sample = _MirroredSample(self._buffer)  # type: ignore[method-assign]
 
     def _on_rollout_start(self) -> None:
         vars(self._buffer).pop("sample", None)
 
     def _on_training_end(self) -> None:
         vars(self._buffer).pop("sample", None)
+
+
+class _MirroredSample:
+    """What a replay buffer's ``sample`` is replaced with."""
+
+    def __init__(self, buffer: ReplayBuffer) -> None:
+        self._buffer = buffer
+
+    def __call__(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
+        return mirror_half(type(self._buffer).sample(self._buffer, batch_size, env))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Ctrl-C comes while the algorithm learns; then the buffer is saved, with its own method.
+        return partial, (type(self._buffer).sample, self._buffer)
 
 
 def _attributes(env: VecEnv, name: str) -> list[Any]:

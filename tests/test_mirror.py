@@ -141,7 +141,7 @@ def test_all_of_a_transition_is_mirrored(monkeypatch):
     model = make_model(n_steps=2)
     model.learn(12)
     stock = model.replay_buffer.sample(8)
-    monkeypatch.setattr(model.replay_buffer, "sample", lambda *_: stock)
+    monkeypatch.setattr(type(model.replay_buffer), "sample", lambda *_: stock)
     callback = MirrorCallback()
     callback.init_callback(model)
     callback.on_training_start({}, {})
@@ -153,6 +153,21 @@ def test_all_of_a_transition_is_mirrored(monkeypatch):
         assert getattr(batch, name)[4:].equal(getattr(stock, name)[4:])
     for name in ("dones", "rewards", "discounts"):
         assert getattr(batch, name) is getattr(stock, name)
+
+
+def test_a_buffer_that_is_saved_while_the_algorithm_learns_is_a_stock_one(tmp_path):
+    """Ctrl-C comes then, as a rule, and what was driven is to be saved."""
+    model = make_model(n_steps=3)
+    model.learn(20)
+    buffer = model.replay_buffer
+    callback = MirrorCallback()
+    callback.init_callback(model)
+    callback.on_training_start({}, {})
+    callback.on_rollout_end()
+    model.save_replay_buffer(tmp_path / "replay.pkl")
+    assert not all(known(buffer.sample(8).observations, buffer))
+    model.load_replay_buffer(tmp_path / "replay.pkl")
+    assert all(known(model.replay_buffer.sample(8).observations, buffer))
 
 
 def test_what_has_no_mirror_image_is_told_at_once():
