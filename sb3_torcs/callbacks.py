@@ -5,6 +5,7 @@ They go by their dotted path, e.g. ``sb3_torcs.callbacks.NoiseCallback: {kind: o
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -285,12 +286,33 @@ class RandomStartCallback(_SwitchUser):
         return True
 
 
-class GradientStepsCallback(BaseCallback):
+class _WhileLearning(BaseCallback):
+    """
+    Base of callbacks that change the algorithm only while it learns.
+
+    That is from the end of a rollout to the beginning of the next: what callbacks save in between
+    is unchanged.
+    """
+
+    def _on_step(self) -> bool:
+        return True
+
+    @abstractmethod
+    def _undo(self) -> None:
+        """Take back what ``_on_rollout_end`` has changed, if anything."""
+
+    def _on_rollout_start(self) -> None:
+        self._undo()
+
+    def _on_training_end(self) -> None:
+        self._undo()
+
+
+class GradientStepsCallback(_WhileLearning):
     """
     Learn more from each decision at the beginning of a training, when there are few.
 
-    Models that callbacks save keep their own ``gradient_steps``: the other number holds only from
-    the end of a rollout, where the algorithm reads it, to the beginning of the next.
+    Models that callbacks save keep their own ``gradient_steps``.
 
     :param gradient_steps: instead of the model's own, for the first decisions
     :param frames: number of these decisions, of all environments together
@@ -314,26 +336,19 @@ class GradientStepsCallback(BaseCallback):
             )
         self._algorithm, self._own = self.model, self.model.gradient_steps
 
-    def _on_step(self) -> bool:
-        return True
-
     def _on_rollout_end(self) -> None:
         if self.num_timesteps <= self.frames:
             self._algorithm.gradient_steps = self.gradient_steps
 
-    def _on_rollout_start(self) -> None:
-        self._algorithm.gradient_steps = self._own
-
-    def _on_training_end(self) -> None:
+    def _undo(self) -> None:
         self._algorithm.gradient_steps = self._own
 
 
-class MirrorCallback(BaseCallback):
+class MirrorCallback(_WhileLearning):
     """
     Learn from half of each batch as seen in a mirror, where every bend goes the other way.
 
-    The replay buffer holds what was driven, and is the stock one wherever it is saved: it mirrors
-    only from the end of a rollout, where the algorithm learns, to the beginning of the next.
+    The replay buffer holds what was driven, and is the stock one wherever it is saved.
 
     :param verbose: as in ``BaseCallback``
     """
@@ -353,7 +368,8 @@ class MirrorCallback(BaseCallback):
                 f"{type(self).__name__} needs observations whose middle is 0, which VecNormalize "
                 "moves; take 'normalize' away: the observations are scaled already"
             )
-        for angles in _attributes(self.training_env, "range_finder_angles"):
+        _require(self.training_env, "range_finder_angles")
+        for angles in self.training_env.get_attr("range_finder_angles"):
             if not np.allclose(angles, -angles[::-1]):
                 raise InvalidOption(
                     f"{type(self).__name__} needs range finders that look equally far to both "
@@ -361,16 +377,10 @@ class MirrorCallback(BaseCallback):
                 )
         self._buffer = buffer
 
-    def _on_step(self) -> bool:
-        return True
-
     def _on_rollout_end(self) -> None:
         self._buffer.sample = _MirroredSample(self._buffer)  # type: ignore[method-assign]
 
-    def _on_rollout_start(self) -> None:
-        vars(self._buffer).pop("sample", None)
-
-    def _on_training_end(self) -> None:
+    def _undo(self) -> None:
         vars(self._buffer).pop("sample", None)
 
 
@@ -386,12 +396,6 @@ class _MirroredSample:
     def __reduce__(self) -> tuple[Any, ...]:
         # Ctrl-C comes while the algorithm learns; then the buffer is saved, with its own method.
         return partial, (type(self._buffer).sample, self._buffer)
-
-
-def _attributes(env: VecEnv, name: str) -> list[Any]:
-    """Return an attribute of all environments of a vector."""
-    _require(env, name)
-    return env.get_attr(name)
 
 
 def _require(env: VecEnv, name: str) -> None:

@@ -28,7 +28,7 @@ def _order() -> th.Tensor:
     """Where in an observation stands what its mirror image has in each place."""
     order, where = np.arange(OBSERVATION_SIZE), feature_slices()
     beams, wheels = where["range_finders"], where["wheel_speeds"]
-    order[beams] = order[beams][::-1].copy()
+    order[beams] = order[beams][::-1]
     order[wheels] = order[wheels][list(OTHER_WHEEL)]
     return th.from_numpy(order)
 

@@ -154,9 +154,12 @@ def training_record(model: Path) -> TrainingRecord:
     :param model: the file
     :return: what is known
     """
-    below = sorted(path for path in model.parent.iterdir() if path.is_dir())
-    records = [record for record in map(_record, below) if record is not None]
-    return _record(model.parent) or (records[0] if len(records) == 1 else TrainingRecord())
+    own = _record(model.parent)
+    if own is not None:
+        return own
+    below = [_record(path) for path in model.parent.iterdir() if path.is_dir()]
+    records = [record for record in below if record is not None]
+    return records[0] if len(records) == 1 else TrainingRecord()
 
 
 def _record(folder: Path) -> TrainingRecord | None:

@@ -229,7 +229,7 @@ def _write_entry(path: Path, env_id: str, entry: dict[str, Any]) -> Path:
 
 def _zoo_words(options: TrainOptions, wanted: int, env_kwargs: dict[str, Any]) -> list[str]:
     """Compose the zoo's command line, files and folders aside."""
-    from sb3_torcs.zoo import TIME_LIMIT
+    from sb3_torcs import zoo
 
     eval_freq = options.eval_freq
     if eval_freq is None:
@@ -241,9 +241,8 @@ def _zoo_words(options: TrainOptions, wanted: int, env_kwargs: dict[str, Any]) -
     if env_kwargs:
         # The zoo does not give the file's env_kwargs to the evaluation's environment; and an
         # evaluation is from the grid and long enough, wherever and how long the training drives.
-        evaluation = {
-            name: value for name, value in env_kwargs.items() if name not in ("start", TIME_LIMIT)
-        }
+        mine = ("start", zoo.TIME_LIMIT)
+        evaluation = {name: value for name, value in env_kwargs.items() if name not in mine}
         words += ["--eval-env-kwargs", *(f"{name}:{value!r}" for name, value in evaluation.items())]
     return words
 
