@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sb3_torcs.errors import RayUnavailable
+from sb3_torcs.errors import RayUnavailable, StudyError
 from sb3_torcs.study_file import Study, Trial
 from sb3_torcs.study_folder import Files, StudyFolder
 
@@ -167,7 +167,8 @@ def run_study(
     :param progress: called when a trial has something new
     :return: the table of the results
     :raises RayUnavailable: if Ray is missing, or the cluster does not answer
-    :raises StudyError: if the folder is of another study, or in use
+    :raises StudyError: if the folder is of another study, or in use, or if a variant cannot be
+        built
     """
     require_ray(address)
     tell = progress or _nobody
@@ -175,6 +176,8 @@ def run_study(
     with place.locked():
         place.begin(study)
         left = [trial for trial in study.trials if not place.ended(trial)]
+        for trial in {trial.variant: trial for trial in left}.values():
+            _check_buildable(trial)
         for trial in study.trials:
             for row in place.rows(trial):
                 tell(trial, row)
@@ -184,6 +187,16 @@ def run_study(
             with _ray(place, jobs, address) as scratch:
                 _tune(study, left, place, scratch, tell)
         return place.write_results(study)
+
+
+def _check_buildable(trial: Trial) -> None:
+    """Build the agent of a trial, so that a wrong value is told before anything is trained."""
+    from sb3_torcs.study_training import Training
+
+    try:
+        Training(trial).close()
+    except Exception as error:
+        raise StudyError(f"variant '{trial.variant}' cannot be trained: {error}") from error
 
 
 def require_ray(address: str | None = None) -> None:
@@ -214,7 +227,6 @@ def _ray(place: StudyFolder, jobs: int | None, address: str | None) -> Iterator[
     if session.is_file():
         _remove_scratch(Path(session.read_text(encoding="utf-8")))
     scratch = Path(tempfile.mkdtemp(prefix=SCRATCH))
-    session.write_text(str(scratch), encoding="utf-8")
     options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
     if address is None:
         options.update(
@@ -224,6 +236,7 @@ def _ray(place: StudyFolder, jobs: int | None, address: str | None) -> Iterator[
     else:
         options["address"] = address
     try:
+        session.write_text(str(scratch), encoding="utf-8")
         ray.init(**options)
     except (OSError, RuntimeError, ValueError) as error:
         shutil.rmtree(scratch, ignore_errors=True)

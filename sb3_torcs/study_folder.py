@@ -158,7 +158,6 @@ class StudyFolder:
             raise StudyError(f"{trial.name} has come farther elsewhere; this worker is not needed")
         folder = self.of(trial)
         over = rows[-1]["decisions"] >= trial.budget
-        kept = [name for name in FOR_DRIVERS if name in files] + ["last_model.zip"] * over
         before = [*folder.glob(f"{CHECKPOINT}*"), *folder.glob(f".{CHECKPOINT}*")]
         if not over:
             aside = folder / f".{CHECKPOINT}new"
@@ -167,8 +166,9 @@ class StudyFolder:
             for file, content in files.items():
                 _write(aside / file, content)
             aside.rename(folder / f"{CHECKPOINT}{len(rows):06d}")
-        for file in kept:
-            _write(folder / file, files[file])
+        for file in FOR_DRIVERS:
+            if file in files:
+                _write(folder / file, files[file])
         _write(folder / ROWS, json.dumps(rows).encode())
         for old in before:
             shutil.rmtree(old, ignore_errors=True)

@@ -118,6 +118,28 @@ def test_a_damaged_folder_is_told(begun, capsys, name):
     assert f"small-nets-seed0/{name}' cannot be read (" in capsys.readouterr().err
 
 
+# Where the algorithm cannot be built, the zoo drops the environments that it has made unclosed.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (
+            {"callback": [{"sb3_torcs.callbacks.NoiseDecayCallback": {"frames": -1}}]},
+            "pass at least 1 frame",
+        ),
+        ({"learning_rate": "fast"}, "learning_rate is 'fast'"),
+        ({"policy_kwargs": {"head_bias": [0.0]}}, "head_bias"),
+    ],
+)
+def test_a_wrong_value_is_told_before_anything_is_trained(tmp_path, capsys, change, told):
+    file = study_file(tmp_path, variants={"good": {}, "bad": change})
+    assert main(["study", str(file), "--folder", str(tmp_path / "out"), "--jobs", "1"]) == 2
+    error = capsys.readouterr().err
+    assert "bad" in error
+    assert told in error
+    assert not list((tmp_path / "out").rglob(".session"))
+
+
 def test_another_recipe_is_told_by_what_is_different(begun, tmp_path):
     _, place = begun
     with pytest.raises(StudyError, match="was begun with another eval_interval; give another"):
