@@ -74,7 +74,7 @@ def best_lap(name, track):
     columns = {key: np.array([row[key] for row in laps[lap]]) for key in laps[lap][0]
                if np.isscalar(laps[lap][0][key])}  # fmt: skip
     return Lap(
-        name=name,
+        name=Path(name).name,
         seconds=times[lap],
         distance=columns["distance_from_start"],
         speed=columns["speed_x"],
