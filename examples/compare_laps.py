@@ -110,7 +110,7 @@ def draw_along(figure, laps):
         pedals.fill_between(lap.distance, -lap.brake, color=colour, alpha=0.5, linewidth=0.0)
         place.plot(lap.distance, lap.place, color=colour)
     speed.set_ylabel("speed [km/h]")
-    speed.legend(fontsize=8, ncols=len(laps))
+    speed.legend(fontsize=8, ncols=len(laps), loc="lower left", bbox_to_anchor=(0.0, 1.0))
     pedals.set_ylabel("brake (down), gas (up)")
     pedals.axhline(0.0, color="black", linewidth=0.6)
     place.set_ylabel("right edge to left edge")
