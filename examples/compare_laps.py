@@ -23,6 +23,9 @@ from sb3_torcs.tracks import load_track
 COLOURS = ("tab:blue", "tab:red", "tab:green", "tab:purple", "tab:orange")
 BENDS = 3  # that are shown from above
 VIEW = 70.0  # [m] around their middle
+STEP = 2.0  # [m] in which the road is looked at
+RADIUS = 60.0  # [m] a bend is sharper than that
+BEFORE = 120.0  # [m] in which a car slows down for it
 
 
 class Lap(NamedTuple):
@@ -100,6 +103,15 @@ def tightest_bends(track):
     return sorted(found)
 
 
+def where_it_brakes(lap, track):
+    """Shares of its time on the brake: shortly before a bend, and in one."""
+    heading = np.unwrap([track.pose(place).heading for place in np.arange(0.0, track.length, STEP)])
+    bend = np.abs(np.gradient(heading, STEP)) > 1.0 / RADIUS
+    ahead = np.any([np.roll(bend, -step) for step in range(int(BEFORE / STEP))], axis=0)
+    braking = (lap.distance[lap.brake > BRAKING] / STEP).astype(int) % len(bend)
+    return np.mean((ahead & ~bend)[braking]), np.mean(bend[braking])
+
+
 def draw_along(figure, laps):
     """Speed, pedals and place over the distance."""
     speed, pedals, place = figure.subplots(3, 1, sharex=True)
@@ -143,14 +155,17 @@ if __name__ == "__main__":
     parser.add_argument("--track", default="aalborg")
     parser.add_argument("--out", type=Path, default=Path("laps.png"))
     args = parser.parse_args()
+    track = load_track(args.track)
     laps = [best_lap(name, args.track) for name in args.drivers]
     for lap in laps:
+        before, within = where_it_brakes(lap, track)
         print(
-            f"{lap.name}: {lap.seconds:.3f} s, on the brake in {np.mean(lap.brake > BRAKING):.0%}"
+            f"{lap.name}: {lap.seconds:.3f} s, on the brake in {np.mean(lap.brake > BRAKING):.0%} "
+            f"of it; {before:.0%} of that at most {BEFORE:.0f} m before a bend, {within:.0%} in one"
         )
     figure = Figure(figsize=(12.0, 11.0), layout="constrained")
     along, bends = figure.subfigures(2, 1, height_ratios=[1.7, 1.0])
     draw_along(along, laps)
-    draw_bends(bends, laps, load_track(args.track))
+    draw_bends(bends, laps, track)
     figure.savefig(args.out, dpi=100)
     print(args.out)

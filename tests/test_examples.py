@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import re
 import runpy
 import shlex
 import sys
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 from sb3_torcs.errors import OutputNotWritable
+from sb3_torcs.models import AGENTS
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
@@ -157,3 +159,16 @@ def test_evaluations_are_drawn(monkeypatch, capsys, tmp_path):
     run(monkeypatch, "plot_evaluations.py", *runs, "--out", str(picture))
     assert picture.stat().st_size > 1000
     assert str(picture) in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("game")
+def test_laps_are_compared(monkeypatch, capsys, tmp_path):
+    picture = tmp_path / "laps.png"
+    agent = str(AGENTS / "ddpg-aalborg")
+    run(monkeypatch, "compare_laps.py", agent, "inferno", "--out", str(picture))
+    ours, robot, drawn = capsys.readouterr().out.splitlines()
+    told = r"in \d+% of it; \d+% of that at most 120 m before a bend, \d+% in one"
+    assert re.fullmatch(rf"ddpg-aalborg: [\d.]+ s, on the brake {told}", ours)
+    assert re.fullmatch(rf"inferno: 76\.356 s, on the brake {told}", robot)
+    assert drawn == str(picture)
+    assert picture.read_bytes().startswith(b"\x89PNG")
