@@ -174,10 +174,10 @@ def run_study(
     tell = progress or _nobody
     place = StudyFolder(folder)
     with place.locked():
-        place.begin(study)
         left = [trial for trial in study.trials if not place.ended(trial)]
         for trial in {trial.variant: trial for trial in left}.values():
             _check_buildable(trial)
+        place.begin(study)
         for trial in study.trials:
             for row in place.rows(trial):
                 tell(trial, row)
