@@ -77,7 +77,7 @@ def best_lap(name, track):
     columns = {key: np.array([row[key] for row in laps[lap]]) for key in laps[lap][0]
                if np.isscalar(laps[lap][0][key])}  # fmt: skip
     return Lap(
-        name=Path(name).name,
+        name=Path(name).name if Path(name).is_dir() else name,
         seconds=times[lap],
         distance=columns["distance_from_start"],
         speed=columns["speed_x"],
@@ -103,10 +103,15 @@ def tightest_bends(track):
     return sorted(found)
 
 
-def where_it_brakes(lap, track):
+def sharp_bends(track):
+    """Whether the road bends sharply, every few metres of it."""
+    places = np.arange(0.0, track.length, STEP)
+    curvature = [track.segments[track.find(place)[0]].curvature for place in places]
+    return np.abs(curvature) > 1.0 / RADIUS
+
+
+def where_it_brakes(lap, bend):
     """Shares of its time on the brake: shortly before a bend, and in one."""
-    heading = np.unwrap([track.pose(place).heading for place in np.arange(0.0, track.length, STEP)])
-    bend = np.abs(np.gradient(heading, STEP)) > 1.0 / RADIUS
     ahead = np.any([np.roll(bend, -step) for step in range(int(BEFORE / STEP))], axis=0)
     braking = (lap.distance[lap.brake > BRAKING] / STEP).astype(int) % len(bend)
     return np.mean((ahead & ~bend)[braking]), np.mean(bend[braking])
@@ -156,9 +161,10 @@ if __name__ == "__main__":
     parser.add_argument("--out", type=Path, default=Path("laps.png"))
     args = parser.parse_args()
     track = load_track(args.track)
+    bend = sharp_bends(track)
     laps = [best_lap(name, args.track) for name in args.drivers]
     for lap in laps:
-        before, within = where_it_brakes(lap, track)
+        before, within = where_it_brakes(lap, bend)
         print(
             f"{lap.name}: {lap.seconds:.3f} s, on the brake in {np.mean(lap.brake > BRAKING):.0%} "
             f"of it; {before:.0%} of that at most {BEFORE:.0f} m before a bend, {within:.0%} in one"
