@@ -8,18 +8,28 @@ changes no bit of the result.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, cast
 
 import torch as th
 from stable_baselines3.common.policies import ContinuousCritic
-from stable_baselines3.common.preprocessing import get_action_dim
+from stable_baselines3.common.preprocessing import get_action_dim, preprocess_obs
 from stable_baselines3.td3.policies import Actor
 from torch import nn
 from torch.nn.functional import layer_norm as normalise
 from torch.nn.functional import linear
 
-__all__ = ["HEAD_GAINS", "LateActionCritic", "LateActionQ", "SplitHeadActor", "SplitHeads"]
+from sb3_torcs.mirror import mirror_actions, mirror_observations
+
+__all__ = [
+    "HEAD_GAINS",
+    "ExactDriver",
+    "LateActionCritic",
+    "LateActionQ",
+    "SplitHeadActor",
+    "SplitHeads",
+]
 
 HEAD_GAINS = {"tanh": 1.0, "sigmoid": 0.5}
 """[-] SB3 wants actions in [-1, 1], where a sigmoid is 2 sigmoid(z) - 1 = tanh(z / 2), exactly."""
@@ -160,6 +170,48 @@ class SplitHeadActor(Actor):
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {**super()._get_constructor_parameters(), **self.head_kwargs}
+
+
+class ExactDriver(nn.Module):
+    """
+    A copy of an actor that drives in double precision.
+
+    Processors round sums differently, and a car that is steered a hair otherwise is elsewhere
+    after a lap. Rounded from double to single precision, the actions are the same everywhere.
+
+    :param actor: of SB3's DDPG or TD3
+    :param symmetric: drive the mean of what the actor does and the mirror image of what it does in
+        the mirror
+    """
+
+    def __init__(self, actor: Actor, *, symmetric: bool = False) -> None:
+        super().__init__()
+        self.observation_space = actor.observation_space
+        self.normalize_images = actor.normalize_images
+        # Copies of the parts: the actor itself carries its optimizer and the hooks of a noise.
+        self.features_extractor = copy.deepcopy(actor.features_extractor)
+        self.mu = copy.deepcopy(actor.mu).double()
+        self.symmetric = symmetric
+
+    def forward(self, observation: th.Tensor) -> th.Tensor:
+        """
+        Decide.
+
+        :param observation: (batch, observation)
+        :return: (batch, actuators) in [-1, 1]
+        """
+        seen = cast(
+            th.Tensor, preprocess_obs(observation, self.observation_space, self.normalize_images)
+        )
+        actions = self._drive(seen)
+        if self.symmetric:
+            image = mirror_actions(self._drive(mirror_observations(seen)))
+            actions = 0.5 * (actions + image)
+        return actions.float()
+
+    def _drive(self, seen: th.Tensor) -> th.Tensor:
+        actions: th.Tensor = self.mu(self.features_extractor(seen).double())
+        return actions
 
 
 class LateActionQ(nn.Module):

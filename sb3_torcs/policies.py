@@ -8,7 +8,6 @@ file can name ``sb3_torcs.policies.SplitHeadPolicy`` without an import.
 
 from __future__ import annotations
 
-import copy
 import os
 import warnings
 from collections.abc import Sequence
@@ -19,7 +18,7 @@ from gymnasium import spaces
 from stable_baselines3 import DDPG, TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
-from stable_baselines3.common.preprocessing import get_action_dim, preprocess_obs
+from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.td3.policies import Actor, TD3Policy
@@ -27,9 +26,11 @@ from torch import nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from sb3_torcs import fast_matmul as matmul
+from sb3_torcs.actions import ACTION_HIGH
 from sb3_torcs.errors import InvalidOption, ModelMismatch, OutputNotWritable
-from sb3_torcs.networks import HEAD_GAINS, LateActionCritic, SplitHeadActor
+from sb3_torcs.networks import HEAD_GAINS, ExactDriver, LateActionCritic, SplitHeadActor
 from sb3_torcs.optimizers import LeanAdam, with_lr_scale
+from sb3_torcs.sensors import OBSERVATION_SIZE
 
 __all__ = ["SplitHeadPolicy", "export_actor"]
 
@@ -63,6 +64,10 @@ class SplitHeadPolicy(TD3Policy):
     :param ema_decay: if given, a running average of the actor's weights drives in its place
         whenever ``predict`` is ``deterministic``, as in evaluations; each update leaves the average
         this share of itself, e.g. 0.9995. Training is the same to the bit without it
+    :param symmetric: whenever ``predict`` is ``deterministic``, drive the mean of what the actor
+        does and the mirror image of what it does in the mirror, so that a bend to the left is
+        driven like one to the right. For observations whose middle is 0 (no ``VecNormalize``), with
+        range finders that look equally far to both sides. Training is the same to the bit without
     :param fast_matmul: allow another kernel for speed, see :mod:`sb3_torcs.fast_matmul`; what its
         probe found is in ``policy.fast_matmul_found``
     :param kwargs: the other arguments of ``TD3Policy``
@@ -80,6 +85,7 @@ class SplitHeadPolicy(TD3Policy):
         layer_norm: bool = False,
         critic_lr_scale: float = 1.0,
         ema_decay: float | None = None,
+        symmetric: bool = False,
         fast_matmul: bool = False,
         **kwargs: Any,
     ) -> None:
@@ -88,6 +94,8 @@ class SplitHeadPolicy(TD3Policy):
         bias = (0.0,) * len(heads) if head_bias is None else tuple(head_bias)
         _check_heads(heads, bias, get_action_dim(action_space))
         _check_net_arch(net_arch)
+        if symmetric:
+            _check_mirrored(observation_space, action_space)
         self.own_kwargs: dict[str, Any] = {
             "heads": tuple(heads),
             "head_bias": bias,
@@ -95,6 +103,7 @@ class SplitHeadPolicy(TD3Policy):
             "layer_norm": layer_norm,
             "critic_lr_scale": _positive("critic_lr_scale", critic_lr_scale),
             "ema_decay": _share("ema_decay", ema_decay),
+            "symmetric": symmetric,
             "fast_matmul": fast_matmul,
         }
         self.fast_matmul_found = matmul.enable() if fast_matmul else None
@@ -107,7 +116,7 @@ class SplitHeadPolicy(TD3Policy):
         )
 
     def _build(self, lr_schedule: Schedule) -> None:
-        self._exact: tuple[list[int], nn.Module] | None = None
+        self._exact: tuple[list[int], ExactDriver] | None = None
         super()._build(lr_schedule)
         self.average = self._averaged()
         scale = self.own_kwargs["critic_lr_scale"]
@@ -136,24 +145,18 @@ class SplitHeadPolicy(TD3Policy):
         """The actor that drives when ``predict`` is deterministic."""
         return self.actor if self.average is None else cast(Actor, self.average.module)
 
+    def exact_driver(self) -> ExactDriver:
+        """Return a copy of what drives when ``predict`` is deterministic."""
+        return ExactDriver(self.driver, symmetric=self.own_kwargs["symmetric"])
+
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         if not deterministic:
             return self.actor(observation)
-        features = self.driver.extract_features(observation, self.driver.features_extractor)
-        return self._exact_heads()(features.double()).float()
-
-    def _exact_heads(self) -> nn.Module:
-        """
-        Return the driver's network in double precision.
-
-        Processors round sums differently, and a car that is steered a hair otherwise is elsewhere
-        after a lap. Rounded from double to single precision, the actions are the same everywhere.
-        """
-        network = self.driver.mu
-        versions = [id(network), *(parameter._version for parameter in network.parameters())]
+        driver = self.driver
+        versions = [id(driver), *(parameter._version for parameter in driver.parameters())]
         if self._exact is None or self._exact[0] != versions:
-            self._exact = (versions, copy.deepcopy(network).double())
-        return self._exact[1]
+            self._exact = (versions, self.exact_driver())
+        return self._exact[1](observation)
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
         """
@@ -228,6 +231,16 @@ def _check_net_arch(net_arch: Any) -> None:
         )
 
 
+def _check_mirrored(observation_space: spaces.Space, action_space: spaces.Space) -> None:
+    known = (OBSERVATION_SIZE,), (len(ACTION_HIGH),)
+    if (observation_space.shape, action_space.shape) != known:
+        raise InvalidOption(
+            "symmetric=True mirrors the sensors and actuators of Torcs-v0 and TorcsLite-v0, shapes "
+            f"{known[0]} and {known[1]}, not {observation_space} and {action_space}; pass "
+            "symmetric=False"
+        )
+
+
 def _positive(name: str, value: float) -> float:
     if not 0.0 < value < float("inf"):
         raise InvalidOption(f"{name}={value!r}: pass a number above 0, e.g. {name}=1.0")
@@ -251,29 +264,22 @@ def _fast_optimizer(kwargs: dict[str, Any]) -> dict[str, Any]:
     return {**kwargs, "optimizer_class": optimizer_class, "optimizer_kwargs": options}
 
 
-class _EnvUnitActor(nn.Module):
+class _EnvUnitDriver(nn.Module):
     """Raw observations to actions in the environment's own units, for export."""
 
     low: th.Tensor
     span: th.Tensor
 
-    def __init__(self, actor: Actor) -> None:
+    def __init__(self, driver: ExactDriver, action_space: spaces.Box) -> None:
         super().__init__()
-        assert isinstance(actor.action_space, spaces.Box)
-        self.observation_space = actor.observation_space
-        self.normalize_images = actor.normalize_images
-        # Copies of the parts: the actor itself carries its optimizer and the hooks of a noise.
-        self.features_extractor = copy.deepcopy(actor.features_extractor)
-        self.mu = copy.deepcopy(actor.mu).double()  # as in SplitHeadPolicy
-        low = th.as_tensor(actor.action_space.low)
+        self.driver = driver
+        low = th.as_tensor(action_space.low)
         self.register_buffer("low", low)
-        self.register_buffer("span", th.as_tensor(actor.action_space.high) - low)
+        self.register_buffer("span", th.as_tensor(action_space.high) - low)
 
     def forward(self, observation: th.Tensor) -> th.Tensor:
-        prepared = preprocess_obs(observation, self.observation_space, self.normalize_images)
         # The order of operations is that of BasePolicy.unscale_action: same bits.
-        scaled = self.mu(self.features_extractor(prepared).double()).float()
-        return self.low + 0.5 * (scaled + 1.0) * self.span
+        return self.low + 0.5 * (self.driver(observation) + 1.0) * self.span
 
 
 def export_actor(
@@ -291,13 +297,15 @@ def export_actor(
         units: steering in [-1, 1], throttle and brake in [0, 1]
     """
     policy = model.policy
-    actor = getattr(policy, "driver", None) or getattr(policy, "actor", None)
+    actor = getattr(policy, "actor", None)
     if not isinstance(actor, Actor):
         raise ModelMismatch(
             f"{type(model).__name__} with {type(model.policy).__name__} has no deterministic "
             "actor to export; pass a DDPG or TD3 model"
         )
-    module = _EnvUnitActor(actor).cpu().eval().requires_grad_(False)
+    driver = policy.exact_driver() if isinstance(policy, SplitHeadPolicy) else ExactDriver(actor)
+    assert isinstance(model.action_space, spaces.Box)
+    module = _EnvUnitDriver(driver, model.action_space).cpu().eval().requires_grad_(False)
     example = th.as_tensor(model.observation_space.sample())[None]
     with th.no_grad(), warnings.catch_warnings():
         # PyTorch deprecates TorchScript, and has nothing else yet that C++ alone can run.

@@ -19,6 +19,7 @@ from toy import ToyRace
 from sb3_torcs import fast_matmul
 from sb3_torcs.bench_policy import PlainSplitHeadPolicy, measure, updater
 from sb3_torcs.errors import InvalidOption, ModelMismatch, OutputNotWritable
+from sb3_torcs.mirror import mirror_actions, mirror_observations
 from sb3_torcs.optimizers import LeanAdam
 from sb3_torcs.policies import SplitHeadPolicy, export_actor
 
@@ -143,11 +144,14 @@ def test_layer_norm_is_in_the_hidden_layers_of_both_networks():
 
 
 def test_other_numbers_of_actions_take_other_heads():
-    """Heads are configurable per action dimension."""
+    """Heads are configurable per action dimension; a mirror image is known of three only."""
     env = DummyVecEnv([ToyRace])
     env.action_space = spaces.Box(-1, 1, (2,))
-    model = DDPG("SplitHeadPolicy", env, policy_kwargs={"heads": ("tanh",) * 2}, buffer_size=10)
+    kwargs = {"heads": ("tanh",) * 2}
+    model = DDPG("SplitHeadPolicy", env, policy_kwargs=kwargs, buffer_size=10)
     assert model.predict(OBSERVATIONS)[0].shape == (5, 2)
+    with pytest.raises(InvalidOption, match="pass symmetric=False"):
+        DDPG("SplitHeadPolicy", env, policy_kwargs={**kwargs, "symmetric": True}, buffer_size=10)
 
 
 @pytest.mark.parametrize(("kwargs", "message"), [
@@ -299,13 +303,38 @@ def test_a_processor_that_rounds_otherwise_drives_the_same(tmp_path):
     np.testing.assert_array_equal(*drives)
 
 
-def test_averaging_changes_no_bit_of_the_training():
-    networks = []
-    for decay in (None, 0.9):
-        model = updater("SplitHeadPolicy", 32, net_arch=SMALL, ema_decay=decay)
+@pytest.mark.parametrize("kwargs", [{"ema_decay": 0.9}, {"symmetric": True}])
+def test_what_drives_in_evaluations_changes_no_bit_of_the_training(kwargs):
+    networks, explored = [], []
+    for own in ({}, kwargs):
+        model = updater("SplitHeadPolicy", 32, net_arch=SMALL, **own)
         model.train(10, 32)
         networks.append([*model.actor.parameters(), *model.critic.parameters()])
+        explored.append(model.predict(OBSERVATIONS)[0])
     assert_same(*networks)
+    np.testing.assert_array_equal(*explored)
+
+
+@pytest.mark.parametrize("ema_decay", [None, 0.9])
+def test_a_symmetric_driver_drives_both_ways_alike(ema_decay):
+    """The mean of what the actor does on either side; to the bit before SB3 scales the actions."""
+    model, plain = (
+        make_model(init_std=0.5, ema_decay=ema_decay, symmetric=own) for own in (True, False)
+    )
+    seen = th.as_tensor(OBSERVATIONS)
+    image = mirror_observations(seen)
+    for _ in range(2):
+        driver, one_sided = model.policy.exact_driver(), plain.policy.exact_driver()
+        assert th.equal(driver(image), mirror_actions(driver(seen)))
+        assert not th.allclose(one_sided(image), mirror_actions(one_sided(seen)), atol=1e-3)
+        mean = (one_sided(seen) + mirror_actions(one_sided(image))) / 2
+        th.testing.assert_close(driver(seen), mean)
+        expected = model.policy.unscale_action(driver(seen).numpy(force=True))
+        found, _ = model.predict(OBSERVATIONS, deterministic=True)
+        np.testing.assert_array_equal(found, expected)
+        for each in (model, plain):
+            each.set_random_seed(3)
+            each.learn(20)
 
 
 def test_switching_the_mode_reaches_every_module():
@@ -355,12 +384,15 @@ def test_a_fresh_process_loads_it_without_importing_the_plugin(tmp_path):
 
 def test_the_policy_alone_can_be_saved_and_loaded(tmp_path):
     """``policy.save`` and ``actor.save``, as for SB3's own."""
-    policy = make_model(critic_lr_scale=2.0, head_bias=(0, 0, -1), ema_decay=0.9).policy
+    kwargs = {"ema_decay": 0.9, "symmetric": True, "init_std": 0.5}
+    policy = make_model(critic_lr_scale=2.0, head_bias=(0, 0, -1), **kwargs).policy
     for part in (policy, policy.actor):
         part.save(str(tmp_path / "part"))
         loaded = type(part).load(str(tmp_path / "part"), device="cpu")
-        expected = policy.predict(OBSERVATIONS)[0]
-        np.testing.assert_array_equal(loaded.predict(OBSERVATIONS)[0], expected)
+        for known in (False, True) if part is policy else (False,):
+            expected = policy.predict(OBSERVATIONS, deterministic=known)[0]
+            found = loaded.predict(OBSERVATIONS, deterministic=known)[0]
+            np.testing.assert_array_equal(found, expected)
 
 
 def test_the_alias_belongs_to_ddpg_and_td3_only():
@@ -370,10 +402,12 @@ def test_the_alias_belongs_to_ddpg_and_td3_only():
     assert "SplitHeadPolicy" not in PPO.policy_aliases
 
 
+@pytest.mark.parametrize("symmetric", [False, True])
 @pytest.mark.parametrize("algorithm", [DDPG, TD3])
-def test_the_export_is_the_driver(tmp_path, algorithm):
+def test_the_export_is_the_driver(tmp_path, algorithm, symmetric):
     """From raw observations to environment units, equal to predict; any number of rows."""
-    model = make_model(algorithm, init_std=0.5, layer_norm=True, ema_decay=0.9)
+    kwargs = {"layer_norm": True, "ema_decay": 0.9, "symmetric": symmetric}
+    model = make_model(algorithm, init_std=0.5, **kwargs)
     model.learn(20)
     script = export_actor(model, tmp_path / "driver.pt")
     code = "import sys, torch; print(torch.jit.load(sys.argv[1])(torch.zeros(2, 29)).tolist())"
