@@ -12,7 +12,6 @@ import tempfile
 import weakref
 from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
 from typing import IO
 
 from sb3_torcs.errors import DisplayUnavailable
@@ -85,12 +84,7 @@ class VirtualDisplay:
     def __enter__(self) -> VirtualDisplay:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def close(self) -> None:

@@ -16,7 +16,6 @@ import weakref
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import TracebackType
 
 from sb3_torcs.errors import BackendUnavailable, GameFailed, GameIncomplete, GameTimeout
 from sb3_torcs.game import BUILD, Game
@@ -100,12 +99,7 @@ class GameProcess:
     def __enter__(self) -> GameProcess:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.stop()
 
     @property

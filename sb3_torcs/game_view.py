@@ -11,7 +11,6 @@ import socket
 import weakref
 from contextlib import ExitStack
 from dataclasses import replace
-from types import TracebackType
 from xml.etree import ElementTree
 
 import numpy as np
@@ -66,12 +65,7 @@ class GameView:
     def __enter__(self) -> GameView:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def frame(self, appearance: bytes) -> npt.NDArray[np.uint8]:

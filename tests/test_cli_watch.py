@@ -11,6 +11,7 @@ from pathlib import Path
 import imageio_ffmpeg
 import numpy as np
 import pytest
+from processes import children
 
 from sb3_torcs import driving, watching
 from sb3_torcs.cli import main
@@ -32,13 +33,6 @@ def nothing_is_left(tmp_path, monkeypatch):
     yield
     assert list(private.iterdir()) == []
     assert children() - before == set()
-
-
-def children():
-    """Games and displays that this process has started, by whatever test, and that still run."""
-    call = ["ps", "--ppid", str(os.getpid()), "-o", "pid=,comm="]
-    listed = subprocess.run(call, capture_output=True, text=True, check=False)
-    return {line for line in listed.stdout.splitlines() if re.search(r" (torcs-bin|Xvfb)\b", line)}
 
 
 class Turning:

@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env as check_gymnasium
 from gymnasium.wrappers import RecordVideo
+from processes import children
 from stable_baselines3.common.env_checker import check_env as check_sb3
 
 from sb3_torcs.envs.torcs_lite import TorcsLiteEnv
@@ -222,12 +223,6 @@ def test_there_is_no_picture_before_and_after():
 
 
 # ---- Faults, and what is left -------------------------------------------------------------------
-
-
-def children():
-    """The processes that this one has started, by whatever test."""
-    text = Path(f"/proc/{os.getpid()}/task/{os.getpid()}/children").read_text()
-    return {int(pid) for pid in text.split()}
 
 
 def traces(env, before):
