@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import pickle
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,8 @@ __all__ = [
 
 BEST_MODEL = "best_model.zip"
 AGENTS = Path(__file__).parent / "agents"
+
+NEEDED_KEYS = ("observation_space", "action_space", "num_timesteps")
 
 # What only one family of algorithms saves; the first that is there names it. DDPG saves what TD3
 # does, and either class drives the other's models.
@@ -114,8 +117,8 @@ def find_model(path: str | Path, *, prefer_last: bool = False) -> Path:
     given = Path(path).expanduser()
     if given.is_file():
         return given
-    if given.with_name(f"{given.name}.zip").is_file():
-        return given.with_name(f"{given.name}.zip")
+    if Path(f"{given}.zip").is_file():
+        return Path(f"{given}.zip")
     if not given.is_dir() and str(path) in shipped_agents():
         given = AGENTS / str(path)
     if not given.is_dir():
@@ -153,6 +156,7 @@ def training_record(model: Path) -> TrainingRecord:
 
     :param model: the file
     :return: what is known
+    :raises ModelMismatch: if something of it cannot be read
     """
     own = _record(model.parent)
     if own is not None:
@@ -164,16 +168,44 @@ def training_record(model: Path) -> TrainingRecord:
 
 def _record(folder: Path) -> TrainingRecord | None:
     """Read what the zoo wrote in a folder."""
-    config, arguments = _read_plain(folder / "config.yml"), _read_plain(folder / "args.yml")
-    if not config and not arguments:
-        return None
+    arguments, config = folder / "args.yml", folder / "config.yml"
     statistics = folder / "vecnormalize.pkl"
+    if not any(file.is_file() for file in (arguments, config, statistics)):
+        return None
     return TrainingRecord(
-        algo=arguments.get("algo"),
-        env_id=arguments.get("env"),
-        env_kwargs=config.get("env_kwargs") or {},
+        algo=_recorded(arguments, "algo", str),
+        env_id=_recorded(arguments, "env", str),
+        env_kwargs=_recorded(config, "env_kwargs", dict) or {},
         statistics=statistics if statistics.is_file() else None,
     )
+
+
+def _recorded(file: Path, key: str, kind: type) -> Any:
+    """Read one value of the zoo's records."""
+    value = _read_plain(file).get(key)
+    if not isinstance(value, kind | None):
+        raise ModelMismatch(
+            f"'{file}', the record of a training: {key} is {value!r}; repair or remove it"
+        )
+    return value
+
+
+def _read_plain(file: Path) -> dict[str, Any]:
+    """
+    Read one of the zoo's records, if it is there.
+
+    Without it a model would drive in another environment than the one it learned in, so what is
+    there and cannot be read is an error.
+    """
+    if not file.is_file():
+        return {}
+    try:
+        content = yaml.load(file.read_text(encoding="utf-8"), Loader=_PlainLoader)
+    except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ModelMismatch(
+            f"'{file}', the record of a training, cannot be read ({error}); repair or remove it"
+        ) from error
+    return content if isinstance(content, dict) else {}
 
 
 def one_track(track: Any) -> Any:
@@ -192,21 +224,14 @@ def one_track(track: Any) -> Any:
     return track
 
 
-def _read_plain(path: Path) -> dict[str, Any]:
-    """Read one of the zoo's records; a broken or missing one is as good as none."""
-    try:
-        content = yaml.load(path.read_text(encoding="utf-8"), Loader=_PlainLoader)
-    except (OSError, yaml.YAMLError, UnicodeDecodeError):
-        return {}
-    return content if isinstance(content, dict) else {}
-
-
 def _saved_data(model: Path) -> dict[str, Any]:
     """Read the readable part of a saved model, without unpickling anything."""
     try:
         with zipfile.ZipFile(model) as archive:
-            data: dict[str, Any] = json.loads(archive.read("data"))
-    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
+            data: dict[str, Any] = dict(json.loads(archive.read("data")))
+        for name in NEEDED_KEYS:
+            data[name]
+    except (OSError, KeyError, TypeError, ValueError, zipfile.BadZipFile) as error:
         raise ModelMismatch(
             f"'{model}' is not a model that Stable-Baselines3 saved ({error}); give the .zip that "
             "a training saved"
@@ -235,7 +260,8 @@ def saved_spaces(model: Path) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
 
     data = _saved_data(model)
     wanted = {name: data[name] for name in ("observation_space", "action_space")}
-    loaded = json_to_data(json.dumps(wanted))
+    with _as_mismatch(f"'{model}' does not tell what it sees and does", "give"):
+        loaded = json_to_data(json.dumps(wanted))
     return loaded["observation_space"], loaded["action_space"]
 
 
@@ -289,25 +315,41 @@ def load_driver(path: str | Path, env: gym.Env[Any, Any], algo: str | None = Non
         from sb3_torcs.drivers import ScriptedDriver
 
         return ScriptedDriver()
+    from stable_baselines3.common.vec_env import VecNormalize
+
     model_file = find_model(path)
     data = _saved_data(model_file)
     check_spaces(model_file, saved_spaces(model_file), env)
     record = training_record(model_file)
-    algorithm = _algorithm(algo or record.algo, data, model_file)
+    name, algorithm = _algorithm(algo or record.algo, data, model_file)
     # On the CPU: for one decision at a time it is the fastest, and it is always there. The
     # schedules are of no use to a driver, and the saved ones may be from another version.
     # Nor is a memory: SB3 warns of the class that it chose itself for returns over several steps.
-    model = algorithm.load(
-        io.BytesIO(model_file.read_bytes()), device="cpu", buffer_size=1, replay_buffer_class=None
-    )
+    kwargs = {"device": "cpu", "buffer_size": 1, "replay_buffer_class": None}
+    with _as_mismatch(f"'{model_file}' does not load as {name}", "give an --algo that fits, or"):
+        model = algorithm.load(io.BytesIO(model_file.read_bytes()), **kwargs)
     if record.statistics is None:
         return model
-    with record.statistics.open("rb") as file:
-        return NormalizedDriver(model, pickle.load(file))
+    with _as_mismatch(f"'{record.statistics}' holds no statistics of VecNormalize", "give"):
+        statistics = pickle.loads(record.statistics.read_bytes())
+        if not isinstance(statistics, VecNormalize):
+            raise TypeError(f"a {type(statistics).__name__}")
+    return NormalizedDriver(model, statistics)
 
 
-def _algorithm(name: str | None, data: dict[str, Any], model: Path) -> Any:
-    """Find the class of a saved model."""
+@contextlib.contextmanager
+def _as_mismatch(what: str, hint: str) -> Iterator[None]:
+    """Tell a file that is not what it should be: SB3 and pickle raise whatever comes of it."""
+    try:
+        yield
+    except Exception as error:
+        raise ModelMismatch(
+            f"{what} ({type(error).__name__}: {error}); {hint} a model that is whole"
+        ) from error
+
+
+def _algorithm(name: str | None, data: dict[str, Any], model: Path) -> tuple[str, Any]:
+    """Find the algorithm of a saved model: its name and its class."""
     from rl_zoo3.utils import ALGOS
 
     if name is None and "recurrent" in str(data.get("policy_class")).lower():
@@ -321,4 +363,4 @@ def _algorithm(name: str | None, data: dict[str, Any], model: Path) -> Any:
             f"the RL Zoo has no algorithm '{name}'{near_miss(name, ALGOS)} it has: "
             f"{', '.join(sorted(ALGOS))}"
         )
-    return ALGOS[name]
+    return name, ALGOS[name]

@@ -1,4 +1,6 @@
+import pickle
 import shutil
+import zipfile
 
 import gymnasium as gym
 import numpy as np
@@ -72,10 +74,18 @@ def test_a_record_below_belongs_to_the_model_only_if_it_is_the_only_one(saved):
     assert models.training_record(path) == models.TrainingRecord()
 
 
-def test_a_record_that_is_broken_is_as_good_as_none(saved):
+@pytest.mark.parametrize(("name", "text", "message"), [
+    ("config.yml", "a: [", "cannot be read"),
+    ("config.yml", "env_kwargs: narrow", "env_kwargs is 'narrow'"),
+    ("args.yml", "algo: 3", "algo is 3"),
+    ("args.yml", "{env: [Torcs-v0]}", r"env is \['Torcs-v0'\]"),
+])  # fmt: skip
+def test_a_record_that_is_broken_is_told(saved, name, text, message):
+    """Without it the model would drive in another environment than the one it learned in."""
     _, path = saved
-    (path.parent / "config.yml").write_text("a: [")
-    assert models.training_record(path) == models.TrainingRecord()
+    (path.parent / name).write_text(text)
+    with pytest.raises(ModelMismatch, match=f"(?s){name}.*{message}.*repair or remove it"):
+        models.training_record(path)
 
 
 def test_a_record_builds_no_objects(tmp_path):
@@ -100,6 +110,12 @@ def test_a_folder_stands_for_its_best_model(saved):
     assert models.find_model(path.parent, prefer_last=True) == path
 
 
+def test_the_folder_may_be_the_present_one(saved, monkeypatch):
+    monkeypatch.chdir(saved[1].parent)
+    saved[1].rename("best_model.zip")
+    assert models.find_model(".").resolve() == saved[1].parent / "best_model.zip"
+
+
 def test_the_suffix_may_be_left_out(saved):
     _, path = saved
     assert models.find_model(path.with_suffix("")) == path
@@ -120,6 +136,44 @@ def test_a_file_that_is_no_model_is_refused(tmp_path, env):
     (tmp_path / "m.zip").write_text("not a zip")
     with pytest.raises(ModelMismatch, match="is not a model that Stable-Baselines3 saved"):
         models.load_driver(tmp_path / "m.zip", env)
+
+
+def rewritten(path, **changes):
+    """Put other contents into a saved model; ``None`` takes a part away."""
+    with zipfile.ZipFile(path) as archive:
+        parts = {name: archive.read(name) for name in archive.namelist()}
+    parts |= {name.replace("_pth", ".pth"): content for name, content in changes.items()}
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in parts.items():
+            if content is not None:
+                archive.writestr(name, content)
+
+
+@pytest.mark.parametrize(("changes", "message"), [
+    ({"data": b"[1]"}, "is not a model that Stable-Baselines3 saved"),
+    ({"data": b"{}"}, "is not a model that Stable-Baselines3 saved"),
+    ({"data": None}, "is not a model that Stable-Baselines3 saved"),
+    ({"policy_pth": None}, "does not load as ddpg"),
+    ({"policy_pth": b"PK half of it"}, "does not load as ddpg"),
+])  # fmt: skip
+def test_a_damaged_model_is_refused(saved, env, changes, message):
+    rewritten(saved[1], **changes)
+    with pytest.raises(ModelMismatch, match=message):
+        models.load_driver(saved[1], env, algo="ddpg")
+
+
+@pytest.mark.parametrize("algo", ["sac", "ppo", "dqn"])
+def test_a_model_of_another_algorithm_is_refused(saved, env, algo):
+    with pytest.raises(ModelMismatch, match=f"does not load as {algo} .*give an --algo that fits"):
+        models.load_driver(saved[1], env, algo=algo)
+
+
+@pytest.mark.parametrize("content", [b"", b"no pickle", pickle.dumps({"mean": 0.0})])
+def test_statistics_that_are_none_are_refused(saved, env, content):
+    _, path = saved
+    (path.parent / "vecnormalize.pkl").write_bytes(content)
+    with pytest.raises(ModelMismatch, match="holds no statistics of VecNormalize"):
+        models.load_driver(path, env)
 
 
 def test_an_unknown_algorithm_is_told_the_near_miss(saved, env):
