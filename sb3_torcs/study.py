@@ -1,8 +1,8 @@
 """Studies: every variant with every seed, as trials of Ray Tune on the local cores or a cluster.
 
-Whatever a trial has come to goes to one keeper, an actor beside the driver, which writes it to the
-study's folder. A trial that is begun again, because its worker was lost or the whole study was
-killed, asks the keeper what there is and goes on from there; workers need no disk of their own.
+Whatever a trial has come to goes to the study's folder, an actor beside the driver. A trial that is
+begun again, because its worker was lost or the whole study was killed, asks the folder what there
+is and goes on from there; workers need no disk of their own.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +19,12 @@ from sb3_torcs.errors import RayUnavailable, StudyError
 from sb3_torcs.study_file import Study, Trial
 from sb3_torcs.study_folder import Files, StudyFolder
 
-__all__ = ["Keeper", "Progress", "require_ray", "run_study", "run_trial"]
+__all__ = ["Progress", "require_ray", "run_study", "run_trial"]
 
 RETRIES = 3  # of a trial whose worker was lost or whose code failed, per run of the command
 SESSION = ".session"  # where a killed run's temporary files are
 SCRATCH = "st-"  # what folders with temporary files are called: short, since sockets lie in them
+MARK = ".of-a-study"  # a file that says so
 
 Progress = Callable[[Trial, dict[str, Any]], None]
 """Called with a trial and the last of its rows, or with ``{"state": …}``."""
@@ -44,75 +44,17 @@ IMPATIENT = {"RAY_NUM_REDIS_GET_RETRIES": "1"}
 """A cluster that does not answer is told within a minute; Ray would try for eight."""
 
 
-@dataclass
-class Keeper:
-    """
-    Keeps what trials have come to. Has the disk to itself, so that nothing is written twice.
-
-    :param study: that is run
-    :param folder: its folder
-    """
-
-    study: Study
-    folder: StudyFolder
-
-    def state(self, trial: Trial) -> tuple[Files | None, bool, list[str]]:
-        """
-        Tell what there is of a trial.
-
-        :param trial: of the study
-        :return: the files to go on from, if any; whether the training is over; tracks on which the
-            best model is still to be measured
-        """
-        over = self.folder.trained(trial)
-        source = self.folder.of(trial) if over else self.folder.checkpoint(trial)
-        files = None
-        if source is not None:
-            files = {file.name: file.read_bytes() for file in source.iterdir() if file.is_file()}
-        return files, over, self.folder.missing(trial)
-
-    def put(self, trial: Trial, files: Files, rows: list[dict[str, Any]]) -> None:
-        """
-        Take the state after an evaluation.
-
-        :param trial: of the study
-        :param files: of its checkpoint
-        :param rows: of its evaluations so far
-        """
-        self.folder.put(trial, files, rows)
-        self.folder.write_results(self.study)
-
-    def put_finals(self, trial: Trial, rows: list[dict[str, Any]]) -> None:
-        """
-        Take the final measurements.
-
-        :param trial: of the study
-        :param rows: one per track
-        """
-        self.folder.put_finals(trial, rows)
-        self.folder.write_results(self.study)
-
-    def rows(self, trial: Trial) -> list[dict[str, Any]]:
-        """
-        Tell the evaluations of a trial.
-
-        :param trial: of the study
-        :return: its rows
-        """
-        return self.folder.rows(trial)
-
-
-def run_trial(trial: Trial, keeper: Any, report: Callable[[dict[str, Any]], None]) -> None:
+def run_trial(trial: Trial, place: Any, report: Callable[[dict[str, Any]], None]) -> None:
     """
     Train and measure one agent, or go on with it.
 
     :param trial: which one
-    :param keeper: has the methods of :class:`Keeper`
+    :param place: a :class:`~sb3_torcs.study_folder.StudyFolder`, or what stands for one elsewhere
     :param report: called with the newest row
     """
     from sb3_torcs.study_training import Training, final_row
 
-    files, over, missing = keeper.state(trial)
+    files, over, missing = place.state(trial)
     if not over:
         with _unpacked(files) as checkpoint:
             training = Training(trial, checkpoint)
@@ -121,20 +63,21 @@ def run_trial(trial: Trial, keeper: Any, report: Callable[[dict[str, Any]], None
             with tempfile.TemporaryDirectory() as scratch:
                 training.save(Path(scratch))
                 packed = {file.name: file.read_bytes() for file in Path(scratch).iterdir()}
-            keeper.put(trial, packed, training.rows)
+            place.put(trial, packed, training.rows)
             report(training.rows[-1])
 
         with contextlib.closing(training):
             training.run(after_slice)
-        files, _, missing = keeper.state(trial)
-    chosen = [row for row in keeper.rows(trial) if row["phase"] == "train" and row["kept"]][-1]
+        files, _, missing = place.state(trial)
+    chosen = [row for row in place.rows(trial) if row["phase"] == "train" and row["kept"]][-1]
     with _unpacked(files) as folder:
         assert folder is not None
         model = folder / "best_model.zip"
-        finals = [final_row(trial, model, track, chosen) for track in missing]
-    if finals:
-        keeper.put_finals(trial, finals)
-        report(finals[-1])
+        for track in missing:
+            row = final_row(trial, model, track, chosen)
+            place.put_finals(trial, [row])
+    if missing:
+        report(row)
 
 
 @contextlib.contextmanager
@@ -172,12 +115,14 @@ def run_study(
     """
     require_ray(address)
     tell = progress or _nobody
-    place = StudyFolder(folder)
+    place = StudyFolder(folder, study)
     with place.locked():
+        _remove_scratch(place.path / SESSION)  # of a run that was killed
         left = [trial for trial in study.trials if not place.ended(trial)]
         for trial in {trial.variant: trial for trial in left}.values():
             _check_buildable(trial)
-        place.begin(study)
+        place.begin()
+        place.write_results()
         for trial in study.trials:
             for row in place.rows(trial):
                 tell(trial, row)
@@ -185,8 +130,8 @@ def run_study(
                 tell(trial, {"state": "done"})
         if left:
             with _ray(place, jobs, address) as scratch:
-                _tune(study, left, place, scratch, tell)
-        return place.write_results(study)
+                _tune(left, place, scratch, tell)
+    return place.results
 
 
 def _check_buildable(trial: Trial) -> None:
@@ -204,8 +149,13 @@ def require_ray(address: str | None = None) -> None:
     Make sure that Ray can be imported, and that it will be quiet.
 
     :param address: of a cluster that is to be joined
-    :raises RayUnavailable: if it is not installed
+    :raises RayUnavailable: if it is not installed, or the address is none of a cluster
     """
+    if address is not None and address.startswith("ray://"):
+        raise RayUnavailable(
+            f"'{address}' is for clients outside of a cluster; type the command on one of its "
+            "machines, with --address auto"
+        )
     settings = QUIET if address is None else {**QUIET, **IMPATIENT}
     for name, value in settings.items():
         os.environ.setdefault(name, value)
@@ -220,12 +170,10 @@ def require_ray(address: str | None = None) -> None:
 
 @contextlib.contextmanager
 def _ray(place: StudyFolder, jobs: int | None, address: str | None) -> Iterator[Path]:
-    """Start Ray or join a cluster, and clean up, after a killed run too."""
+    """Start Ray or join a cluster, with a folder for temporary files, and clean up."""
     import ray
 
     session = place.path / SESSION
-    if session.is_file():
-        _remove_scratch(Path(session.read_text(encoding="utf-8")))
     scratch = Path(tempfile.mkdtemp(prefix=SCRATCH))
     options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
     if address is None:
@@ -236,11 +184,11 @@ def _ray(place: StudyFolder, jobs: int | None, address: str | None) -> Iterator[
     else:
         options["address"] = address
     try:
+        (scratch / MARK).touch()
         session.write_text(str(scratch), encoding="utf-8")
         ray.init(**options)
     except (OSError, RuntimeError, ValueError) as error:
-        shutil.rmtree(scratch, ignore_errors=True)
-        session.unlink(missing_ok=True)
+        _remove_scratch(session)
         raise RayUnavailable(
             f"Ray does not start in '{scratch}' ({error}); is there room, and the path short? "
             "Otherwise choose another place: TMPDIR=/tmp"
@@ -252,29 +200,32 @@ def _ray(place: StudyFolder, jobs: int | None, address: str | None) -> Iterator[
         yield scratch
     finally:
         ray.shutdown()
-        shutil.rmtree(scratch, ignore_errors=True)
-        session.unlink(missing_ok=True)
+        _remove_scratch(session)
 
 
-def _remove_scratch(folder: Path) -> None:
-    """Remove what a killed run has left, and nothing else, whatever the file says."""
-    if folder.parent == Path(tempfile.gettempdir()) and folder.name.startswith(SCRATCH):
-        shutil.rmtree(folder, ignore_errors=True)
+def _remove_scratch(session: Path) -> None:
+    """Remove a run's temporary files, and nothing else, whatever the file that names them says."""
+    if session.is_file():
+        folder = Path(session.read_text(encoding="utf-8"))
+        if (folder / MARK).is_file():
+            shutil.rmtree(folder, ignore_errors=True)
+        session.unlink()
 
 
-def _tune(
-    study: Study, trials: list[Trial], place: StudyFolder, scratch: Path, progress: Progress
-) -> None:
+def _tune(trials: list[Trial], place: StudyFolder, scratch: Path, progress: Progress) -> None:
     """Let Ray Tune run the trials."""
     import ray
     from ray import tune
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
     here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=False)
-    keeper = ray.remote(Keeper).options(num_cpus=0, scheduling_strategy=here).remote(study, place)
+    folder = ray.remote(StudyFolder).options(num_cpus=0, scheduling_strategy=here)
+    actor = folder.remote(place.path, place.study)
 
     def trainable(config: dict[str, Any]) -> None:
-        run_trial(trials[config["trial"]], _Remote(keeper), tune.report)
+        if scratch.is_dir():  # on this machine: what a killed worker leaves is removed with it
+            tempfile.tempdir = str(scratch)
+        run_trial(trials[config["trial"]], _Remote(actor), tune.report)
 
     here_only = _HereOnly(progress)
 

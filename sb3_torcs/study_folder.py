@@ -29,7 +29,7 @@ import yaml
 from sb3_torcs.errors import OutputNotWritable, StudyError
 from sb3_torcs.study_file import FIELDS, Study, Trial, track_name
 
-__all__ = ["RESULTS", "Files", "StudyFolder"]
+__all__ = ["RECIPE", "RESULTS", "ROWS", "Files", "StudyFolder", "write_whole"]
 
 Files = dict[str, bytes]
 """Contents of files by name."""
@@ -45,11 +45,18 @@ class StudyFolder:
     What a study has come to.
 
     :param path: of the folder; it is made
+    :param study: that is run in it
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, study: Study) -> None:
         self.path = path
+        self.study = study
         path.mkdir(parents=True, exist_ok=True)
+
+    @property
+    def results(self) -> Path:
+        """The table of all rows."""
+        return self.path / RESULTS
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
@@ -73,27 +80,32 @@ class StudyFolder:
         """
         return self.path / trial.name
 
-    def begin(self, study: Study) -> None:
+    def begin(self) -> None:
         """
         Make a folder for each trial, and make sure that those that are there are of this study.
 
-        :param study: to be run here
-        :raises StudyError: if a trial was begun with another recipe
+        :raises StudyError: if the folder is of another study, or if a trial was begun with another
+            recipe
         """
-        for trial in study.trials:
+        for file in self.path.glob(f"*/{RECIPE}"):
+            recipe = _parsed(file, yaml.safe_load)
+            other = recipe.get("study") if isinstance(recipe, dict) else recipe
+            if other != self.study.name:
+                raise StudyError(
+                    f"'{self.path}' holds the study '{other}'; give another --folder for "
+                    f"'{self.study.name}'"
+                )
+        for trial in self.study.trials:
             file = self.of(trial) / RECIPE
             recipe = trial.recipe()
             if not file.is_file():
-                file.parent.mkdir(exist_ok=True)
-                _write(file, yaml.safe_dump(recipe, sort_keys=False).encode())
+                write_whole(file, yaml.safe_dump(recipe, sort_keys=False).encode())
                 continue
-            before = _parsed(file, yaml.safe_load) or {}
+            before = _parsed(file, yaml.safe_load)
             if before != recipe:
-                keys = {**recipe, **before}
-                changed = [key for key in keys if recipe.get(key) != before.get(key)]
                 raise StudyError(
-                    f"'{file.parent}' was begun with another {', '.join(changed)}; give another "
-                    "--folder, or remove that one to begin it anew"
+                    f"'{file.parent}' was begun with another {_difference(before, recipe)}; give "
+                    "another --folder, or remove that one to begin it anew"
                 )
 
     def rows(self, trial: Trial) -> list[dict[str, Any]]:
@@ -103,8 +115,7 @@ class StudyFolder:
         :param trial: of the study
         :return: its rows, those during the training first
         """
-        file = self.of(trial) / ROWS
-        return _parsed(file, json.loads) if file.is_file() else []
+        return _rows(self.of(trial) / ROWS)
 
     def trained(self, trial: Trial) -> bool:
         """
@@ -144,6 +155,21 @@ class StudyFolder:
         """
         return max(self.of(trial).glob(f"{CHECKPOINT}*"), default=None)
 
+    def state(self, trial: Trial) -> tuple[Files | None, bool, list[str]]:
+        """
+        Tell what there is of a trial.
+
+        :param trial: of the study
+        :return: the files to go on from, if any; whether the training is over; tracks on which the
+            best model is still to be measured
+        """
+        over = self.trained(trial)
+        source = self.of(trial) if over else self.checkpoint(trial)
+        files = None
+        if source is not None:
+            files = {file.name: file.read_bytes() for file in source.iterdir() if file.is_file()}
+        return files, over, self.missing(trial)
+
     def put(self, trial: Trial, files: Mapping[str, bytes], rows: list[dict[str, Any]]) -> None:
         """
         Write the newest state of a trial, and take the one before away.
@@ -162,16 +188,20 @@ class StudyFolder:
         if not over:
             aside = folder / f".{CHECKPOINT}new"
             shutil.rmtree(aside, ignore_errors=True)
-            aside.mkdir()
-            for file, content in files.items():
-                _write(aside / file, content)
-            aside.rename(folder / f"{CHECKPOINT}{len(rows):06d}")
+            try:
+                for file, content in files.items():
+                    write_whole(aside / file, content)
+                aside.rename(folder / f"{CHECKPOINT}{len(rows):06d}")
+            except OSError:
+                shutil.rmtree(aside, ignore_errors=True)  # it may be what fills the disk
+                raise
         for file in FOR_DRIVERS:
             if file in files:
-                _write(folder / file, files[file])
-        _write(folder / ROWS, json.dumps(rows).encode())
+                write_whole(folder / file, files[file])
+        write_whole(folder / ROWS, json.dumps(rows).encode())
         for old in before:
             shutil.rmtree(old, ignore_errors=True)
+        self.write_results()
 
     def put_finals(self, trial: Trial, rows: Iterable[dict[str, Any]]) -> None:
         """
@@ -183,22 +213,42 @@ class StudyFolder:
         done = self.rows(trial)
         known = {row["track"] for row in done if row["phase"] == "final"}
         done += [row for row in rows if row["track"] not in known]
-        _write(self.of(trial) / ROWS, json.dumps(done).encode())
+        write_whole(self.of(trial) / ROWS, json.dumps(done).encode())
+        self.write_results()
 
-    def write_results(self, study: Study) -> Path:
+    def write_results(self) -> None:
         """
-        Write all rows of all trials into one table, in the order of the study file.
+        Write all rows into one table, in the order of the study file.
 
-        :param study: whose trials they are
-        :return: the file
+        Those of trials that the file names no more come last.
         """
+        named = [self.of(trial) / ROWS for trial in self.study.trials]
+        others = sorted(set(self.path.glob(f"*/{ROWS}")).difference(named))
         table = io.StringIO()
         writer = csv.writer(table, lineterminator="\n")
         writer.writerow(FIELDS)
-        for trial in study.trials:
-            writer.writerows([_cell(row[f]) for f in FIELDS] for row in self.rows(trial))
-        _write(self.path / RESULTS, table.getvalue().encode())
-        return self.path / RESULTS
+        for file in (*named, *others):
+            writer.writerows([_cell(row[field]) for field in FIELDS] for row in _rows(file))
+        write_whole(self.results, table.getvalue().encode())
+
+
+def _rows(file: Path) -> list[dict[str, Any]]:
+    return _parsed(file, json.loads) if file.is_file() else []
+
+
+def _difference(before: Any, after: Any) -> str:
+    """Name the keys in which two recipes differ, as deep as they are mappings."""
+    if not isinstance(before, dict) or not isinstance(after, dict):
+        return f"(it was {before!r})"
+    changed = []
+    for key in {**after, **before}:
+        one, two = before.get(key), after.get(key)
+        if isinstance(one, dict) and isinstance(two, dict) and one != two:
+            changed.append(f"{key}: {_difference(one, two)}")
+        elif one != two:
+            was = f"it was {one!r}" if key in before else "it was not there"
+            changed.append(f"{key} ({was})")
+    return ", ".join(changed)
 
 
 def _cell(value: Any) -> Any:
@@ -219,17 +269,27 @@ def _parsed(file: Path, parse: Callable[[str], Any]) -> Any:
         ) from error
 
 
-def _write(file: Path, content: bytes) -> None:
-    """Write a file that is there whole, or not at all, after a power cut too."""
+def write_whole(file: Path, content: bytes) -> None:
+    """
+    Write a file that is there whole, or not at all, after a power cut too.
+
+    :param file: to be written, in a folder that is made
+    :param content: of it
+    :raises OutputNotWritable: if that cannot be; what was there before is still there
+    """
     aside = file.with_name(f".{file.name}")
     try:
-        with aside.open("wb") as output:
-            output.write(content)
-            output.flush()
-            os.fsync(output.fileno())
-        aside.replace(file)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            with aside.open("wb") as output:
+                output.write(content)
+                output.flush()
+                os.fsync(output.fileno())
+            aside.replace(file)
+        finally:
+            aside.unlink(missing_ok=True)
     except OSError as error:
         raise OutputNotWritable(
-            f"cannot write '{file}': {error.strerror or error}; make room, and type the same "
-            "command again: what was written before is kept"
+            f"cannot write '{file}': {error.strerror or error}; make room, or give another "
+            "folder, and type the command again: what was written before is kept"
         ) from error

@@ -7,6 +7,7 @@ arXiv:2108.13264, by rliable); the bootstrap is seeded, so the same results give
 from __future__ import annotations
 
 import csv
+import io
 import itertools
 import math
 from collections.abc import Callable, Sequence
@@ -19,7 +20,7 @@ import numpy.typing as npt
 from sb3_torcs.errors import StudyError
 from sb3_torcs.ladder import RUNGS
 from sb3_torcs.study_file import slug
-from sb3_torcs.study_folder import RECIPE, RESULTS, ROWS
+from sb3_torcs.study_folder import RECIPE, RESULTS, ROWS, write_whole
 
 __all__ = ["Estimate", "Results", "estimate", "iqm", "read_results", "write_report"]
 
@@ -27,6 +28,7 @@ Array = npt.NDArray[np.float64]
 
 REPETITIONS = 2000  # of the bootstrap
 LEVEL = 0.95
+FEWEST = 3  # seeds that have an interval
 NO_LAP = math.inf  # [s] worse than any, so that whoever has none is not forgotten
 
 
@@ -154,9 +156,10 @@ def write_report(folder: Path, output: Path) -> Path:
     :param folder: of the study
     :param output: folder for the report; it is made
     :return: the report
+    :raises StudyError: if there is nothing to report
+    :raises OutputNotWritable: if the report cannot be written
     """
     trials = read_results(folder)
-    output.mkdir(parents=True, exist_ok=True)
     study = trials[0].train[0]["study"]
     lines = [
         f"# {study}",
@@ -173,7 +176,7 @@ def write_report(folder: Path, output: Path) -> Path:
     ]
     for variant, group in _variants(trials).items():
         picture = output / f"learning-{slug(variant)}.png"
-        _draw(variant, group, picture)
+        write_whole(picture, _drawn(variant, group))
         lines += [f"## Learning: {variant}", "", f"![{variant}]({picture.name})", ""]
     lines += [
         "Thin: every seed; bold: the interquartile mean of the seeds. A seed without a lap counts "
@@ -182,7 +185,7 @@ def write_report(folder: Path, output: Path) -> Path:
         "",
     ]
     report = output / "report.md"
-    report.write_text("\n".join(lines), encoding="utf-8")
+    write_whole(report, "\n".join(lines).encode())
     return report
 
 
@@ -224,7 +227,7 @@ def _summary(trials: Sequence[Results]) -> list[str]:
         laps = [row["best_flying_lap_s"] or NO_LAP for row in homes if row["completes"]]
         laps += [NO_LAP] * (len(homes) - len(laps))
         firsts = [_first_lap(trial) for trial in group]
-        middle = estimate(np.array(laps)[:, None]) if laps else None
+        middle = estimate(np.array(laps)[:, None]) if len(laps) >= FEWEST else None
         rows.append(
             [
                 variant,
@@ -360,8 +363,8 @@ def _curves(group: Sequence[Results]) -> dict[str, Array]:
     }
 
 
-def _draw(variant: str, group: Sequence[Results], path: Path) -> None:
-    """Draw distance, lap time and success over decisions."""
+def _drawn(variant: str, group: Sequence[Results]) -> bytes:
+    """Draw distance, lap time and success over decisions, as PNG."""
     from matplotlib.figure import Figure
 
     curves = _curves(group)
@@ -393,7 +396,9 @@ def _draw(variant: str, group: Sequence[Results], path: Path) -> None:
         panel.set_xlim(0.0, 1.02 * decisions[-1])
         panel.grid(alpha=0.3)
     figure.suptitle(f"{variant}: {len(group)} seeds", fontsize=11)
-    figure.savefig(path, dpi=100)
+    picture = io.BytesIO()
+    figure.savefig(picture, dpi=100)
+    return picture.getvalue()
 
 
 def _band(panel: Any, decisions: Array, figure: Estimate) -> None:

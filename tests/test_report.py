@@ -94,6 +94,12 @@ def test_a_study_that_still_runs_can_be_reported(tmp_path):
     assert [len(trial.train) for trial in read_results(tmp_path / "study")] == [3, 1]
 
 
+def test_few_seeds_have_no_interval(tmp_path):
+    rows = [row(seed, phase) for seed in (0, 1) for phase in ("train", "final")]
+    (summary,) = lines_of(write_report(written(tmp_path / "study", rows), tmp_path), "| base |")
+    assert summary.startswith("| base | 2 of 2 | 83.500 | 83.500 | - |")
+
+
 def test_who_was_never_evaluated_is_named(study, tmp_path):
     for name, rows in (("base-seed0", True), ("base-seed3", False), ("base-seed4", False)):
         (study / name).mkdir()
@@ -128,6 +134,16 @@ def test_what_is_no_study_is_told(tmp_path, capsys):
     assert "cannot be read as results (IsADirectoryError" in capsys.readouterr().err
     assert main(["report", str(written(tmp_path / "empty", []))]) == 2
     assert "no agent was evaluated yet" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("taken", ["out", "out/report.md"])
+def test_a_report_that_cannot_be_written_is_told(study, tmp_path, capsys, taken):
+    if taken == "out":
+        (tmp_path / "out").touch()
+    else:
+        (tmp_path / taken).mkdir(parents=True)
+    assert main(["report", str(study), "--output", str(tmp_path / "out")]) == 2
+    assert f"cannot write '{tmp_path}/out/" in capsys.readouterr().err
 
 
 def test_the_interquartile_mean_is_rliables():

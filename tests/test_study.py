@@ -17,8 +17,8 @@ import yaml
 from sb3_torcs.cli import main
 from sb3_torcs.cli.study import Board
 from sb3_torcs.errors import RayUnavailable, StudyError
-from sb3_torcs.study import Keeper, run_study, run_trial
-from sb3_torcs.study_file import read_study
+from sb3_torcs.study import MARK, SESSION, run_study, run_trial
+from sb3_torcs.study_file import FIELDS, read_study
 from sb3_torcs.study_folder import StudyFolder
 
 CLOCKS = ("wall_s", "cpu_s")
@@ -51,10 +51,10 @@ def undisturbed(tmp_path_factory):
     """The same study without Ray: one trial after the other, in this process."""
     folder = tmp_path_factory.mktemp("undisturbed")
     study = read_study(study_file(folder))
-    keeper = Keeper(study, StudyFolder(folder / "out"))
-    keeper.folder.begin(study)
+    place = StudyFolder(folder / "out", study)
+    place.begin()
     for trial in study.trials:
-        run_trial(trial, keeper, lambda row: None)
+        run_trial(trial, place, lambda row: None)
     return results(folder / "out")
 
 
@@ -68,13 +68,19 @@ def test_the_table_has_every_evaluation_of_every_trial(undisturbed):
         assert len({row["return"] for row in rows[:-1]}) == 8  # each drives what was learned
 
 
+def evaluated(trial):
+    """A row of its first evaluation."""
+    row = dict.fromkeys(FIELDS, 0)
+    return {**row, "variant": trial.variant, "seed": trial.seed, "phase": "train", "decisions": 240}
+
+
 @pytest.fixture
 def begun(tmp_path):
     """A study of two trials, of which the first has one evaluation."""
     study = read_study(study_file(tmp_path))
-    place = StudyFolder(tmp_path / "out")
-    place.begin(study)
-    place.put(study.trials[0], {"state.json": b"1"}, [{"phase": "train", "decisions": 240}])
+    place = StudyFolder(tmp_path / "out", study)
+    place.begin()
+    place.put(study.trials[0], {"state.json": b"1"}, [evaluated(study.trials[0])])
     return study, place
 
 
@@ -94,7 +100,7 @@ def test_the_table_shows_how_far_everybody_is_and_the_best_so_far(begun, monkeyp
     assert board.errors() == {"small-nets-seed1": "why"}
 
 
-def test_a_full_disk_is_told_and_takes_nothing_away(begun, monkeypatch, capsys):
+def test_a_full_disk_is_told_and_leaves_everything_as_it_was(begun, tmp_path, monkeypatch, capsys):
     study, place = begun
     before = place.rows(study.trials[0])
 
@@ -107,7 +113,10 @@ def test_a_full_disk_is_told_and_takes_nothing_away(begun, monkeypatch, capsys):
     assert place.rows(study.trials[0]) == before
     assert (place.checkpoint(study.trials[0]) / "state.json").read_bytes() == b"1"
     assert main(["study", str(study.path), "--folder", str(place.path.parent / "new")]) == 2
-    assert "make room, and type the same command again" in capsys.readouterr().err
+    assert (
+        "make room, or give another folder, and type the command again" in capsys.readouterr().err
+    )
+    assert not [file for file in tmp_path.rglob(".*") if file.name != ".lock"]
 
 
 @pytest.mark.parametrize("name", ["rows.json", "recipe.yml"])
@@ -140,16 +149,39 @@ def test_a_wrong_value_is_told_before_anything_is_trained(tmp_path, capsys, chan
     assert not list((tmp_path / "out").rglob("recipe.yml"))  # or the corrected file were another
 
 
-def test_another_recipe_is_told_by_what_is_different(begun, tmp_path):
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"eval_interval": 100}, r"another eval_interval \(it was 240\); give another"),
+        (
+            {"variants": {"small nets": {"policy_kwargs": {"net_arch": [8, 8]}}}},
+            r"policy_kwargs: .*net_arch \(it was \[16, 16\]\)",
+        ),
+        ({"variants": {"small nets": {"tau": 0.1}}}, r"entry: .*buffer_size \(it was 1000\)"),
+        ({"name": "other"}, "holds the study 'tiny'; give another --folder for 'other'"),
+        ({"name": "other", "variants": {"new": {}}}, "holds the study 'tiny'"),
+    ],
+)
+def test_another_recipe_is_told_by_what_is_different(begun, tmp_path, changes, told):
     _, place = begun
-    with pytest.raises(StudyError, match="was begun with another eval_interval; give another"):
-        place.begin(read_study(study_file(tmp_path, eval_interval=100)))
+    with pytest.raises(StudyError, match=told):
+        StudyFolder(place.path, read_study(study_file(tmp_path, **changes))).begin()
+
+
+def test_what_the_file_names_no_more_stays_in_the_table(begun, tmp_path):
+    """Fewer seeds, or another variant: nothing that was measured gets lost."""
+    study, place = begun
+    place.put(study.trials[1], {"state.json": b"1"}, [evaluated(study.trials[1])])
+    fewer = StudyFolder(place.path, read_study(study_file(tmp_path, seeds=[1, 2])))
+    fewer.begin()
+    fewer.write_results()
+    assert [row["seed"] for row in results(place.path)] == ["1", "0"]
 
 
 def test_a_worker_that_is_behind_is_not_needed(begun):
     study, place = begun
     with pytest.raises(StudyError, match="small-nets-seed0 has come farther elsewhere"):
-        place.put(study.trials[0], {}, [{"phase": "train", "decisions": 240}])
+        place.put(study.trials[0], {}, [evaluated(study.trials[0])])
 
 
 def test_two_runs_do_not_share_a_folder(begun, capsys):
@@ -166,13 +198,19 @@ def test_where_ray_does_not_start_it_is_said_and_nothing_else_is_removed(
     study, place = begun
     far = tmp_path / ("far" * 20)
     far.mkdir()
-    (place.path / ".session").write_text(str(tmp_path))
+    (place.path / SESSION).write_text(str(tmp_path))
     monkeypatch.setattr(tempfile, "tempdir", str(far))
     with pytest.raises(RayUnavailable, match=r"Ray does not start in .* TMPDIR=/tmp"):
         run_study(study, place.path, jobs=1)
     assert study.path.is_file()
     assert not list(far.iterdir())
-    assert not (place.path / ".session").exists()
+    assert not (place.path / SESSION).exists()
+
+
+def test_an_address_for_clients_outside_of_a_cluster_is_refused(begun):
+    study, place = begun
+    with pytest.raises(RayUnavailable, match=r"type the command on one of its machines"):
+        run_study(study, place.path, address="ray://somewhere:10001")
 
 
 @pytest.fixture
@@ -214,7 +252,11 @@ def test_a_lost_machine_costs_one_interval_at_most_and_changes_no_result(
 
 
 @pytest.mark.slow
-def test_a_killed_study_goes_on_with_the_same_command(undisturbed, tmp_path, capsys):
+def test_a_killed_study_goes_on_with_the_same_command_and_leaves_nothing(
+    undisturbed, tmp_path, short_folder, monkeypatch, capsys
+):
+    monkeypatch.setenv("TMPDIR", short_folder)
+    monkeypatch.setattr(tempfile, "tempdir", short_folder)
     words = ["study", str(study_file(tmp_path)), "--folder", str(tmp_path / "out"), "--jobs", "2"]
     command = [sys.executable, "-m", "sb3_torcs.cli", *words]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -225,7 +267,7 @@ def test_a_killed_study_goes_on_with_the_same_command(undisturbed, tmp_path, cap
     finally:
         process.send_signal(signal.SIGKILL)
         process.wait()
-    session = Path((tmp_path / "out" / ".session").read_text())
+    session = Path((tmp_path / "out" / SESSION).read_text())
     assert session.is_dir()
     before = results(tmp_path / "out")
     assert len(before) < len(undisturbed)
@@ -235,12 +277,24 @@ def test_a_killed_study_goes_on_with_the_same_command(undisturbed, tmp_path, cap
     said = json.loads(capsys.readouterr().out)
     assert {(line["seed"], line["state"]) for line in said["trials"]} == {(0, "done"), (1, "done")}
     assert results(tmp_path / "out") == undisturbed
-    assert not session.exists()
-    assert not (tmp_path / "out" / ".session").exists()
+    assert os.listdir(short_folder) == ["ray"]
+    assert (
+        str(session)
+        not in subprocess.run(
+            ["ps", "-eo", "args"], capture_output=True, text=True, check=True
+        ).stdout
+    )
+    assert not (tmp_path / "out" / SESSION).exists()
     assert not list((tmp_path / "out").rglob("*checkpoint-*"))
 
-    assert main(words) == 0  # there is nothing left to do, and Ray is not started
+    # There is nothing left to do, and Ray is not started; killed after the last result, it has left
+    # its temporary files.
+    session.mkdir()
+    (session / MARK).touch()
+    (tmp_path / "out" / SESSION).write_text(str(session))
+    assert main(words) == 0
     assert "2 of 2 agents" in capsys.readouterr().out
+    assert not session.exists()
 
 
 @pytest.mark.slow
@@ -258,7 +312,7 @@ def test_ctrl_c_keeps_everything_and_says_how_to_go_on(tmp_path):
     assert "0 of 2 agents trained and measured" in out
     assert f"go on with:\n  sb3-torcs {' '.join(words)}" in out
     assert "Traceback" not in err
-    assert not (tmp_path / "out" / ".session").exists()
+    assert not (tmp_path / "out" / SESSION).exists()
 
 
 def seeds_so_far(folder):

@@ -6,8 +6,6 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from sb3_torcs.cli.common import writable_folder
-
 __all__ = ["add_parser", "run"]
 
 
@@ -31,9 +29,8 @@ def run(args: argparse.Namespace) -> int:
     :param args: from the command line
     :return: the exit status
     """
-    from sb3_torcs.study_report import read_results, write_report
+    from sb3_torcs.study_report import write_report
 
     folder = Path(args.folder).expanduser()
-    read_results(folder)  # before anything is made
-    print(write_report(folder, writable_folder(args.output or folder)))
+    print(write_report(folder, Path(args.output).expanduser() if args.output else folder))
     return 0

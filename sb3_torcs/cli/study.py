@@ -65,17 +65,18 @@ def run(args: argparse.Namespace) -> int:
     interrupted = contextlib.suppress(KeyboardInterrupt)  # Tune swallows it, others do not
     with interrupted, quiet_output(args.json), board.shown():
         run_study(study, folder, jobs=args.jobs, address=args.address, progress=board.update)
-    place = StudyFolder(folder)
-    results = place.write_results(study)
+    place = StudyFolder(folder, study)
     left = [trial for trial in study.trials if not place.ended(trial)]
     failed = board.errors()
     if args.json:
-        print_json({"study": study.name, "results": str(results), "trials": board.as_json()})
+        print_json({"study": study.name, "results": str(place.results), "trials": board.as_json()})
     else:
         for name, error in failed.items():
             print(f"{name} failed: {error}")
         ended = len(study.trials) - len(left)
-        print(f"{ended} of {len(study.trials)} agents trained and measured; results: {results}")
+        print(f"{ended} of {len(study.trials)} agents trained and measured")
+        if place.results.is_file():
+            print(f"results: {place.results}")
         print("go on with:" if left else "see them:")
         print(f"  {_command(args) if left else shlex.join(['sb3-torcs', 'report', str(folder)])}")
     return INTERRUPTED if len(left) > len(failed) else int(bool(failed))
@@ -99,7 +100,9 @@ class Board:
 
     def __init__(self, study: Study) -> None:
         self._study = study
-        self._rows: dict[str, dict[str, Any]] = {trial.name: {} for trial in study.trials}
+        self._rows: dict[str, dict[str, Any]] = {
+            trial.name: {"state": "waits", "decisions": 0} for trial in study.trials
+        }
 
     def update(self, trial: Trial, row: dict[str, Any]) -> None:
         """
@@ -150,10 +153,10 @@ class Board:
             table.add_row(
                 trial.variant,
                 str(trial.seed),
-                f"{row.get('decisions', 0)} / {trial.budget}",
+                f"{row['decisions']} / {trial.budget}",
                 str(row.get("laps", "")),
                 f"{lap:.3f}" if lap else "",
                 {None: "", True: "yes", False: "no"}[completes],
-                row.get("state", "waits"),
+                row["state"],
             )
         return table
