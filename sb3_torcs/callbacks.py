@@ -35,6 +35,7 @@ from sb3_torcs.noise import (
     checked_dt,
     noises_of,
 )
+from sb3_torcs.sensors import look_both_ways
 
 __all__ = [
     "DrivingMetricsCallback",
@@ -370,7 +371,7 @@ class MirrorCallback(_WhileLearning):
             )
         _require(self.training_env, "range_finder_angles")
         for angles in self.training_env.get_attr("range_finder_angles"):
-            if not np.allclose(angles, -angles[::-1]):
+            if not look_both_ways(angles):
                 raise InvalidOption(
                     f"{type(self).__name__} needs range finders that look equally far to both "
                     f"sides, not {np.degrees(angles).round(3).tolist()}; pass 'scr' or 'narrow'"

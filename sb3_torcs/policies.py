@@ -94,8 +94,7 @@ class SplitHeadPolicy(TD3Policy):
         bias = (0.0,) * len(heads) if head_bias is None else tuple(head_bias)
         _check_heads(heads, bias, get_action_dim(action_space))
         _check_net_arch(net_arch)
-        if symmetric:
-            _check_mirrored(observation_space, action_space)
+        _check_symmetric(symmetric, observation_space, action_space)
         self.own_kwargs: dict[str, Any] = {
             "heads": tuple(heads),
             "head_bias": bias,
@@ -231,9 +230,13 @@ def _check_net_arch(net_arch: Any) -> None:
         )
 
 
-def _check_mirrored(observation_space: spaces.Space, action_space: spaces.Space) -> None:
+def _check_symmetric(
+    symmetric: Any, observation_space: spaces.Space, action_space: spaces.Space
+) -> None:
+    if not isinstance(symmetric, bool):
+        raise InvalidOption(f"symmetric={symmetric!r}: pass True or False")
     known = (OBSERVATION_SIZE,), (len(ACTION_HIGH),)
-    if (observation_space.shape, action_space.shape) != known:
+    if symmetric and (observation_space.shape, action_space.shape) != known:
         raise InvalidOption(
             "symmetric=True mirrors the sensors and actuators of Torcs-v0 and TorcsLite-v0, shapes "
             f"{known[0]} and {known[1]}, not {observation_space} and {action_space}; pass "

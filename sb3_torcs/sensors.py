@@ -28,6 +28,7 @@ __all__ = [
     "Sensor",
     "encode",
     "feature_slices",
+    "look_both_ways",
     "range_finder_angles",
     "sensor_table",
 ]
@@ -195,3 +196,13 @@ def range_finder_angles(choice: str | Sequence[float]) -> FloatArray:
     if angles.shape != (19,) or not np.all(np.abs(angles) <= 90.0):
         raise InvalidOption(f"range_finders has shape {angles.shape}: {choice!r}; {allowed}")
     return np.radians(angles)
+
+
+def look_both_ways(angles: FloatArray) -> bool:
+    """
+    Say whether range finders look equally far to both sides, so that there is a mirror image.
+
+    :param angles: (19,) [rad]
+    :return: whether they do
+    """
+    return bool(np.allclose(angles, -angles[::-1]))

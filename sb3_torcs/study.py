@@ -184,23 +184,23 @@ def _ray(place: StudyFolder, jobs: int | None, address: str | None) -> Iterator[
     else:
         options["address"] = address
     try:
-        (scratch / MARK).touch()
-        session.write_text(str(scratch), encoding="utf-8")
-        ray.init(**options)
-    except (OSError, RuntimeError, ValueError) as error:
-        _remove_scratch(session)
-        raise RayUnavailable(
-            f"Ray does not start in '{scratch}' ({error}); is there room, and the path short? "
-            "Otherwise choose another place: TMPDIR=/tmp"
-            if address is None
-            else f"no Ray cluster at '{address}' ({error}); start one with `ray start --head` and "
-            "give the address that it prints, or leave --address out"
-        ) from error
-    try:
+        try:
+            (scratch / MARK).touch()
+            session.write_text(str(scratch), encoding="utf-8")
+            ray.init(**options)
+        except (OSError, RuntimeError, ValueError) as error:
+            raise RayUnavailable(
+                f"Ray does not start in '{scratch}' ({error}); is there room, and the path short? "
+                "Otherwise choose another place: TMPDIR=/tmp"
+                if address is None
+                else f"no Ray cluster at '{address}' ({error}); start one with `ray start --head` "
+                "and give the address that it prints, or leave --address out"
+            ) from error
         yield scratch
     finally:
         ray.shutdown()
-        _remove_scratch(session)
+        shutil.rmtree(scratch, ignore_errors=True)
+        session.unlink(missing_ok=True)
 
 
 def _remove_scratch(session: Path) -> None:

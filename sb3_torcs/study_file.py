@@ -31,6 +31,7 @@ KEYS = (*REQUIRED, *SOURCE, "variants", "final_tracks")
 WRAPPERS = ("env_wrapper", "vec_env_wrapper", "frame_stack")
 ROAD = "road"
 SEEDS = 2**32  # that NumPy takes
+MANY = 10_000  # a larger number of seeds is one seed, without its brackets
 
 FIELDS = (
     "study", "variant", "seed", "phase", "decisions", "episodes", "wall_s", "cpu_s", "track",
@@ -196,6 +197,8 @@ def _read(file: Path) -> dict[str, Any]:
 
 def _seeds(value: Any, file: Path) -> list[int]:
     """Read ``5``, which is 0 to 4, or a list."""
+    if type(value) is int and value > MANY:
+        raise StudyError(f"{file}: seeds is {value}, too many; one seed is a list: [{value}]")
     seeds = list(range(value)) if type(value) is int else value
     if (
         not isinstance(seeds, list)

@@ -18,8 +18,9 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import yaml
 
-from sb3_torcs.car import is_count
+from sb3_torcs.car import is_count, is_number
 from sb3_torcs.errors import ZooConfigError, near_miss
+from sb3_torcs.sensors import look_both_ways, range_finder_angles
 
 __all__ = [
     "TIME_LIMIT",
@@ -55,6 +56,12 @@ TIME_LIMIT = "max_episode_steps"
 """What ``gym.make`` itself takes of an entry's ``env_kwargs``: it holds for training episodes."""
 
 REQUIRED = ("n_timesteps", "policy")
+
+SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf", "delta_std")
+"""Values that may be words, e.g. ``lin_0.001``."""
+
+COUNTS = ("n_envs", "batch_size", "buffer_size", "n_steps", "n_epochs", "policy_delay")
+SHARES = ("gamma", "tau", "gae_lambda")
 
 OURS = ("Torcs-v0", "TorcsLite-v0")
 
@@ -173,6 +180,26 @@ def check_entry(entry: Entry, algo: str, env_id: str, place: Place) -> None:
             _check_call(f"{key} {path}", _imported(path, key, place), arguments, place)
     _check_env_kwargs(entry.get("env_kwargs"), env_id, place)
     _check_wrappers(entry, place)
+    _check_symmetric(entry, place)
+
+
+def _check_symmetric(entry: Entry, place: Place) -> None:
+    """Make sure that a policy that drives its mirror image, too, sees something that has one."""
+    policy_kwargs = entry.get("policy_kwargs")
+    if not isinstance(policy_kwargs, Mapping) or not policy_kwargs.get("symmetric"):
+        return
+    if entry.get("normalize"):
+        raise ZooConfigError(
+            f"{place}: policy_kwargs has symmetric, which needs observations whose middle is 0, "
+            "and normalize moves it; take one of them away: the observations are scaled already"
+        )
+    env_kwargs = entry.get("env_kwargs")
+    own = env_kwargs.get("range_finders", "scr") if isinstance(env_kwargs, Mapping) else "scr"
+    if not look_both_ways(range_finder_angles(own)):
+        raise ZooConfigError(
+            f"{place}: policy_kwargs has symmetric, which needs range finders that look equally "
+            "far to both sides; take it away, or set range_finders to scr or narrow"
+        )
 
 
 def _check_env_kwargs(env_kwargs: Any, env_id: str, place: Place) -> None:
@@ -245,7 +272,7 @@ def decisions(entry: Entry) -> int:
 
 
 def _check_numbers(entry: Entry, place: Place) -> None:
-    """Check the values that the zoo turns into numbers only when the training begins."""
+    """Check numbers that are read, or used, only when the training has begun."""
     steps = entry["n_timesteps"]
     try:
         good = not isinstance(steps, bool) and 1.0 <= float(steps) < float("inf")
@@ -253,11 +280,23 @@ def _check_numbers(entry: Entry, place: Place) -> None:
         good = False
     if not good:
         raise ZooConfigError(f"{place}: n_timesteps is {steps!r}; expected a number >= 1")
-    for key in ("learning_rate", "clip_range", "clip_range_vf", "delta_std"):
+    for key in SCHEDULES:
         value = entry.get(key)
-        if isinstance(value, str) and not re.fullmatch(r"(lin_)?[\d.]+(e[+-]?\d+)?", value):
+        word = isinstance(value, str) and re.fullmatch(r"(lin_)?[\d.]+(e[+-]?\d+)?", value)
+        if value is not None and not word and not is_number(value):
             raise ZooConfigError(
                 f"{place}: {key} is {value!r}; expected a number, or lin_NUMBER to fall to 0"
+            )
+    for key in COUNTS:
+        if not is_count(entry.get(key, 1)):
+            raise ZooConfigError(
+                f"{place}: {key} is {entry[key]!r}; expected a whole number >= 1, e.g. 64"
+            )
+    for key in SHARES:
+        value = entry.get(key, 1.0)
+        if not (is_number(value) and 0.0 <= value <= 1.0):
+            raise ZooConfigError(
+                f"{place}: {key} is {value!r}; expected a number from 0 to 1, e.g. 0.005"
             )
 
 

@@ -163,6 +163,7 @@ def test_other_numbers_of_actions_take_other_heads():
     ({"net_arch": {"pi": [8]}}, "the critic has two layer sizes"),
     ({"critic_lr_scale": 0.0}, "pass a number above 0"),
     ({"ema_decay": 1.0}, "pass a share in"),
+    ({"symmetric": "no"}, "pass True or False"),
     ({"init_std": -1.0}, "pass a number above 0"),
 ])  # fmt: skip
 def test_a_wrong_option_is_named_with_what_is_allowed(kwargs, message):

@@ -36,6 +36,7 @@ def test_the_shipped_studies_can_be_run(path):
         ({"seeds": [-1]}, "a list of different whole numbers"),
         ({"seeds": [2**32]}, "whole numbers from 0 to 2**32 - 1"),
         ({"seeds": True}, "seeds is True"),
+        ({"seeds": 20240101}, "too many; one seed is a list: [20240101]"),
         ({"seeds": None}, "key 'seeds' is missing"),
         ({"sedes": 3}, "unknown key 'sedes'; did you mean 'seeds'?"),
         ({"eval_interval": 0}, "eval_interval is 0; expected decisions, e.g. 5000"),

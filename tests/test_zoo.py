@@ -211,3 +211,28 @@ def test_a_schedule_must_be_one_that_the_zoo_reads(tmp_path):
     assert said == "learning_rate is 'abc'; expected a number, or lin_NUMBER to fall to 0"
     accepted({"learning_rate": "lin_1e-3"})
     accepted({"learning_rate": "0.001"})
+
+
+@pytest.mark.parametrize(("key", "value", "expected"), [
+    ("learning_rate", float("nan"), "a number, or lin_NUMBER to fall to 0"),
+    ("batch_size", 1.5, "a whole number >= 1, e.g. 64"),
+    ("n_envs", 0, "a whole number >= 1, e.g. 64"),
+    ("buffer_size", "1e5", "a whole number >= 1, e.g. 64"),
+    ("gamma", "x", "a number from 0 to 1, e.g. 0.005"),
+    ("gamma", float("nan"), "a number from 0 to 1, e.g. 0.005"),
+    ("tau", "1e-3", "a number from 0 to 1, e.g. 0.005"),
+])  # fmt: skip
+def test_a_number_that_none_can_train_with_is_told(tmp_path, key, value, expected):
+    assert complaint(tmp_path, {key: value}) == f"{key} is {value!r}; expected {expected}"
+
+
+def test_a_symmetric_policy_needs_observations_that_have_a_mirror_image(tmp_path):
+    symmetric = {
+        "policy": "sb3_torcs.policies.SplitHeadPolicy", "policy_kwargs": {"symmetric": True}
+    }  # fmt: skip
+    one_sided = {"env_kwargs": {"range_finders": list(range(0, 38, 2))}}
+    accepted(symmetric)
+    accepted({**symmetric, "env_kwargs": {"range_finders": "narrow"}, "normalize": False})
+    accepted({**symmetric, **one_sided, "policy_kwargs": {"symmetric": False}})
+    assert "whose middle is 0" in complaint(tmp_path, {**symmetric, "normalize": True})
+    assert "set range_finders to scr or narrow" in complaint(tmp_path, {**symmetric, **one_sided})
