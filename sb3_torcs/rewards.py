@@ -151,6 +151,7 @@ class Reward:
         seconds = after.time - before.time
         terms = {}  # filled in a loop: a comprehension is one more call per decision
         for name, term, weight in self._terms:
-            terms[name] = weight * seconds * term(before, after, controls)
+            # A car that is lost stays where and when it was: no time, no rate.
+            terms[name] = weight * seconds * term(before, after, controls) if seconds else 0.0
         terms["crash"] = self._crash if end in CRASHES else 0.0
         return terms

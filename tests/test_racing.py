@@ -11,6 +11,7 @@ from conftest import ScriptedBackend
 from sb3_torcs.car import Controls, Start
 from sb3_torcs.envs.racing import RacingEnv
 from sb3_torcs.errors import CarLost, EnvClosed, InvalidAction, InvalidOption
+from sb3_torcs.rewards import TERMS
 
 GAS = np.array([0.0, 1.0, 0.0], np.float32)
 
@@ -77,14 +78,15 @@ def test_lap_time_is_in_info_only_when_a_lap_was_just_completed(oval):
     assert info["best_lap_time"] == 70.5
 
 
-def test_a_car_that_is_lost_ends_the_episode_only(oval):
+@pytest.mark.parametrize("reward", ["progress", dict.fromkeys([*TERMS, "crash"], -1.0)])
+def test_a_car_that_is_lost_ends_the_episode_only(oval, reward):
     """Where the decision before has left it, as a crash; the next episode is like any other."""
 
     class Losing(ScriptedBackend):
         def step(self, controls, ticks):
             raise CarLost("the car is nowhere")
 
-    env = RacingEnv(Losing(oval), reward="progress")
+    env = RacingEnv(Losing(oval), reward=reward)
     before, _ = env.reset(seed=0)
     observation, _, terminated, truncated, info = env.step(GAS)
     assert observation.tolist() == before.tolist()
