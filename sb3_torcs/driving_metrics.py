@@ -80,6 +80,7 @@ def callbacks_in(callback: BaseCallback | None) -> Iterator[BaseCallback]:
 class DrivenLine(NamedTuple):
     """Where a car went, one row per decision."""
 
+    track: Track
     x: npt.NDArray[np.float64]  # (n,) [m] in the track's frame
     y: npt.NDArray[np.float64]  # (n,) [m]
     speed: npt.NDArray[np.float64]  # (n,) [m/s] along the car
@@ -99,6 +100,7 @@ def drive_lap(model: BaseAlgorithm, env: VecEnv, limit: int = 1500) -> DrivenLin
     cars: list[CarState] = []
     lap_time = None
     observation: Any = env.reset()
+    (track,) = env.get_attr("track", 0)  # when the lap ends the next one may be on another
     for _ in range(limit):
         action, _ = model.predict(observation, deterministic=True)
         observation, _, dones, infos = env.step(action)
@@ -107,15 +109,14 @@ def drive_lap(model: BaseAlgorithm, env: VecEnv, limit: int = 1500) -> DrivenLin
         if lap_time is not None or dones[0]:
             break
     x, y, speed = np.array([(car.x, car.y, car.speed_x) for car in cars]).T
-    return DrivenLine(x, y, speed, cars[-1].distance_raced, lap_time)
+    return DrivenLine(track, x, y, speed, cars[-1].distance_raced, lap_time)
 
 
-def line_image(track: Track, line: DrivenLine) -> npt.NDArray[np.uint8]:
+def line_image(line: DrivenLine) -> npt.NDArray[np.uint8]:
     """
     Draw a driven line, coloured by speed, over the track's outline.
 
-    :param track: the road
-    :param line: what was driven on it
+    :param line: what was driven
     :return: (height, width, 3)
     """
     # Graphics load only when there is something to draw.
@@ -125,7 +126,7 @@ def line_image(track: Track, line: DrivenLine) -> npt.NDArray[np.uint8]:
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "line.png"
-        plot_track(track, path, line=np.column_stack([line.x, line.y]), speed=line.speed)
+        plot_track(line.track, path, line=np.column_stack([line.x, line.y]), speed=line.speed)
         pixels = imread(path)[..., :3]  # in [0, 1]
     return np.round(255.0 * pixels).astype(np.uint8)
 
@@ -352,7 +353,7 @@ class DrivingMetricsCallback(BaseCallback):
             best = self.best_evaluation_lap_time or math.inf
             self.best_evaluation_lap_time = min(line.lap_time, best)
             self.logger.record("driving/evaluation_lap_time", line.lap_time)
-        picture = line_image(env.get_attr("track", 0)[0], line)
+        picture = line_image(line)
         self.logger.record("driving/line", Image(picture, "HWC"), exclude=TEXT_FORMATS)
         # At once, as EvalCallback does: the next row may be as far away as the next evaluation.
         self.logger.dump(self.num_timesteps)

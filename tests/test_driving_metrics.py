@@ -227,7 +227,7 @@ def test_the_scale_of_the_noise_is_logged(oval):
 @pytest.mark.parametrize("metrics_first", [True, False])
 def test_a_line_is_drawn_once_after_each_evaluation(metrics_first, monkeypatch):
     """Also after the very last one, wherever the callback stands in the list."""
-    monkeypatch.setattr("sb3_torcs.driving_metrics.line_image", lambda track, line: line)
+    monkeypatch.setattr("sb3_torcs.driving_metrics.line_image", lambda line: line)
     model = DDPG("MlpPolicy", lite(), learning_starts=1000, **small())
     pictures = Pictures()
     model.set_logger(Logger(None, [pictures]))
@@ -263,6 +263,21 @@ def test_a_driven_lap_ends_with_the_lap(oval):
     assert line.lap_time == 60.0
 
 
+def test_a_driven_line_is_on_the_track_that_it_was_driven_on():
+    """The environment is on another one as soon as the lap has ended."""
+
+    def make():
+        return gym.make("TorcsLite-v0", track=["aalborg", "alpine-1"], max_episode_steps=3)
+
+    alone, env = make(), DummyVecEnv([make])
+    drawn = [alone.reset(seed=0 if first else None) and alone.unwrapped.track.name
+             for first in (True, *[False] * 11)]  # fmt: skip
+    env.seed(0)
+    lines = [drive_lap(Follows(), env) for _ in range(6)]
+    assert [len(line.x) for line in lines] == [3] * 6
+    assert [line.track.name for line in lines] == drawn[::2] != drawn[1::2]
+
+
 def test_a_driven_lap_that_never_ends_is_given_up(oval):
     env = DummyVecEnv([lambda: RacingEnv(ScriptedBackend(oval))])
     line = drive_lap(Follows(), env, limit=5)
@@ -273,12 +288,12 @@ def test_a_driven_lap_that_never_ends_is_given_up(oval):
 def test_the_picture_shows_the_line_in_colours(oval):
     pytest.importorskip("sb3_torcs.track_plot")
     turn = np.linspace(0.0, 1.0, 50)
-    fast = DrivenLine(300.0 * turn, 0.0 * turn, 20.0 + 30.0 * turn, 300.0, None)
-    picture = line_image(oval, fast)
+    fast = DrivenLine(oval, 300.0 * turn, 0.0 * turn, 20.0 + 30.0 * turn, 300.0, None)
+    picture = line_image(fast)
     assert picture.dtype == np.uint8
     assert picture.ndim == 3
     assert picture.shape[2] == 3
-    assert not np.array_equal(picture, line_image(oval, fast._replace(speed=fast.speed[::-1])))
+    assert not np.array_equal(picture, line_image(fast._replace(speed=fast.speed[::-1])))
 
 
 def test_callbacks_are_found_wherever_they_hang():
