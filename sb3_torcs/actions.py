@@ -62,7 +62,10 @@ def controls_from_action(action: npt.NDArray[np.floating]) -> Controls:
 
 def _three_numbers(action: Any) -> list[float]:
     """Read an action that is no array of floats: a list, whole numbers, or a mistake."""
-    shape = np.shape(action)
+    try:
+        shape: object = np.shape(action)
+    except ValueError:  # lists of different lengths
+        shape = "of its own"
     if shape != (3,):
         raise InvalidAction(
             f"action has shape {shape}, expected (3,): steering, throttle, brake; "

@@ -21,6 +21,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
+from sb3_torcs.car import checked_start, checked_start_speed, is_count, is_number
 from sb3_torcs.driving_metrics import DrivingMetricsCallback, callbacks_in
 from sb3_torcs.errors import InvalidOption, near_miss
 from sb3_torcs.mirror import mirror_half
@@ -35,6 +36,7 @@ from sb3_torcs.noise import (
     checked_dt,
     noises_of,
 )
+from sb3_torcs.rewards import Reward
 from sb3_torcs.sensors import look_both_ways
 
 __all__ = [
@@ -81,9 +83,9 @@ class NoiseCallback(BaseCallback):
         verbose: int = 0,
     ) -> None:
         super().__init__(verbose)
-        if kind not in KINDS:
+        if not isinstance(kind, str) or kind not in KINDS:
             raise InvalidOption(
-                f"kind is {kind!r}{near_miss(kind, KINDS)} pass 'set_point' or 'ou'"
+                f"kind is {kind!r}{near_miss(str(kind), KINDS)} pass 'set_point' or 'ou'"
             )
         self.kind = kind
         self.parameters = tuple(OUParameters.of(value) for value in (steering, throttle, brake))
@@ -164,9 +166,10 @@ class NoiseDecayCallback(_NoiseUser):
 
     def __init__(self, *, frames: int = 100_000, floor: float = 0.0, verbose: int = 0) -> None:
         super().__init__(verbose)
-        if frames < 1 or not 0.0 <= floor <= 1.0:
+        if not is_count(frames) or not is_number(floor) or not 0.0 <= floor <= 1.0:
             raise InvalidOption(
-                f"frames={frames!r}, floor={floor!r}: pass at least 1 frame and a floor in [0, 1]"
+                f"frames={frames!r}, floor={floor!r}: pass a whole number of at least 1 frame, and "
+                "a floor in [0, 1]"
             )
         self.frames = frames
         self.floor = floor
@@ -205,7 +208,7 @@ class StochasticBrakeCallback(_NoiseUser):
         verbose: int = 0,
     ) -> None:
         super().__init__(verbose)
-        if not 0.0 <= probability <= 1.0:
+        if not is_number(probability) or not 0.0 <= probability <= 1.0:
             raise InvalidOption(f"probability={probability!r}: pass a share of the steps in [0, 1]")
         self.brake = StochasticBrake(probability, OUParameters.of((mu, theta, sigma)))
 
@@ -242,6 +245,7 @@ class RewardCallback(_SwitchUser):
         self, *, reward: str | Mapping[str, float], also_eval: bool = False, verbose: int = 0
     ) -> None:
         super().__init__(verbose)
+        Reward(reward)  # or a worker process would have to say what is wrong
         self.reward = reward
         self.also_eval = also_eval
 
@@ -274,8 +278,8 @@ class RandomStartCallback(_SwitchUser):
         self, *, start: str = "random", speed: float | None = None, verbose: int = 0
     ) -> None:
         super().__init__(verbose)
-        self.start = start
-        self.speed = speed
+        self.start = checked_start(start)
+        self.speed = None if speed is None else checked_start_speed(speed)
 
     def _on_training_start(self) -> None:
         settings: list[tuple[str, Any]] = [("set_start", self.start)]
@@ -313,7 +317,8 @@ class GradientStepsCallback(_WhileLearning):
     """
     Learn more from each decision at the beginning of a training, when there are few.
 
-    Models that callbacks save keep their own ``gradient_steps``.
+    A training that goes on with its memory is not at its beginning. Models that callbacks save keep
+    their own ``gradient_steps``.
 
     :param gradient_steps: instead of the model's own, for the first decisions
     :param frames: number of these decisions, of all environments together
@@ -322,9 +327,10 @@ class GradientStepsCallback(_WhileLearning):
 
     def __init__(self, *, gradient_steps: int, frames: int, verbose: int = 0) -> None:
         super().__init__(verbose)
-        if gradient_steps < 1 or frames < 1:
+        if not is_count(gradient_steps) or not is_count(frames):
             raise InvalidOption(
-                f"gradient_steps={gradient_steps!r}, frames={frames!r}: pass at least 1 of each"
+                f"gradient_steps={gradient_steps!r}, frames={frames!r}: pass whole numbers of at "
+                "least 1"
             )
         self.gradient_steps = gradient_steps
         self.frames = frames
@@ -338,7 +344,9 @@ class GradientStepsCallback(_WhileLearning):
         self._algorithm, self._own = self.model, self.model.gradient_steps
 
     def _on_rollout_end(self) -> None:
-        if self.num_timesteps <= self.frames:
+        memory = self._algorithm.replay_buffer
+        remembered = 0 if memory is None else memory.size() * memory.n_envs
+        if max(self.num_timesteps, remembered) <= self.frames:
             self._algorithm.gradient_steps = self.gradient_steps
 
     def _undo(self) -> None:

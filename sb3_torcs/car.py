@@ -12,6 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from sb3_torcs.errors import InvalidOption
+
 __all__ = [
     "CONTROL_TICK",
     "MAX_DAMAGE",
@@ -19,6 +21,8 @@ __all__ = [
     "Controls",
     "FloatArray",
     "Start",
+    "checked_start",
+    "checked_start_speed",
     "is_count",
     "is_number",
 ]
@@ -62,6 +66,38 @@ class Start(NamedTuple):
     track_position: float = 0.0  # [-] 0 on the axis, 1 on the left edge, -1 on the right edge
     heading_error: float = 0.0  # [rad] as in CarState
     speed: float = 0.0  # [m/s] along the car's own axis
+
+
+STARTS = ("grid", "random")
+MAX_START_SPEED = 150.0  # [m/s] what the observation of the speed can say
+
+
+def checked_start(start: str) -> str:
+    """
+    Check where episodes shall begin.
+
+    :param start: ``"grid"`` or ``"random"``
+    :return: the same
+    :raises InvalidOption: for anything else
+    """
+    if start not in STARTS:
+        raise InvalidOption(f"start is {start!r}; expected 'grid' or 'random'")
+    return start
+
+
+def checked_start_speed(speed: float) -> float:
+    """
+    Check the speed that random starts do not exceed.
+
+    :param speed: [m/s]
+    :return: the same
+    :raises InvalidOption: if no car can start so
+    """
+    if not is_number(speed) or not 0.0 <= speed <= MAX_START_SPEED:
+        raise InvalidOption(
+            f"speed of random starts is {speed!r}; expected 0 to {MAX_START_SPEED:g} m/s"
+        )
+    return float(speed)
 
 
 class CarState(NamedTuple):

@@ -20,7 +20,7 @@ from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_torcs.actions import ACTION_HIGH, ACTION_LOW
-from sb3_torcs.car import FloatArray
+from sb3_torcs.car import FloatArray, is_number
 from sb3_torcs.errors import InvalidOption, NoiseNotBound
 
 __all__ = [
@@ -187,7 +187,8 @@ class ActuatorNoise(ActionNoise):
         self._watch = None
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_watch": None}
+        # Those of the callbacks of one training, not of the noise.
+        return {**self.__dict__, "_watch": None, "stochastic_brake": None}
 
     def __deepcopy__(self, memo: dict[int, Any]) -> ActuatorNoise:
         # SB3 makes the noises of parallel environments by deep copies: each needs a stream of
@@ -262,7 +263,7 @@ def checked_dt(dt: float) -> float:
     :param dt: duration of one decision
     :return: the same
     """
-    if not 0.0 < dt < np.inf:
+    if not is_number(dt) or dt <= 0.0:
         raise InvalidOption(f"dt={dt!r}: pass a duration above 0, e.g. dt=1.0 (one decision)")
     return float(dt)
 

@@ -63,7 +63,8 @@ def test_nan_is_refused_by_name(place, name, dtype):
 
 
 @pytest.mark.parametrize(
-    "action", [np.zeros(2), np.zeros((1, 3)), np.float32(0.0), [], [0.0] * 4, None, 3]
+    "action",
+    [np.zeros(2), np.zeros((1, 3)), np.float32(0.0), [], [0.0] * 4, None, 3, [[1, 2], 3, 4]],
 )
 def test_another_shape_is_refused(action):
     with pytest.raises(InvalidAction, match=r"expected \(3,\): steering, throttle, brake"):

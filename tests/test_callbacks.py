@@ -21,7 +21,7 @@ from sb3_torcs.callbacks import (
     RewardCallback,
     StochasticBrakeCallback,
 )
-from sb3_torcs.errors import InvalidOption, NoiseNotBound
+from sb3_torcs.errors import InvalidOption, NoiseNotBound, Sb3TorcsError
 from sb3_torcs.noise import ActuatorNoise, OUNoise, SetPointNoise, noises_of
 
 SET_POINT = {"steering": [0, 1, 0], "throttle": [0.5, 1, 0], "brake": [-0.1, 1, 0]}
@@ -224,7 +224,9 @@ def test_steering_a_noise_that_is_not_there_is_an_error(callback):
         learn(make_model(), 2, callback())
 
 
-@pytest.mark.parametrize("bad", [{"frames": 0}, {"floor": -0.1}, {"floor": 1.1}])
+@pytest.mark.parametrize(
+    "bad", [{"frames": 0}, {"floor": -0.1}, {"floor": 1.1}, {"frames": "1e5"}, {"floor": None}]
+)
 def test_a_decay_that_is_none_is_refused(bad):
     """Values that would divide by zero or grow."""
     with pytest.raises(InvalidOption, match="floor"):
@@ -284,8 +286,8 @@ def test_reward_and_start_are_switched_and_given_back(n_envs, vec_env_cls):
 
 def test_the_mean_of_each_reward_term_is_logged():
     """Under reward/, for TensorBoard."""
-    spy = learn(make_model(), 10, RewardCallback(reward="abcde"))
-    assert spy.logged["reward/speed"] == 4.0
+    spy = learn(make_model(), 10, RewardCallback(reward="blog"))
+    assert spy.logged["reward/speed"] == 3.0
     assert spy.logged["reward/crash"] == 1.0
 
 
@@ -304,6 +306,23 @@ def test_evaluation_keeps_its_reward_unless_asked(also_eval, expected):
     learn(make_model(), 5, RewardCallback(reward="blog", also_eval=also_eval), nested, Look())
     assert seen == [(expected, "grid")] * 5
     assert evaluation.eval_env.env_method("settings") == [("progress", "grid")]
+
+
+@pytest.mark.parametrize(
+    ("callback", "options", "message"),
+    [
+        (RewardCallback, {"reward": "progres"}, "did you mean 'progress'"),
+        (RandomStartCallback, {"start": "rnadom"}, "expected 'grid' or 'random'"),
+        (RandomStartCallback, {"speed": "fast"}, "expected 0 to 150 m/s"),
+        (NoiseCallback, {"kind": 5}, "pass 'set_point' or 'ou'"),
+        (NoiseCallback, {"dt": "1e-1"}, "pass a duration above 0"),
+        (StochasticBrakeCallback, {"probability": "10 %"}, "a share of the steps"),
+    ],
+)
+def test_a_wrong_value_is_told_when_the_callback_is_made(callback, options, message):
+    """A worker process would die of it."""
+    with pytest.raises(Sb3TorcsError, match=message):
+        callback(**options)
 
 
 @pytest.mark.parametrize("callback", [RewardCallback(reward="blog"), RandomStartCallback()])
@@ -342,12 +361,13 @@ def test_a_young_training_learns_more_from_each_decision():
     assert (model._n_updates, model.gradient_steps) == (14, 1)
 
 
-def test_a_training_that_goes_on_is_no_longer_young():
-    """The decisions are counted over all its parts."""
+@pytest.mark.parametrize("reset", [False, True])
+def test_a_training_that_goes_on_is_no_longer_young(reset):
+    """The decisions are counted over all its parts, whatever SB3 counts."""
     model = make_model(gradient_steps=1)
     callback = GradientStepsCallback(gradient_steps=3, frames=6)
     learn(model, 4, callback)
-    model.learn(4, callback=callback, reset_num_timesteps=False)
+    model.learn(4, callback=callback, reset_num_timesteps=reset)
     assert model._n_updates == 6 * 3 + 2
 
 
@@ -358,10 +378,12 @@ def test_gradient_steps_need_an_algorithm_with_a_replay():
         model.learn(8, callback=GradientStepsCallback(gradient_steps=2, frames=10))
 
 
-@pytest.mark.parametrize("options", [{"gradient_steps": 0}, {"frames": 0}])
+@pytest.mark.parametrize(
+    "options", [{"gradient_steps": 0}, {"frames": 0}, {"gradient_steps": 2.5}, {"frames": "1e5"}]
+)
 def test_gradient_steps_are_at_least_one(options):
     """None at all is what `learning_starts` is for."""
-    with pytest.raises(InvalidOption, match="at least 1 of each"):
+    with pytest.raises(InvalidOption, match="whole numbers of at least 1"):
         GradientStepsCallback(**{"gradient_steps": 2, "frames": 10, **options})
 
 

@@ -249,6 +249,13 @@ def test_stochastic_brake_comes_in_its_share_of_the_steps(cls):
     assert (executed > 0).mean() == pytest.approx(0.1, abs=4 * 0.3 / 63)
 
 
+def test_a_saved_noise_has_no_stochastic_brake():
+    """That is a callback's, which the training that goes on may not have."""
+    noise = OUNoise(seed=0)
+    noise.stochastic_brake = StochasticBrake(0.1, OUParameters(0.2, 1.0, 0.1))
+    assert pickle.loads(pickle.dumps(noise)).stochastic_brake is None
+
+
 def test_the_default_is_the_table_of_the_post():
     """Steering, throttle, brake: mu, theta, sigma."""
     assert OUNoise().parameters == BLOG == ((0.0, 0.6, 0.3), (0.5, 1.0, 0.1), (-0.1, 1.0, 0.05))

@@ -17,10 +17,13 @@ from sb3_torcs.backends.base import Backend
 from sb3_torcs.car import (
     CONTROL_TICK,
     MAX_DAMAGE,
+    MAX_START_SPEED,
     CarState,
     Controls,
     FloatArray,
     Start,
+    checked_start,
+    checked_start_speed,
     is_count,
     is_number,
 )
@@ -44,8 +47,6 @@ RANDOM_GRID_SHARE = 0.1
 RANDOM_TRACK_POSITION = 0.6  # [-]
 RANDOM_HEADING_ERROR = 0.25  # [rad]
 RANDOM_SPEED = 40.0  # [m/s] unless somebody sets another
-STARTS = ("grid", "random")
-MAX_START_SPEED = 150.0  # [m/s] what the observation of the speed can say
 RESET_OPTIONS = ("distance", "track_position", "heading_error", "speed")
 
 
@@ -103,7 +104,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         self.render_mode = render_mode
         self.metadata = {
             **self.metadata,
-            "render_fps": round(1.0 / (action_repeat * CONTROL_TICK)),
+            "render_fps": max(1, round(1.0 / (action_repeat * CONTROL_TICK))),
         }
         self.observation_space = spaces.Box(OBSERVATION_LOW, OBSERVATION_HIGH, dtype=np.float32)
         self.action_space = spaces.Box(
@@ -149,10 +150,8 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         :param start: ``"grid"`` or ``"random"``
         :return: the start until now
         """
-        if start not in STARTS:
-            raise InvalidOption(f"start is {start!r}; expected 'grid' or 'random'")
         previous = getattr(self, "_start", None)
-        self._start = start
+        self._start = checked_start(start)
         return previous
 
     def set_random_speed(self, speed: float) -> float | None:
@@ -162,12 +161,8 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         :param speed: that they do not exceed [m/s]
         :return: the one until now
         """
-        if not is_number(speed) or not 0.0 <= speed <= MAX_START_SPEED:
-            raise InvalidOption(
-                f"speed of random starts is {speed!r}; expected 0 to {MAX_START_SPEED:g} m/s"
-            )
         previous = getattr(self, "_random_speed", None)
-        self._random_speed = float(speed)
+        self._random_speed = checked_start_speed(speed)
         return previous
 
     def reset(
