@@ -42,4 +42,5 @@ env = Monitor(GentleSteering(gym.make("TorcsLite-v0", track="aalborg", reward=WE
 model = DDPG(SplitHeadPolicy, env, learning_starts=100, batch_size=64, device="cpu", seed=0)
 model.learn(args.timesteps)
 returns = env.get_episode_rewards()
-print(f"{len(returns)} episodes; the best return by this reward was {max(returns):.2f}")
+best = max(returns, default=float("nan"))
+print(f"{len(returns)} episodes; the best return by this reward was {best:.2f}")

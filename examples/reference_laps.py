@@ -18,6 +18,8 @@ parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--tracks", nargs="+", help="category/name; default: all")
 parser.add_argument("--out", type=Path, default=REFERENCE_FILE)
 args = parser.parse_args()
+if args.tracks and args.out == REFERENCE_FILE:
+    parser.error("--tracks measures some of the tracks; give an --out, or the others were lost")
 
 
 def scripted(track):
@@ -34,7 +36,8 @@ def robot(name, track):
     return [lap.time for lap in result.laps] if result.car == CAR else []
 
 
-with args.out.open("w", newline="", encoding="utf-8") as file:
+aside = args.out.with_name(f".{args.out.name}")
+with aside.open("w", newline="", encoding="utf-8") as file:
     file.write(f"# python examples/reference_laps.py, sb3_torcs {sb3_torcs.__version__}\n")
     writer = csv.writer(file, lineterminator="\n")
     writer.writerow(REFERENCE_FIELDS)
@@ -45,3 +48,4 @@ with args.out.open("w", newline="", encoding="utf-8") as file:
             times = (f"{laps[0]:.3f}", f"{min(laps[1:]):.3f}") if whole else ("", "")
             writer.writerow((track.rpartition("/")[2], driver, CAR, *times))
             print(f"{track}: {driver} {', '.join(f'{lap:.3f}' for lap in laps) or 'no lap'}")
+aside.replace(args.out)  # whole, or what was there before

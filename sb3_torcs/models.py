@@ -19,10 +19,12 @@ import yaml
 from gymnasium import spaces
 
 from sb3_torcs.errors import InvalidOption, ModelMismatch, near_miss
+from sb3_torcs.sensors import range_finder_angles
 
 __all__ = [
     "NormalizedDriver",
     "TrainingRecord",
+    "check_resumable",
     "check_spaces",
     "find_model",
     "load_driver",
@@ -35,6 +37,8 @@ __all__ = [
 
 BEST_MODEL = "best_model.zip"
 AGENTS = Path(__file__).parent / "agents"
+
+SAVED_AS = {"ddpg": "td3"}  # a model of one does not tell that it is not of the other
 
 NEEDED_KEYS = ("observation_space", "action_space", "num_timesteps")
 
@@ -292,6 +296,43 @@ def check_spaces(
         )
 
 
+def check_resumable(model: Path, env: gym.Env[Any, Any], algo: str, n_envs: int) -> bool:
+    """
+    Make sure that a training can go on from a model.
+
+    :param model: the file; its memory and its record lie beside it
+    :param env: that the training is to go on in
+    :param algo: that is to learn, as the zoo calls it
+    :param n_envs: number of environments in which it is to learn
+    :return: whether there is a memory to go on with
+    :raises ModelMismatch: if they do not belong together
+    """
+    from stable_baselines3.common.save_util import load_from_pkl
+
+    data = _saved_data(model)
+    check_spaces(model, saved_spaces(model), env)
+    record = training_record(model)
+    saved = record.algo or _told_algorithm(data)
+    if saved is not None and SAVED_AS.get(saved, saved) != SAVED_AS.get(algo, algo):
+        raise ModelMismatch(f"'{model}' is a model of {saved}, not of {algo}; give --algo {saved}")
+    seen, angles = record.env_kwargs.get("range_finders", "scr"), "range_finder_angles"
+    sees = env.get_wrapper_attr(angles) if env.has_wrapper_attr(angles) else None
+    if record.env_id and sees is not None and not np.allclose(range_finder_angles(seen), sees):
+        raise ModelMismatch(
+            f"'{model}' has learned with range_finders {seen!r}, and would go on with others; give "
+            "the --env, --entry or --conf-file of before"
+        )
+    memory = model.parent / "replay_buffer.pkl"
+    if not memory.is_file():
+        return False
+    said = f"'{memory}' is no memory that can be gone on with"
+    with _as_mismatch(said, "remove it, or give"), memory.open("rb") as file:
+        buffer = load_from_pkl(file)
+        if buffer.n_envs != n_envs:
+            raise ValueError(f"of {buffer.n_envs} cars at once, not {n_envs}")
+    return True
+
+
 def _layout(space: spaces.Space[Any]) -> str:
     """Say in a few words what a space is."""
     if isinstance(space, spaces.Box):
@@ -348,14 +389,18 @@ def _as_mismatch(what: str, hint: str) -> Iterator[None]:
         ) from error
 
 
+def _told_algorithm(data: dict[str, Any]) -> str | None:
+    """Find out the algorithm of a model by what it saved."""
+    if "recurrent" in str(data.get("policy_class")).lower():
+        return "ppo_lstm"
+    return next((algo for key, algo in TELLING_KEYS if key in data), None)
+
+
 def _algorithm(name: str | None, data: dict[str, Any], model: Path) -> tuple[str, Any]:
     """Find the algorithm of a saved model: its name and its class."""
     from rl_zoo3.utils import ALGOS
 
-    if name is None and "recurrent" in str(data.get("policy_class")).lower():
-        name = "ppo_lstm"
-    if name is None:
-        name = next((algo for key, algo in TELLING_KEYS if key in data), None)
+    name = name or _told_algorithm(data)
     if name is None:
         raise ModelMismatch(f"'{model}' does not tell its algorithm; say it: --algo ddpg")
     if name not in ALGOS:

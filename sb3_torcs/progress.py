@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import time
 from typing import Any, TextIO
 
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_torcs.car import is_number
 from sb3_torcs.driving_metrics import DrivingMetricsCallback, callbacks_in
 from sb3_torcs.errors import InvalidOption
 
-__all__ = ["RacingProgressCallback", "spoken_time"]
+__all__ = ["RacingProgressCallback", "Unbroken", "spoken_time"]
 
 BAR = "{percentage:3.0f}% {bar} {n_fmt}/{total_fmt} steps{postfix}"
 REDRAW = 0.2  # [s] between two looks of the bar
@@ -31,6 +33,34 @@ def spoken_time(seconds: float) -> str:
     return f"{minutes} min" if minutes < 100 else f"{minutes // 60} h {minutes % 60:02d} min"
 
 
+class Unbroken:
+    """
+    A stream whose reader may leave: what nobody reads is dropped, and that is no error.
+
+    :param stream: to write to
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        """
+        :param text: to write
+        :return: its length
+        """
+        with contextlib.suppress(OSError):
+            self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        """Write what is held back."""
+        with contextlib.suppress(OSError):
+            self._stream.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
 class RacingProgressCallback(BaseCallback):
     """
     A live line: steps, episode, distance of the last one, best lap, time left.
@@ -48,7 +78,7 @@ class RacingProgressCallback(BaseCallback):
         self, *, every: float = 30.0, stream: TextIO | None = None, verbose: int = 0
     ) -> None:
         super().__init__(verbose)
-        if every <= 0.0:
+        if not is_number(every) or every <= 0.0:
             raise InvalidOption(f"every is {every!r} s; expected more than 0")
         self.every = every
         self.episodes = 0
@@ -58,7 +88,7 @@ class RacingProgressCallback(BaseCallback):
         self._bar: Any = None
 
     def _on_training_start(self) -> None:
-        stream = self._stream or sys.stderr
+        stream: Any = Unbroken(self._stream or sys.stderr)
         self._out = stream
         self._ended = False
         self._total = int(self.locals["total_timesteps"])

@@ -10,7 +10,9 @@ import copy
 import importlib
 import importlib.util
 import inspect
+import multiprocessing
 import re
+import signal
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,6 +28,7 @@ __all__ = [
     "TIME_LIMIT",
     "ZOO_KEYS",
     "Place",
+    "UninterruptedWorker",
     "check_entry",
     "check_racing",
     "check_registered",
@@ -64,6 +67,21 @@ COUNTS = ("n_envs", "batch_size", "buffer_size", "n_steps", "n_epochs", "policy_
 SHARES = ("gamma", "tau", "gae_lambda")
 
 OURS = ("Torcs-v0", "TorcsLite-v0")
+
+
+class UninterruptedWorker(gym.Wrapper[Any, Any, Any, Any]):
+    """
+    Leaves Ctrl-C to the training, if the environment is in a worker process of it.
+
+    The terminal interrupts all processes. A worker that ends takes the model with it.
+
+    :param env: any
+    """
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        super().__init__(env)
+        if multiprocessing.parent_process() is not None:
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 class Place(NamedTuple):

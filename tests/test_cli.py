@@ -1,10 +1,12 @@
 import dataclasses
 import itertools
 import json
+import os
 import shlex
 import signal
 import subprocess
 import sys
+import time
 import types
 
 import numpy as np
@@ -311,6 +313,16 @@ def test_a_stretch_is_drawn(recorded, tmp_path):
     assert (tmp_path / "line.png").read_bytes()[:4] == PNG
 
 
+def test_an_output_that_takes_no_more_is_told():
+    with open("/dev/full", "w") as full:
+        command = [sys.executable, "-m", "sb3_torcs.cli", "tracks"]
+        process = subprocess.run(
+            command, stdout=full, stderr=subprocess.PIPE, text=True, check=False
+        )
+    said = "sb3-torcs: No space left on device: the output; make room, or choose another place\n"
+    assert (process.returncode, process.stderr) == (2, said)
+
+
 # train
 
 
@@ -323,6 +335,7 @@ def test_a_stretch_is_drawn(recorded, tmp_path):
         ({"entry": "othr"}, "no entry 'othr'; did you mean 'other'?"),
         ({"resume": "none.zip"}, "there is no model 'none.zip'"),
         ({"algo": "dpg"}, "no algorithm 'dpg'; did you mean 'ddpg'?"),
+        ({"zoo_args": ("--log-folder", "x")}, "before -- there are --algo, --env, --timesteps"),
     ],
 )
 def test_a_mistake_is_told_before_anything_starts(tmp_path, changes, message):
@@ -330,6 +343,22 @@ def test_a_mistake_is_told_before_anything_starts(tmp_path, changes, message):
         train.train(options(tmp_path, **changes))
     assert message in str(caught.value)
     assert not (tmp_path / "logs").exists()
+
+
+def test_a_training_goes_on_in_the_environment_of_its_model(monkeypatch):
+    """Where nothing else is said."""
+    asked = []
+    monkeypatch.setattr(train, "train_run", lambda options: asked.append(options) or 1 / 0)
+    for words in (
+        ["--resume", "ddpg-aalborg"],
+        ["--resume", "ddpg-aalborg", "--env", "TorcsLite-v0", "--algo", "td3"],
+        [],
+    ):
+        with pytest.raises(ZeroDivisionError):
+            main(["train", *words])
+    assert [(options.env, options.algo) for options in asked] == [
+        ("Torcs-v0", "ddpg"), ("TorcsLite-v0", "td3"), ("TorcsLite-v0", "ddpg")
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize("option", ["--folder", "--tensorboard"])
@@ -417,6 +446,27 @@ def test_an_interrupted_training_keeps_what_it_learned_and_says_how_to_go_on(cap
     config = models._read_plain(folder / "TorcsLite-v0" / "config.yml")
     assert config["learning_starts"] == 0  # it has its memory, so it needs no new warm-up
     assert signal.getsignal(signal.SIGINT) is handler
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("by", [signal.SIGINT, signal.SIGTERM])
+def test_a_training_in_processes_that_is_ended_from_outside_keeps_what_it_learned(tmp_path, by):
+    """The terminal interrupts all its processes; who reads what it says may be gone before."""
+    conf_file = write_config(tmp_path, n_envs=2, n_timesteps=10**6)
+    words = ["--conf-file", conf_file, "--folder", str(tmp_path / "logs"), "--eval-freq", "200"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "sb3_torcs.cli", "train", *words, "--", "--vec-env", "subproc"],
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True,
+    )  # fmt: skip
+    folder = tmp_path / "logs" / "ddpg" / "TorcsLite-v0_1"
+    while not (folder / "best_model.zip").is_file():
+        assert process.poll() is None, process.stdout.read()
+        time.sleep(0.1)
+    process.stdout.close()
+    (os.killpg if by == signal.SIGINT else os.kill)(process.pid, by)
+    process.wait(60)
+    assert models.saved_steps(folder / "TorcsLite-v0.zip") >= 200
+    assert models.find_model(folder, prefer_last=True).name == "TorcsLite-v0.zip"
 
 
 @pytest.mark.slow

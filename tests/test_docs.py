@@ -19,6 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 import sb3_torcs  # noqa: F401  registers the environments
 from sb3_torcs import cli, rewards, zoo
+from sb3_torcs.cli.train import TrainOptions
 from sb3_torcs.driving_metrics import DrivingMetricsCallback
 from sb3_torcs.envs.torcs import TorcsEnv
 from sb3_torcs.envs.torcs_lite import TorcsLiteEnv
@@ -342,9 +343,10 @@ def check(args, monkeypatch):
     for name in [args.track] if getattr(args, "track", None) else getattr(args, "names", ()):
         load_track(name, np.random.default_rng(0))
     if args.verb == "train":
-        entry = zoo.read_entry(zoo.config_file(args.algo, args.conf_file), args.entry or args.env)
-        assert args.env in gym.registry
-        words = ["--algo", args.algo, "--env", args.env, *args.zoo_args]
+        algo, env = args.algo or TrainOptions.algo, args.env or TrainOptions.env
+        entry = zoo.read_entry(zoo.config_file(algo, args.conf_file), args.entry or env)
+        assert env in gym.registry
+        words = ["--algo", algo, "--env", env, *args.zoo_args]
         changed = parsed_by_the_zoo(["--gym-packages", "sb3_torcs", *words], monkeypatch)
         assert set(changed.hyperparams or ()) <= set(entry)
     if args.verb == "study":

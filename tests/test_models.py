@@ -176,6 +176,42 @@ def test_statistics_that_are_none_are_refused(saved, env, content):
         models.load_driver(path, env)
 
 
+@pytest.fixture
+def learned(saved, env):
+    """A model with its memory and its record, and what `check_resumable` is asked about it."""
+    model, path = saved
+    zoo_record(path.parent)
+    model.save_replay_buffer(path.parent / "replay_buffer.pkl")
+    return path, lambda env=env, algo="ddpg", n_envs=1: models.check_resumable(
+        path, env, algo, n_envs
+    )
+
+
+def test_what_belongs_together_is_gone_on_with(learned):
+    path, check = learned
+    assert check() is True
+    assert check(algo="td3") is True  # which is the same with other defaults
+    (path.parent / "replay_buffer.pkl").unlink()
+    assert check(n_envs=4) is False
+
+
+def test_what_does_not_belong_together_is_not_gone_on_with(learned):
+    path, check = learned
+    with pytest.raises(ModelMismatch, match="a model of ddpg, not of sac; give --algo ddpg"):
+        check(algo="sac")
+    with (
+        gym.make("TorcsLite-v0", range_finders="narrow") as narrow,
+        pytest.raises(ModelMismatch, match="learned with range_finders 'scr'"),
+    ):
+        check(narrow)
+    with pytest.raises(ModelMismatch, match=r"replay_buffer.*of 1 cars at once, not 4.*remove it"):
+        check(n_envs=4)
+    memory = path.parent / "replay_buffer.pkl"
+    memory.write_bytes(memory.read_bytes()[:-10])
+    with pytest.raises(ModelMismatch, match=r"replay_buffer.pkl' is no memory"):
+        check()
+
+
 def test_an_unknown_algorithm_is_told_the_near_miss(saved, env):
     with pytest.raises(InvalidOption, match=r"no algorithm 'dpg'; did you mean 'ddpg'\?"):
         models.load_driver(saved[1], env, algo="dpg")

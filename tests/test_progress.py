@@ -57,6 +57,16 @@ def test_a_log_file_gets_whole_lines_and_no_bar(oval):
     )
 
 
+@pytest.mark.parametrize("kind", [io.StringIO, Terminal])
+def test_a_reader_that_leaves_does_not_end_the_training(oval, kind):
+    class Broken(kind):
+        def write(self, text):
+            raise BrokenPipeError
+
+    model, _ = learned(oval, OFF, stream=Broken())
+    assert model.num_timesteps == 64
+
+
 def test_lines_come_at_their_interval(oval, monkeypatch):
     """The clock is scripted: one second per look."""
     ticks = iter(range(10_000))

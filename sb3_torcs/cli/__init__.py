@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import sys
 from collections.abc import Sequence
@@ -55,12 +56,24 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"sb3-torcs: {error}", file=sys.stderr)
         return USAGE_ERROR
     except BrokenPipeError:  # the reader, e.g. `head`, has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _drop_output()
         return READER_LEFT
+    except OSError as error:
+        where = error.filename or "the output"
+        said = f"{error.strerror or error}: {where}; make room, or choose another place"
+        print(f"sb3-torcs: {said}", file=sys.stderr)
+        _drop_output()
+        return USAGE_ERROR
     except KeyboardInterrupt:
         print("sb3-torcs: interrupted", file=sys.stderr)
         return INTERRUPTED
     return status
+
+
+def _drop_output() -> None:
+    """Let Python, when it ends, write what it still holds to nowhere."""
+    with contextlib.suppress(OSError):  # it is no file
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _parser() -> argparse.ArgumentParser:

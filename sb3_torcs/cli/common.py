@@ -20,6 +20,7 @@ __all__ = [
     "positive",
     "print_json",
     "quiet_output",
+    "seed",
     "table",
     "writable_file",
     "writable_folder",
@@ -51,6 +52,19 @@ def natural(text: str) -> int:
     number = int(text) if text.strip().isdigit() else -1
     if number < 0:
         raise argparse.ArgumentTypeError(f"{text!r}: expected a whole number >= 0")
+    return number
+
+
+def seed(text: str) -> int:
+    """
+    Read a seed, for argparse.
+
+    :param text: from the command line
+    :return: the seed, which NumPy takes
+    """
+    number = natural(text)
+    if number >= 2**32:
+        raise argparse.ArgumentTypeError(f"{text!r}: expected a whole number below 2**32")
     return number
 
 

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 from sb3_torcs.cli.common import (
     MODEL_HELP,
-    natural,
     positive,
     print_json,
     quiet_output,
+    seed,
     table,
     writable_file,
 )
@@ -54,7 +54,7 @@ def add_parser(subparsers: Any) -> None:
     add("--car", metavar="C", help="e.g. car1-trb1")
     add("--episodes", type=positive, default=1, metavar="N", help="default: 1")
     add("--laps", type=positive, default=3, metavar="L", help="laps per episode; default: 3")
-    add("--seed", type=natural, default=0, metavar="S", help="of the first reset; default: 0")
+    add("--seed", type=seed, default=0, metavar="S", help="of the first reset; default: 0")
     add("--action-repeat", type=positive, metavar="N", help="control ticks of 0.02 s per decision")
     add("--range-finders", metavar="SET", help="scr or narrow")
     add("--algo", help="the model's algorithm, if it cannot be found out")

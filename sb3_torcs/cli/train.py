@@ -15,7 +15,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from sb3_torcs.cli.common import natural, positive, writable_folder
+from sb3_torcs.cli.common import positive, seed, writable_folder
+from sb3_torcs.errors import InvalidOption
 
 __all__ = ["Run", "TrainOptions", "add_parser", "run", "train", "train_run"]
 
@@ -23,6 +24,9 @@ EVALUATIONS = 40  # of a whole training, unless --eval-freq says otherwise
 SHORTEST_EVAL_FREQ = 1000  # decisions
 
 PROGRESS = "sb3_torcs.progress.RacingProgressCallback"
+WORKER = "sb3_torcs.zoo.UninterruptedWorker"
+OURS = ("--algo", "--env", "--n-timesteps", "-n", "--log-folder", "-f", "--conf-file", "--uuid")
+"""Words of the zoo that decide where things are; ours say the same."""
 
 EPILOG = """\
 What follows -- goes to the RL Zoo as it is, after our own words, so it wins:
@@ -100,13 +104,13 @@ def add_parser(subparsers: Any) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
-    add("--algo", default="ddpg", help="ddpg (default), td3, sac, ppo, or any of the zoo")
-    add("--env", default="TorcsLite-v0", metavar="ID", help="default: TorcsLite-v0")
+    add("--algo", help="ddpg (default), td3, sac, ppo, or any of the zoo")
+    add("--env", metavar="ID", help="default: TorcsLite-v0")
     add("--entry", metavar="NAME", help='entry of the file, e.g. "as the post"; default: the id')
     add("--conf-file", metavar="FILE", help="hyperparameter file; default: the shipped one")
     add("--track", metavar="T", help="instead of the entry's; `sb3-torcs tracks` lists them")
     add("--timesteps", type=positive, metavar="N", help="decisions; default: what the entry says")
-    add("--seed", type=natural, default=0, metavar="S", help="default: 0")
+    add("--seed", type=seed, default=0, metavar="S", help="default: 0")
     add("--folder", default="logs", help="for models and logs; default: logs")
     add("--tensorboard", metavar="DIR", help="default: FOLDER/tensorboard")
     add(
@@ -116,7 +120,11 @@ def add_parser(subparsers: Any) -> None:
         help="decisions between evaluations; default: a fortieth",
     )
     add("--eval-episodes", type=positive, default=1, metavar="N", help="per evaluation; default: 1")
-    add("--resume", metavar="MODEL", help="go on from a saved model (.zip) or a run's folder")
+    add(
+        "--resume",
+        metavar="MODEL",
+        help="go on from a saved model (.zip) or a run's folder, with its --algo and --env",
+    )
     add("--progress", action=argparse.BooleanOptionalAction, default=True, help="progress bar")
     parser.set_defaults(run=run)
 
@@ -128,10 +136,24 @@ def run(args: argparse.Namespace) -> int:
     """
     names = [field.name for field in dataclasses.fields(TrainOptions)]
     values = {name: getattr(args, name) for name in names}
-    options = TrainOptions(**{**values, "zoo_args": tuple(args.zoo_args)})
+    values.update(_trained_before(args), zoo_args=tuple(args.zoo_args))
+    options = TrainOptions(**values)
     result = train_run(options)
     print("\n".join(_closing_words(options, result)))
     return 130 if result.interrupted else 0
+
+
+def _trained_before(args: argparse.Namespace) -> dict[str, str]:
+    """Take algorithm and environment from the model to go on from, where they are not given."""
+    from sb3_torcs.models import TrainingRecord, find_model, training_record
+
+    record = TrainingRecord()
+    if args.resume is not None:
+        record = training_record(find_model(args.resume, prefer_last=True))
+    return {
+        "algo": args.algo or record.algo or TrainOptions.algo,
+        "env": args.env or record.env_id or TrainOptions.env,
+    }
 
 
 def train(options: TrainOptions) -> Path:
@@ -156,11 +178,20 @@ def train_run(options: TrainOptions) -> Run:
     from sb3_torcs import zoo
     from sb3_torcs.models import saved_steps
 
+    for word in options.zoo_args:
+        if word.partition("=")[0] in OURS:
+            raise InvalidOption(
+                f"'{word}' after -- would hide from sb3-torcs where the model is; before -- there "
+                "are --algo, --env, --timesteps, --folder and --conf-file"
+            )
     entry = _entry(options)
     resume = _resumed(options, entry)
     folder = writable_folder(options.folder)
     tensorboard = writable_folder(options.tensorboard or folder / "tensorboard")
     wanted = options.timesteps or zoo.decisions(entry)
+    if any(word.endswith("subproc") for word in options.zoo_args):
+        wrappers = entry.get("env_wrapper") or []
+        entry["env_wrapper"] = [*(wrappers if isinstance(wrappers, list) else [wrappers]), WORKER]
     if options.progress:
         entry["callback"] = _with_progress(entry.get("callback"))
     with tempfile.TemporaryDirectory() as scratch:
@@ -205,13 +236,13 @@ def _resumed(options: TrainOptions, entry: dict[str, Any]) -> Path | None:
         return None
     import gymnasium as gym
 
-    from sb3_torcs.models import check_spaces, find_model, saved_spaces
+    from sb3_torcs.models import check_resumable, find_model
 
     path = find_model(options.resume, prefer_last=True)
     env = gym.make(options.env, **(entry.get("env_kwargs") or {}))
-    check_spaces(path, saved_spaces(path), env)
+    memory = check_resumable(path, env, options.algo, entry.get("n_envs", 1))
     env.close()
-    if "learning_starts" in entry and (path.parent / "replay_buffer.pkl").is_file():
+    if "learning_starts" in entry and memory:
         entry["learning_starts"] = 0
     if "n_steps" in entry:
         # SB3 chooses the class of the memory as before; given its own choice, it would warn.
@@ -238,11 +269,11 @@ def _zoo_words(options: TrainOptions, wanted: int, env_kwargs: dict[str, Any]) -
     words += ["--n-timesteps", str(wanted), "--seed", str(options.seed)]
     words += ["--eval-freq", str(eval_freq), "--eval-episodes", str(options.eval_episodes)]
     words += ["--num-threads", "1", "--device", "cpu", "--verbose", "0", "--save-replay-buffer"]
-    if env_kwargs:
-        # The zoo does not give the file's env_kwargs to the evaluation's environment; and an
-        # evaluation is from the grid and long enough, wherever and how long the training drives.
-        mine = ("start", zoo.TIME_LIMIT)
-        evaluation = {name: value for name, value in env_kwargs.items() if name not in mine}
+    # An evaluation is from the grid and long enough, wherever and how long the training drives.
+    mine = ("start", zoo.TIME_LIMIT)
+    evaluation = {name: value for name, value in env_kwargs.items() if name not in mine}
+    if evaluation:
+        # The zoo does not give the file's env_kwargs to the evaluation's environment.
         words += ["--eval-env-kwargs", *(f"{name}:{value!r}" for name, value in evaluation.items())]
     return words
 
@@ -276,10 +307,15 @@ def _run_zoo(words: list[str]) -> bool:
     """
     from rl_zoo3.train import train as zoo_train
 
+    from sb3_torcs.progress import Unbroken
+
     before = sys.argv
     sys.argv = ["rl_zoo3.train", *words]
+    # Whoever reads may leave, e.g. `tee` at Ctrl-C, before the zoo says that it saves the model.
+    out, err = Unbroken(sys.stdout), Unbroken(sys.stderr)
     try:
-        with _noted_interrupts() as seen:
+        redirected = contextlib.redirect_stdout(out), contextlib.redirect_stderr(err)
+        with redirected[0], redirected[1], _noted_interrupts() as seen:
             zoo_train()
     finally:
         sys.argv = before
@@ -289,7 +325,7 @@ def _run_zoo(words: list[str]) -> bool:
 @contextlib.contextmanager
 def _noted_interrupts() -> Iterator[list[int]]:
     """
-    Note Ctrl-C, which the zoo takes as the end of the training and swallows.
+    Note Ctrl-C, which the zoo takes as the end of the training and swallows; a polite kill, too.
 
     A second one, while the model is being saved, must not break the file: only a third does.
     """
@@ -306,11 +342,12 @@ def _noted_interrupts() -> Iterator[list[int]]:
             return
         raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGINT, note)
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield seen
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _closing_words(options: TrainOptions, result: Run) -> list[str]:
