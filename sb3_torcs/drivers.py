@@ -10,7 +10,10 @@ import numpy.typing as npt
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.sensors import OBSERVATION_SIZE, RANGE_FINDERS, SENSORS, feature_slices
 
-__all__ = ["ScriptedDriver"]
+__all__ = ["SCRIPTED", "ScriptedDriver"]
+
+SCRIPTED = "scripted"
+"""What the driver is called wherever a driver is named."""
 
 _SCALE = {sensor.name: sensor.scale for sensor in SENSORS}
 _WHERE = feature_slices()

@@ -11,11 +11,11 @@ import functools
 from collections.abc import Iterable
 from pathlib import Path
 
+from sb3_torcs.drivers import SCRIPTED
 from sb3_torcs.evaluation import Episode
 
-__all__ = ["REFERENCE_FIELDS", "ROBOTS", "RUNGS", "SCRIPTED", "reference_laps", "rung"]
+__all__ = ["REFERENCE_FIELDS", "ROBOTS", "RUNGS", "reference_laps", "rung"]
 
-SCRIPTED = "scripted"
 ROBOTS = ("inferno", "berniw", "tita", "lliaw", "bt", "olethros")
 """Robots that have a driver in every car of the class that is raced here."""
 

@@ -18,6 +18,7 @@ import numpy.typing as npt
 import yaml
 from gymnasium import spaces
 
+from sb3_torcs.drivers import SCRIPTED, ScriptedDriver
 from sb3_torcs.errors import InvalidOption, ModelMismatch, near_miss
 from sb3_torcs.sensors import range_finder_angles
 
@@ -26,6 +27,7 @@ __all__ = [
     "TrainingRecord",
     "check_resumable",
     "check_spaces",
+    "driver_record",
     "find_model",
     "load_driver",
     "one_track",
@@ -212,6 +214,16 @@ def _read_plain(file: Path) -> dict[str, Any]:
     return content if isinstance(content, dict) else {}
 
 
+def driver_record(driver: str | Path) -> TrainingRecord:
+    """
+    Read how that was trained which is to drive.
+
+    :param driver: as in :func:`find_model`, or ``"scripted"``, of whom nothing is known
+    :return: what is known
+    """
+    return TrainingRecord() if str(driver) == SCRIPTED else training_record(find_model(driver))
+
+
 def one_track(track: Any) -> Any:
     """
     Make sure that a drive has one track, where a training may have had several.
@@ -352,10 +364,8 @@ def load_driver(path: str | Path, env: gym.Env[Any, Any], algo: str | None = Non
     :raises InvalidOption: if there is no such file or algorithm
     :raises ModelMismatch: if the file is no model, or one for another environment
     """
-    if str(path) == "scripted":
-        from sb3_torcs.drivers import ScriptedDriver
-
-        return ScriptedDriver()
+    if str(path) == SCRIPTED:
+        return _scripted(env)
     from stable_baselines3.common.vec_env import VecNormalize
 
     model_file = find_model(path)
@@ -376,6 +386,17 @@ def load_driver(path: str | Path, env: gym.Env[Any, Any], algo: str | None = Non
         if not isinstance(statistics, VecNormalize):
             raise TypeError(f"a {type(statistics).__name__}")
     return NormalizedDriver(model, statistics)
+
+
+def _scripted(env: gym.Env[Any, Any]) -> Any:
+    """Let the driver without a network see what it is made for."""
+    angles = env.get_wrapper_attr("range_finder_angles")
+    if not np.allclose(angles, range_finder_angles("scr")):
+        raise InvalidOption(
+            f"the scripted driver looks around with range_finders 'scr', not with "
+            f"{np.degrees(angles).round(3).tolist()}; leave --range-finders out"
+        )
+    return ScriptedDriver()
 
 
 @contextlib.contextmanager

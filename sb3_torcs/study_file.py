@@ -262,9 +262,6 @@ def _source(
 
 def _check_evaluable(entry: Mapping[str, Any], place: zoo.Place) -> None:
     """Make sure that evaluations can be driven in the training's environment."""
-    env_kwargs = entry.get("env_kwargs")
-    if not isinstance(env_kwargs, dict | None):
-        raise StudyError(f"{place}: env_kwargs is {env_kwargs!r}; expected '{{key: value}}'")
     # Wrappers would have to be around the car of an evaluation, too, wherever it drives.
     for key in WRAPPERS:
         if key in entry:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from sb3_torcs.drivers import SCRIPTED
 from sb3_torcs.driving import Agent
 from sb3_torcs.errors import GameFailed, ServerLost
 from sb3_torcs.film import FPS, Film, side_by_side
@@ -47,7 +48,7 @@ class Show:
     game: Game
     track: str | Path
     robot: tuple[str, int] | None
-    model: str = "scripted"
+    model: str = SCRIPTED
     settings: Mapping[str, Any] = field(default_factory=dict)
     opponents: Sequence[tuple[str, int]] = ()
     laps: int = 1

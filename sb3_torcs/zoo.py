@@ -60,12 +60,6 @@ TIME_LIMIT = "max_episode_steps"
 
 REQUIRED = ("n_timesteps", "policy")
 
-SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf", "delta_std")
-"""Values that may be words, e.g. ``lin_0.001``."""
-
-COUNTS = ("n_envs", "batch_size", "buffer_size", "n_steps", "n_epochs", "policy_delay")
-SHARES = ("gamma", "tau", "gae_lambda")
-
 OURS = ("Torcs-v0", "TorcsLite-v0")
 
 
@@ -211,9 +205,8 @@ def _check_symmetric(entry: Entry, place: Place) -> None:
             f"{place}: policy_kwargs has symmetric, which needs observations whose middle is 0, "
             "and normalize moves it; take one of them away: the observations are scaled already"
         )
-    env_kwargs = entry.get("env_kwargs")
-    own = env_kwargs.get("range_finders", "scr") if isinstance(env_kwargs, Mapping) else "scr"
-    if not look_both_ways(range_finder_angles(own)):
+    env_kwargs = entry.get("env_kwargs") or {}
+    if not look_both_ways(range_finder_angles(env_kwargs.get("range_finders", "scr"))):
         raise ZooConfigError(
             f"{place}: policy_kwargs has symmetric, which needs range finders that look equally "
             "far to both sides; take it away, or set range_finders to scr or narrow"
@@ -222,7 +215,9 @@ def _check_symmetric(entry: Entry, place: Place) -> None:
 
 def _check_env_kwargs(env_kwargs: Any, env_id: str, place: Place) -> None:
     """Check what goes to ``gym.make``."""
-    if isinstance(env_kwargs, Mapping) and TIME_LIMIT in env_kwargs:
+    if not isinstance(env_kwargs, Mapping | None):
+        raise ZooConfigError(f"{place}: env_kwargs is {env_kwargs!r}; expected '{{key: value}}'")
+    if env_kwargs is not None and TIME_LIMIT in env_kwargs:
         limit = env_kwargs[TIME_LIMIT]
         if not is_count(limit):
             raise ZooConfigError(
@@ -289,33 +284,56 @@ def decisions(entry: Entry) -> int:
     return int(float(entry["n_timesteps"]))
 
 
-def _check_numbers(entry: Entry, place: Place) -> None:
-    """Check numbers that are read, or used, only when the training has begun."""
-    steps = entry["n_timesteps"]
+def _is_budget(value: Any) -> bool:
     try:
-        good = not isinstance(steps, bool) and 1.0 <= float(steps) < float("inf")
+        return not isinstance(value, bool) and 1.0 <= float(value) < float("inf")
     except (TypeError, ValueError):
-        good = False
-    if not good:
-        raise ZooConfigError(f"{place}: n_timesteps is {steps!r}; expected a number >= 1")
-    for key in SCHEDULES:
-        value = entry.get(key)
-        word = isinstance(value, str) and re.fullmatch(r"(lin_)?[\d.]+(e[+-]?\d+)?", value)
-        if value is not None and not word and not is_number(value):
-            raise ZooConfigError(
-                f"{place}: {key} is {value!r}; expected a number, or lin_NUMBER to fall to 0"
-            )
-    for key in COUNTS:
-        if not is_count(entry.get(key, 1)):
-            raise ZooConfigError(
-                f"{place}: {key} is {entry[key]!r}; expected a whole number >= 1, e.g. 64"
-            )
-    for key in SHARES:
-        value = entry.get(key, 1.0)
-        if not (is_number(value) and 0.0 <= value <= 1.0):
-            raise ZooConfigError(
-                f"{place}: {key} is {value!r}; expected a number from 0 to 1, e.g. 0.005"
-            )
+        return False
+
+
+def _is_schedule(value: Any) -> bool:
+    if isinstance(value, str):
+        return bool(re.fullmatch(r"(lin_)?[\d.]+(e[+-]?\d+)?", value))
+    return value is None or is_number(value)
+
+
+def _is_share(value: Any) -> bool:
+    return is_number(value) and 0.0 <= value <= 1.0
+
+
+NUMBERS: tuple[tuple[tuple[str, ...], Callable[[Any], bool], str], ...] = (
+    (("n_timesteps",), _is_budget, "a number >= 1"),
+    (
+        ("learning_rate", "clip_range", "clip_range_vf", "delta_std"),
+        _is_schedule,
+        "a number, or lin_NUMBER to fall to 0",
+    ),
+    (
+        ("n_envs", "batch_size", "buffer_size", "n_steps", "n_epochs", "policy_delay"),
+        is_count,
+        "a whole number >= 1, e.g. 64",
+    ),
+    (("gamma", "tau", "gae_lambda"), _is_share, "a number from 0 to 1, e.g. 0.005"),
+    (
+        ("learning_starts",),
+        lambda value: is_count(value) or value == 0,
+        "a whole number >= 1, or 0",
+    ),
+    (
+        ("gradient_steps",),
+        lambda value: is_count(value) or value == -1,
+        "a whole number >= 1, or -1",
+    ),
+)
+"""Numbers that are read, or used, only when the training has begun: keys, rule, and its words."""
+
+
+def _check_numbers(entry: Entry, place: Place) -> None:
+    """Make sure that numbers are such that one can train with them."""
+    for keys, good, words in NUMBERS:
+        for key in keys:
+            if key in entry and not good(entry[key]):
+                raise ZooConfigError(f"{place}: {key} is {entry[key]!r}; expected {words}")
 
 
 def _env_class(env_id: str) -> Callable[..., Any]:

@@ -101,6 +101,15 @@ def test_the_word_scripted_is_the_scripted_driver(env):
     assert isinstance(models.load_driver("scripted", env), ScriptedDriver)
 
 
+def test_the_scripted_driver_looks_around_in_its_own_way():
+    assert models.driver_record("scripted") == models.TrainingRecord()
+    with (
+        gym.make("TorcsLite-v0", range_finders="narrow") as narrow,
+        pytest.raises(InvalidOption, match=r"'scr', not with .*leave --range-finders out"),
+    ):
+        models.load_driver("scripted", narrow)
+
+
 def test_a_folder_stands_for_its_best_model(saved):
     _, path = saved
     (path.parent / "TorcsLite-v0").mkdir()

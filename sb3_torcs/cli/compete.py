@@ -52,10 +52,9 @@ def run(args: argparse.Namespace) -> int:
     :return: the exit status
     """
     from sb3_torcs.driving import Agent
-    from sb3_torcs.models import TrainingRecord, find_model, one_track, training_record
+    from sb3_torcs.models import driver_record, one_track
 
-    scripted = args.model == "scripted"
-    record = TrainingRecord() if scripted else training_record(find_model(args.model))
+    record = driver_record(args.model)
     settings = {name: record.env_kwargs[name] for name in KEPT if name in record.env_kwargs}
     given = {"track": args.track, "car": args.car, "host": args.host, "port": args.port}
     settings |= {name: value for name, value in given.items() if value is not None}

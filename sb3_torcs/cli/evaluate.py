@@ -94,11 +94,10 @@ def _drive(args: argparse.Namespace) -> tuple[list[Episode], Any]:
     """Build the environment, load the driver, drive."""
     from sb3_torcs.cli.recording import Recorder
     from sb3_torcs.evaluation import evaluate, time_limit
-    from sb3_torcs.models import TrainingRecord, find_model, load_driver, training_record
+    from sb3_torcs.models import driver_record, load_driver
     from sb3_torcs.zoo import check_racing
 
-    scripted = args.model == "scripted"
-    record = TrainingRecord() if scripted else training_record(find_model(args.model))
+    record = driver_record(args.model)
     env_id = args.env or record.env_id or DEFAULT_ENV
     check_racing(env_id)
     kwargs = environment_kwargs(args, record)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sb3_torcs.cli.common import MODEL_HELP, positive, writable_file
@@ -11,6 +10,7 @@ from sb3_torcs.cli.results import show_results
 
 if TYPE_CHECKING:
     from sb3_torcs.game import Game
+    from sb3_torcs.models import TrainingRecord
     from sb3_torcs.watching import Show
 
 __all__ = ["add_parser", "run"]
@@ -102,14 +102,14 @@ def _show(game: Game, name: str, args: argparse.Namespace) -> Show:
     :param name: of a model or a robot
     :param args: from the command line
     """
-    from sb3_torcs.models import TrainingRecord, find_model, one_track, training_record
+    from sb3_torcs.models import TrainingRecord, one_track
     from sb3_torcs.watching import Show
 
     robot, record = None, TrainingRecord()
     if name.partition(":")[0] in game.robots():
         robot = game.parse_robot(name)
-    elif name != "scripted":
-        record = training_record(_model(find_model, game, name))
+    else:
+        record = _record(game, name)
     settings = {key: record.env_kwargs[key] for key in KEPT if key in record.env_kwargs}
     if args.car is not None:
         settings["car"] = args.car
@@ -119,19 +119,18 @@ def _show(game: Game, name: str, args: argparse.Namespace) -> Show:
     return Show(game, track, robot, name, settings, opponents, args.laps)
 
 
-def _model(find_model: Any, game: Game, name: str) -> Path:
+def _record(game: Game, name: str) -> TrainingRecord:
     """
-    Find a model, and mention robots if there is none.
+    Read how a model was trained, and mention robots if there is none.
 
-    :param find_model: of :mod:`sb3_torcs.models`
     :param game: the installation
     :param name: as typed
     """
     from sb3_torcs.errors import InvalidOption, near_miss
+    from sb3_torcs.models import driver_record
 
     try:
-        path: Path = find_model(name)
-        return path
+        return driver_record(name)
     except InvalidOption as error:
         hint = near_miss(name, game.robots()).rstrip(";")
         raise InvalidOption(f"{error}; nor is there a robot '{name}'{hint}") from None

@@ -254,6 +254,8 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         if self.render_mode is None:
             gym.logger.warn('render without a mode: gym.make(..., render_mode="rgb_array")')
             return None
+        if self._closed:
+            raise EnvClosed("render after close; make a new environment")
         if self.car is None:
             raise EnvClosed("render before reset; call reset first")
         if self._viewer is None:
