@@ -20,6 +20,7 @@ import gymnasium as gym
 import numpy as np
 
 from sb3_torcs import zoo
+from sb3_torcs.cli.common import positive, seed, writable_folder
 from sb3_torcs.cli.train import TrainOptions, train_run
 from sb3_torcs.errors import OutputNotWritable, Sb3TorcsError
 from sb3_torcs.evaluation import Step, drive
@@ -61,9 +62,9 @@ def parse(words: list[str] | None) -> argparse.Namespace:
     )
     how.add_argument("--fresh", action="store_true", help="throw away what is there; start over")
     parser.add_argument(
-        "--timesteps", type=int, metavar="N", help="decisions to learn from, all runs together"
+        "--timesteps", type=positive, metavar="N", help="decisions to learn from, all runs together"
     )
-    parser.add_argument("--seed", type=int, default=0, metavar="S", help="default: 0")
+    parser.add_argument("--seed", type=seed, default=0, metavar="S", help="default: 0")
     parser.add_argument("--folder", type=Path, default=Path("demo"), help="default: demo")
     return parser.parse_args(words)
 
@@ -89,7 +90,10 @@ def read_state(folder: Path) -> tuple[int | None, int]:
     """Return the decisions wanted, if a training was ever begun here, and those learned from."""
     if not (folder / STATE).is_file():
         return None, 0
-    wanted = int(json.loads((folder / STATE).read_text())["timesteps"])
+    try:
+        wanted = int(json.loads((folder / STATE).read_text())["timesteps"])
+    except (ValueError, KeyError, TypeError):  # a full disk took half of it
+        wanted = shipped_timesteps()
     return wanted, sum(saved_steps(find_model(run, prefer_last=True)) for run in runs(folder))
 
 
@@ -113,10 +117,7 @@ def clear(folder: Path) -> None:
         )
     for path in found:
         shutil.rmtree(path) if path.is_dir() else path.unlink()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputNotWritable(f"cannot make {folder}/ ({error}); use another --folder") from error
+    writable_folder(folder)
 
 
 def shipped_timesteps() -> int:

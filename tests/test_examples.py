@@ -92,6 +92,11 @@ def test_a_fresh_start_leaves_other_files_alone(demo, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
 
 
+def test_half_a_state_is_no_obstacle(demo, tmp_path):
+    (tmp_path / demo.STATE).write_text('{"timest')
+    assert demo.read_state(tmp_path) == (demo.shipped_timesteps(), 0)
+
+
 def test_one_failed_part_of_the_show_does_not_lose_the_others(demo, monkeypatch, capsys, tmp_path):
     def broken(folder):
         raise RuntimeError("no encoder")
