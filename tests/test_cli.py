@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 import types
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_torcs import bench, evaluation, game_process, models
 from sb3_torcs.cli import VERBS, common, doctor, evaluate, main, recording, train
 from sb3_torcs.cli.train import TrainOptions
-from sb3_torcs.errors import BackendUnavailable, InvalidOption
+from sb3_torcs.errors import BackendUnavailable, InvalidOption, OutputNotWritable
 
 NAMES = [verb.__name__.rpartition(".")[2].replace("_", "-") for verb in VERBS]
 PNG = b"\x89PNG"
@@ -446,6 +447,18 @@ def test_an_interrupted_training_keeps_what_it_learned_and_says_how_to_go_on(cap
     config = models._read_plain(folder / "TorcsLite-v0" / "config.yml")
     assert config["learning_starts"] == 0  # it has its memory, so it needs no new warm-up
     assert signal.getsignal(signal.SIGINT) is handler
+
+
+def test_a_run_is_known_by_its_own_record(tmp_path):
+    """Two trainings that begin at once may each have either number."""
+    for number in (1, 2):
+        record = tmp_path / f"TorcsLite-v0_{number}" / "TorcsLite-v0" / "args.yml"
+        record.parent.mkdir(parents=True)
+        record.write_text(f"conf_file: /tmp/of{number}/zoo.yml\n")
+    found = train._run_folder(tmp_path, Path("/tmp/of2/zoo.yml"))
+    assert found == tmp_path / "TorcsLite-v0_2"
+    with pytest.raises(OutputNotWritable, match="has left nothing"):
+        train._run_folder(tmp_path, Path("/tmp/of3/zoo.yml"))
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ from types import FrameType
 from typing import Any
 
 from sb3_torcs.cli.common import positive, seed, writable_folder
-from sb3_torcs.errors import InvalidOption
+from sb3_torcs.errors import InvalidOption, OutputNotWritable
 
 __all__ = ["Run", "TrainOptions", "add_parser", "run", "train", "train_run"]
 
@@ -200,8 +200,8 @@ def train_run(options: TrainOptions) -> Run:
         words += ["--conf-file", str(conf_file), "--log-folder", str(folder)]
         words += ["--tensorboard-log", str(tensorboard)]
         words += ["--trained-agent", str(resume)] if resume else []
-        run_folder = _next_run_folder(folder, options)
         interrupted = _run_zoo([*words, *options.zoo_args])
+    run_folder = _run_folder(folder / options.algo, conf_file)
     last_model = run_folder / f"{options.env.replace('/', '-')}.zip"
     return Run(
         folder=run_folder,
@@ -289,13 +289,17 @@ def _with_progress(callbacks: Any) -> list[Any]:
     return [PROGRESS, *(item for item in items if item != PROGRESS)]
 
 
-def _next_run_folder(folder: Path, options: TrainOptions) -> Path:
-    """Foretell the folder that the zoo will make."""
-    from rl_zoo3.utils import get_latest_run_id
+def _run_folder(parent: Path, conf_file: Path) -> Path:
+    """
+    Find the run that the zoo has numbered; another training may have taken the number before.
 
-    name = options.env.replace("/", "-")
-    parent = folder / options.algo
-    return parent / f"{name}_{get_latest_run_id(f'{parent}/', name) + 1}"
+    :param parent: of all runs of the algorithm
+    :param conf_file: that this training alone was given; the run's record names it
+    """
+    records = [file for file in parent.glob("*/*/args.yml") if str(conf_file) in file.read_text()]
+    if not records:
+        raise OutputNotWritable(f"the training has left nothing in '{parent}'; start it again")
+    return records[0].parent.parent
 
 
 def _run_zoo(words: list[str]) -> bool:
