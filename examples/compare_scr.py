@@ -7,7 +7,7 @@ is 1 if they are not.
 
 import argparse
 import sys
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -18,11 +18,12 @@ import sb3_torcs  # noqa: F401  (registers the environments)
 from sb3_torcs.car import Start
 from sb3_torcs.cli.common import table
 from sb3_torcs.evaluation import Driver
-from sb3_torcs.models import load_driver
+from sb3_torcs.models import driver_record, load_driver
 
 ROUNDING = 1e-6  # [-] between observations, which are at most 3
 SAME = 1e-4  # [-] between two actions that count as the same decision
 MILLISECOND = 0.001  # [s]
+KEPT = ("car", "action_repeat", "range_finders")  # of a model's training
 HEADERS = ("track", "equal", "same decisions", "difference", "laps, engine", "laps, game")
 
 
@@ -83,11 +84,13 @@ def held(one: Drive, other: Drive) -> Comparison:
     return Comparison(number, float(apart.max()), same, laps, damage)
 
 
-def compare(track: str, driver: Driver, start: Start | None = None, laps: int = 1) -> Comparison:
-    """Let a driver drive by both."""
+def compare(
+    track: str, driver: Driver, start: Start | None = None, laps: int = 1, **settings: Any
+) -> Comparison:
+    """Let a driver drive by both, in an environment with these settings."""
     drives = []
     for backend in ("native", "scr"):
-        env = gym.make("Torcs-v0", backend=backend, track=track, laps=laps)
+        env = gym.make("Torcs-v0", backend=backend, track=track, laps=laps, **settings)
         try:
             drives.append(drive(env, driver, start))
         finally:
@@ -104,9 +107,11 @@ def main() -> None:
     words = parser.parse_args()
     tracks = words.tracks.split(",")
     rows, all_equal = [], True
-    driver = load_driver(words.model, gym.make("Torcs-v0"))
+    trained = driver_record(words.model).env_kwargs
+    settings = {name: trained[name] for name in KEPT if name in trained}
+    driver = load_driver(words.model, gym.make("Torcs-v0", **settings))
     for track in progress(tracks, "racing", console=Console(stderr=True)):
-        answer = compare(track, driver, laps=words.laps)
+        answer = compare(track, driver, laps=words.laps, **settings)
         all_equal &= answer.equal
         same = f"{answer.same_decisions} of {answer.decisions}"
         apart = f"{answer.largest_difference:.1e}"

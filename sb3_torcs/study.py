@@ -164,7 +164,7 @@ def require_ray(address: str | None = None) -> None:
     except ImportError as error:
         raise RayUnavailable(
             f"a study needs Ray Tune, which does not import ({error}); type: "
-            'pip install "sb3-torcs[study]"'
+            'pip install "sb3-torcs[study]" (in a clone: pip install ".[study]")'
         ) from error
 
 

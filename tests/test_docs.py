@@ -19,6 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 import sb3_torcs  # noqa: F401  registers the environments
 from sb3_torcs import cli, rewards, zoo
+from sb3_torcs.cli import install_torcs
 from sb3_torcs.cli.train import TrainOptions
 from sb3_torcs.driving_metrics import DrivingMetricsCallback
 from sb3_torcs.envs.torcs import TorcsEnv
@@ -320,7 +321,8 @@ def test_a_command_in_the_docs_parses_and_names_what_exists(page, line, parsed, 
             assert (ROOT / script).is_relative_to(ROOT / "examples")
             assert (ROOT / script).is_file()
         case ["sudo", "apt", "install", *packages]:
-            assert set(packages) <= {"git", "make", "g++", "python3-dev", "python3-venv"}
+            tools = {"git", "make", "g++", "python3-dev", "python3-venv"}
+            assert set(packages) <= {*tools, *install_torcs.FILM_PACKAGES}
         case other:
             pytest.fail(f"{other} is nothing that a test knows")
 

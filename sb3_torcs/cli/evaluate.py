@@ -50,8 +50,8 @@ def add_parser(subparsers: Any) -> None:
     add = parser.add_argument
     add("model", metavar="MODEL", help=MODEL_HELP)
     add("--env", metavar="ID", help=f"default: that of the training, or {DEFAULT_ENV}")
-    add("--track", metavar="T", help="`sb3-torcs tracks` lists them")
-    add("--car", metavar="C", help="e.g. car1-trb1")
+    add("--track", metavar="T", help="default: that of the training, or aalborg")
+    add("--car", metavar="C", help="default: that of the training, or car1-trb1")
     add("--episodes", type=positive, default=1, metavar="N", help="default: 1")
     add("--laps", type=positive, default=3, metavar="L", help="laps per episode; default: 3")
     add("--seed", type=seed, default=0, metavar="S", help="of the first reset; default: 0")

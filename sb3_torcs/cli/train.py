@@ -99,7 +99,8 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "train",
         help="train an agent with the RL Zoo and the shipped hyperparameters",
-        description=(__doc__ or "").split(": ", 1)[1],
+        description="Train an agent with the RL Zoo and the shipped hyperparameters, which are "
+        "found and checked before anything starts.",
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
