@@ -134,7 +134,7 @@ def test_a_damaged_folder_is_told(begun, capsys, name):
     [
         (
             {"callback": [{"sb3_torcs.callbacks.NoiseDecayCallback": {"frames": -1}}]},
-            "pass at least 1 frame",
+            "pass a whole number of at least 1 frame",
         ),
         ({"learning_rate": "fast"}, "learning_rate is 'fast'"),
         ({"policy_kwargs": {"head_bias": [0.0]}}, "head_bias"),
