@@ -36,6 +36,7 @@ class Lap(NamedTuple):
     distance: np.ndarray  # (n,) [m] from the line
     speed: np.ndarray  # (n,) [m/s]
     place: np.ndarray  # (n,) -1 to 1, left positive
+    offset: np.ndarray  # (n,) [m] from the middle of the road, left positive
     gas: np.ndarray  # (n,)
     brake: np.ndarray  # (n,)
     line: np.ndarray  # (n, 2) [m] x and y
@@ -82,6 +83,7 @@ def best_lap(name, track):
         distance=columns["distance_from_start"],
         speed=columns["speed_x"],
         place=2.0 * columns["distance_from_axis"] / columns["track_width"],
+        offset=columns["distance_from_axis"],
         gas=columns["throttle"],
         brake=columns["brake"],
         line=np.stack([columns["x"], columns["y"]], axis=1),
@@ -115,6 +117,11 @@ def where_it_brakes(lap, bend):
     ahead = np.any([np.roll(bend, -step) for step in range(int(BEFORE / STEP))], axis=0)
     braking = (lap.distance[lap.brake > BRAKING] / STEP).astype(int) % len(bend)
     return np.mean((ahead & ~bend)[braking]), np.mean(bend[braking])
+
+
+def offsets(lap, track):
+    """[m] from the middle of the road, every few metres of it."""
+    return np.interp(np.arange(0.0, track.length, STEP), lap.distance, lap.offset)
 
 
 def draw_along(figure, laps):
@@ -169,6 +176,10 @@ if __name__ == "__main__":
             f"{lap.name}: {lap.seconds:.3f} s, on the brake in {np.mean(lap.brake > BRAKING):.0%} "
             f"of it; {before:.0%} of that at most {BEFORE:.0f} m before a bend, {within:.0%} in one"
         )
+        line, last = offsets(lap, track), offsets(laps[-1], track)
+        middle, apart = np.abs(line).mean(), np.abs(line - last).mean()
+        told = f"  {middle:.2f} m from the middle of the road, {apart:.2f} m from"
+        print(f"{told} {laps[-1].name}'s line")
     figure = Figure(figsize=(12.0, 11.0), layout="constrained")
     along, bends = figure.subfigures(2, 1, height_ratios=[1.7, 1.0])
     draw_along(along, laps)
