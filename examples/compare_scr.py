@@ -107,8 +107,7 @@ def main() -> None:
     words = parser.parse_args()
     tracks = words.tracks.split(",")
     rows, all_equal = [], True
-    trained = driver_record(words.model).env_kwargs
-    settings = {name: trained[name] for name in KEPT if name in trained}
+    settings = driver_record(words.model).kept(KEPT)
     driver = load_driver(words.model, gym.make("Torcs-v0", **settings))
     for track in progress(tracks, "racing", console=Console(stderr=True)):
         answer = compare(track, driver, laps=words.laps, **settings)

@@ -7,7 +7,7 @@ import io
 import json
 import pickle
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -65,6 +65,15 @@ class TrainingRecord:
     env_id: str | None = None
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)
     statistics: Path | None = None  # of VecNormalize
+
+    def kept(self, names: Iterable[str]) -> dict[str, Any]:
+        """
+        Pick what another environment shall have in common with that of the training.
+
+        :param names: of keyword arguments
+        :return: those that the training's environment was given
+        """
+        return {name: self.env_kwargs[name] for name in names if name in self.env_kwargs}
 
 
 class NormalizedDriver:

@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
     from sb3_torcs.models import driver_record, one_track
 
     record = driver_record(args.model)
-    settings = {name: record.env_kwargs[name] for name in KEPT if name in record.env_kwargs}
+    settings = record.kept(KEPT)
     given = {"track": args.track, "car": args.car, "host": args.host, "port": args.port}
     settings |= {name: value for name, value in given.items() if value is not None}
     one_track(settings.get("track"))

@@ -118,7 +118,7 @@ def environment_kwargs(args: argparse.Namespace, record: TrainingRecord) -> dict
     from sb3_torcs.evaluation import KEPT
     from sb3_torcs.models import one_track
 
-    kwargs = {name: record.env_kwargs[name] for name in KEPT if name in record.env_kwargs}
+    kwargs = record.kept(KEPT)
     given = {name: getattr(args, name, None) for name in KEPT}
     kwargs.update({name: value for name, value in given.items() if value is not None})
     one_track(kwargs.get("track"))

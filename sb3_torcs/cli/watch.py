@@ -110,7 +110,7 @@ def _show(game: Game, name: str, args: argparse.Namespace) -> Show:
         robot = game.parse_robot(name)
     else:
         record = _record(game, name)
-    settings = {key: record.env_kwargs[key] for key in KEPT if key in record.env_kwargs}
+    settings = record.kept(KEPT)
     if args.car is not None:
         settings["car"] = args.car
     words = args.robots.split(",") if args.robots else []
