@@ -332,7 +332,7 @@ def _places(home: Path | None) -> Iterator[_Place]:
     """
     given = _given(home)
     if given is not None:
-        root = Path(given).expanduser().absolute()
+        root = Path(os.path.expanduser(given)).absolute()
         roots = [root / prefix for prefix in PREFIXES]
         if (root / "tracks").is_dir():
             yield _Place(root, root, _libraries_beside(root))

@@ -202,7 +202,7 @@ def _data(game: Game, folder: Path, race: RaceSetup) -> tuple[Path, RaceSetup]:
     track = os.fspath(race.track)
     if not track.lower().endswith(".xml"):
         return game.data, replace(race, track=game.find_track(track))
-    file = Path(track).expanduser().absolute()
+    file = Path(os.path.expanduser(track)).absolute()
     data = folder / "data"
     (data / "tracks").mkdir(parents=True)
     _link_all(game.data, data, besides="tracks")

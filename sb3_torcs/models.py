@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import os
 import pickle
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
@@ -129,7 +130,7 @@ def find_model(path: str | Path, *, prefer_last: bool = False) -> Path:
     :return: the file
     :raises InvalidOption: if there is none
     """
-    given = Path(path).expanduser()
+    given = Path(os.path.expanduser(path))
     if given.is_file():
         return given
     if Path(f"{given}.zip").is_file():

@@ -7,6 +7,7 @@ Zoo with some of its values changed; a trial is one variant with one seed.
 from __future__ import annotations
 
 import copy
+import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -96,7 +97,7 @@ def read_study(path: str | Path) -> Study:
     :raises ZooConfigError: if a variant has something that nothing would read
     :raises TrackNotFound: if there is no such track
     """
-    file = Path(path).expanduser()
+    file = Path(os.path.expanduser(path))
     said = _read(file)
     _check_keys(said, KEYS, f"{file}: unknown key")
     for key in REQUIRED:
@@ -223,7 +224,7 @@ def _trials(
     source = _source(said, changes, place)
     algo, env_id = source["algo"] or "ddpg", source["env"] or "Torcs-v0"
     zoo.check_racing(env_id)
-    conf_file = source["conf_file"] and file.parent / Path(source["conf_file"]).expanduser()
+    conf_file = source["conf_file"] and file.parent / Path(os.path.expanduser(source["conf_file"]))
     entry = zoo.read_entry(zoo.config_file(algo, conf_file), source["entry"] or env_id)
     if source["n_timesteps"] is not None:
         entry["n_timesteps"] = source["n_timesteps"]

@@ -363,7 +363,7 @@ def load_track(
 
         return random_track(rng)
     if Path(name).suffix.lower() in (TRACK_SUFFIX, ".xml"):
-        path = Path(name).expanduser()
+        path = Path(os.path.expanduser(name))
         if not path.is_file():
             raise TrackNotFound(
                 f"there is no track file '{path}'; give the path of a TORCS .xml or a "

@@ -11,6 +11,7 @@ import importlib
 import importlib.util
 import inspect
 import multiprocessing
+import os
 import re
 import signal
 from collections.abc import Callable, Iterable, Mapping
@@ -106,7 +107,7 @@ def config_file(algo: str, conf_file: str | Path | None = None) -> Path:
     :raises ZooConfigError: if there is none
     """
     if conf_file is not None:
-        path = Path(conf_file).expanduser()
+        path = Path(os.path.expanduser(conf_file))
         if not path.is_file():
             raise ZooConfigError(f"there is no hyperparameter file '{path}'; give a .yml file")
         return path

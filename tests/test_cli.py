@@ -214,10 +214,11 @@ def test_an_evaluation_as_a_table_has_a_row_per_episode(capsys):
     assert [line.split()[:2] for line in lines[3:]] == [["1", "1"], ["2", "1"]]
 
 
-def test_a_missing_model_is_told(capsys, tmp_path):
-    status, _, err = run(capsys, "evaluate", str(tmp_path / "none.zip"))
+@pytest.mark.parametrize("folder", ["none", "~nobody-of-this-name"])
+def test_a_missing_model_is_told(capsys, folder):
+    status, _, err = run(capsys, "evaluate", f"{folder}/best_model.zip")
     assert status == 2
-    assert "there is no model" in err
+    assert f"there is no model '{folder}" in err
 
 
 def test_torcs_is_not_replaced_by_something_else(capsys, monkeypatch, tmp_path):

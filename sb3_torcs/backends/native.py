@@ -101,7 +101,7 @@ def track_path(game: Game, track: str | os.PathLike[str]) -> Path:
             "tracks` lists them) or the path of a TORCS .xml; random tracks are for TorcsLite-v0"
         )
     if os.fspath(track).lower().endswith(".xml"):
-        return Path(track).expanduser().absolute()
+        return Path(os.path.expanduser(track)).absolute()
     return game.tracks()[game.find_track(os.fspath(track))].absolute()
 
 

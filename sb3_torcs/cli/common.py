@@ -6,6 +6,7 @@ import argparse
 import contextlib
 import json
 import math
+import os
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -76,7 +77,7 @@ def writable_folder(folder: str | Path) -> Path:
     :return: the folder
     :raises OutputNotWritable: if it cannot be made or written
     """
-    path = Path(folder).expanduser()
+    path = Path(os.path.expanduser(folder))
     try:
         path.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path):
@@ -97,7 +98,7 @@ def writable_file(file: str | Path, suffixes: tuple[str, ...]) -> Path:
     :return: its path
     :raises OutputNotWritable: if its folder cannot be written, or its kind is another
     """
-    path = Path(file).expanduser()
+    path = Path(os.path.expanduser(file))
     if path.suffix.lower() not in suffixes:
         raise OutputNotWritable(f"'{path}' should end in {' or '.join(suffixes)}")
     if path.is_dir():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,6 @@ def run(args: argparse.Namespace) -> int:
     """
     from sb3_torcs.study_report import write_report
 
-    folder = Path(args.folder).expanduser()
-    print(write_report(folder, Path(args.output).expanduser() if args.output else folder))
+    folder = Path(os.path.expanduser(args.folder))
+    print(write_report(folder, Path(os.path.expanduser(args.output)) if args.output else folder))
     return 0
