@@ -299,6 +299,15 @@ class TestRace:
         assert numbers(state, "track") == [-1] * 19
         assert numbers(state, "focus") == [-1] * 5
 
+    def test_each_client_is_answered_whoever_comes_first(self, serve):
+        _, first, second = serve([DRIVER, ("scr_server", 1)])
+        second.identify()
+        second.nothing_comes()
+        second.identify()
+        first.identify()
+        assert number(first.ask(STAND), "curLapTime") < 0.0
+        assert number(second.receive(), "curLapTime") < 0.0
+
     def test_two_drivers(self, serve):
         _, first, second = serve([("scr_server", 1), DRIVER])
         first.send(INIT)  # driver 0, at the second place: its turn comes last

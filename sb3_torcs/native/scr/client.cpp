@@ -86,21 +86,24 @@ void Client::open(int index) {
     socket_ = inherited ? inherited_socket(inherited, index) : bound_socket(index);
 }
 
-Init Client::identify() {
-    identified_ = false;
-    while (!identified_) {
-        watch_owner();
-        if (!wait(Clock::now() + WATCH)) continue;
-        // Of several that wait the newest is the one that still listens.
-        while (const auto text = receive()) {
-            if (is_init(*text))
-                adopt(*text);
-            else if (is_from_client() && parse_action(*text).restart)
-                send(RESTART);  // it missed that
+bool Client::await_introduction() {
+    watch_owner();
+    if (!identified_ && wait(Clock::now() + WATCH)) hear_introduction();
+    return identified_;
+}
+
+void Client::hear_introduction() {
+    bool introduced = false;
+    // Of several that wait the newest is the one that still listens.
+    while (const auto text = receive()) {
+        if (is_init(*text)) {
+            adopt(*text);
+            introduced = true;
+        } else if (is_from_client() && parse_action(*text).restart) {
+            send(RESTART);  // it missed that
         }
     }
-    send(IDENTIFIED);
-    return init_;
+    if (introduced) send(IDENTIFIED);
 }
 
 std::optional<Action> Client::ask(const State& state) {

@@ -24,8 +24,12 @@ public:
     void open(int index);
     bool has_network() const { return socket_ >= 0; }
 
-    // Waits until a client introduces itself, however long it takes.
-    Init identify();
+    // Waits a little while for a client to introduce itself. Returns whether it has, since the
+    // last one was dismissed.
+    bool await_introduction();
+
+    // As that, without waiting: for the others, who want an answer, too.
+    void hear_introduction();
 
     // Sends a state and waits for what the client answers. Past the deadline that is nothing, or
     // its late answer to an older state. Who wants a restart gets no more states before.

@@ -30,7 +30,10 @@ void Driver::new_race(CarElement* car, const Situation* situation) {
     started_ = false;
     action_ = Action{};
     action_.focus.reset();  // nobody has asked for it yet
-    if (client_.has_network() && leaving() != Leaving::UNNOTICED) client_.identify();
+    if (!client_.has_network() || leaving() == Leaving::UNNOTICED) return;
+    while (!client_.await_introduction())
+        for (Driver& other : drivers())
+            if (other.client_.has_network()) other.client_.hear_introduction();
 }
 
 bool Driver::drive() {
