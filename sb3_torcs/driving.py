@@ -46,20 +46,28 @@ class Agent:
 
     def drive(self, aftermath: float | None = None) -> None:
         """
-        Drive to the end of the race.
+        Drive to the end of the race; if it begins anew, also in that.
 
         :param aftermath: drive on for so long after leaving the road, standing and so on, and then
             stop [s]; ``None`` drives on whatever happens
         :raises ServerLost: if the server is gone
         """
         try:
-            observation, _ = self.env.reset()
-            while not self.backend.over and not self._has_enough(aftermath):
-                action, _ = self.driver.predict(observation, deterministic=True)
-                observation, _, terminated, _, info = self.env.step(action)
-                self._note(info, terminated)
+            self._race(aftermath)
+            while self.backend.restarted:
+                self.lap_times, self.distance = [], 0.0
+                self.end = self.end_time = None
+                self._race(aftermath)
         finally:
             self.env.close()
+
+    def _race(self, aftermath: float | None) -> None:
+        """Drive until the race ends, or as ``drive`` says."""
+        observation, _ = self.env.reset()
+        while not self.backend.over and not self._has_enough(aftermath):
+            action, _ = self.driver.predict(observation, deterministic=True)
+            observation, _, terminated, _, info = self.env.step(action)
+            self._note(info, terminated)
 
     def _note(self, info: dict[str, Any], terminated: bool) -> None:
         """

@@ -35,6 +35,7 @@ FULL_LUCK = 8  # at two for each look in vain, after how many it sleeps at once 
 NO_LUCK = -200  # ... for so many answers
 FIRST_PAUSE = 1.0  # [s] before the first message is said again; servers take their time to load
 PAUSE = 1.0  # [s] before an action is said again
+LONGEST_PAUSE = 5.0  # [s] until it is noticed that a port was closed
 PATIENCE = 10.0  # [s] without a word after which a server is given up
 
 
@@ -43,12 +44,15 @@ class ScrClient:
     A client that drives one car.
 
     A server on this machine that ends is noticed at once, by its port being closed; any other one
-    after ``patience``.
+    after ``patience`` or ``silence``.
 
     :param host: name or address of the server
     :param port: of the driver; the first one's is 3001
     :param angles: (19,) of the range finders [rad], left negative
-    :param patience: without a word after which the server is given up [s]
+    :param patience: without an answer to the first word, or to a wish for a restart, after which
+        the server is given up [s]
+    :param silence: without a state after which it is given up later [s], for a race that waits for
+        other clients, or that somebody has paused; ``None`` is as ``patience``
     :param pause: before an action is said again [s], then twice that, and so on: servers but ours
         take each for the answer to another state, so it should be rare
     :param latencies: to which the time from each state to its answer is added [s], for a server
@@ -64,6 +68,7 @@ class ScrClient:
         angles: FloatArray,
         *,
         patience: float = PATIENCE,
+        silence: float | None = None,
         pause: float = PAUSE,
         latencies: array[float] | None = None,
         watch: Callable[[], None] = lambda: None,
@@ -71,12 +76,15 @@ class ScrClient:
         self.address = f"{host}:{port}"
         self.over = True
         """Whether the server has ended the race, or there was none yet."""
+        self.restarted = False
+        """Whether that was to begin it anew: then whoever identifies again drives in it."""
         self.lost = 0
         """States that another one followed before our answer: the server did not wait for it."""
         self._latencies = latencies
         self._arrived = 0.0
         self._angles = angles
         self._patience = patience
+        self._silence = patience if silence is None else silence
         self._pause = pause
         self._watch = watch
         self._said = b""  # the last word, to be said again
@@ -109,7 +117,7 @@ class ScrClient:
                 f"no SCR server answers at {self.address}, tried for {self._patience:g} s; start "
                 "one with `sb3-torcs serve --track aalborg`, or check --host and --port"
             )
-        self.over = False
+        self.over = self.restarted = False
 
     def send(self, message: bytes) -> None:
         """
@@ -145,10 +153,10 @@ class ScrClient:
             if message is None:
                 self._watch()
                 waited += pause
-                if waited >= self._patience:
+                if waited >= self._silence:
                     raise self._lost(f"nothing came for {waited:.0f} s")
                 self.send(self._said)
-                pause = min(2.0 * pause, self._patience - waited)
+                pause = min(2.0 * pause, LONGEST_PAUSE, self._silence - waited)
                 continue
             state = self._newest(message)
             if state or self.over:
@@ -278,6 +286,7 @@ class ScrClient:
                     state = text
             elif text.startswith((SHUTDOWN, RESTART)):
                 self.over = True
+                self.restarted = text.startswith(RESTART)
         return state
 
     def _unreachable(self, error: OSError) -> ServerLost:
@@ -298,6 +307,6 @@ class ScrClient:
         self.over = True
         self._watch()
         return ServerLost(
-            f"the SCR server at {self.address} is lost: {why}; see what it said, and call reset "
+            f"the SCR server at {self.address} is lost: {why}; see what it said, and begin anew "
             "when it runs again"
         )

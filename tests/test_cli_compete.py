@@ -6,6 +6,7 @@ import json
 import re
 
 import pytest
+from scr_loopback import Loopback
 
 from sb3_torcs.cli import main
 from sb3_torcs.game import find_game
@@ -61,3 +62,21 @@ def test_a_server_that_is_not_there_is_told(monkeypatch, capsys):
     bound.close()
     assert main(["compete", "scripted", "--port", str(port)]) == 2
     assert f"no SCR server answers at 127.0.0.1:{port}" in capsys.readouterr().err
+
+
+class Dying(Loopback):
+    """A server that ends without a word."""
+
+    def send_state(self):
+        self.ending = self.tick > 100
+        if not self.ending:
+            super().send_state()
+
+
+def test_what_was_driven_is_told_though_the_server_is_lost(capsys):
+    with Dying() as server:
+        words = ["compete", "scripted", "--host", server.host, "--port", str(server.port), "--json"]
+        assert main(words) == 2
+    out, err = capsys.readouterr()
+    assert json.loads(out)["distance"] >= 100.0
+    assert "its port is closed" in err

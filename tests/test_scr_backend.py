@@ -44,7 +44,7 @@ from sb3_torcs.errors import (
 from sb3_torcs.game import find_game
 from sb3_torcs.race_file import RaceSetup
 from sb3_torcs.scr_game import open_ports, start_server
-from sb3_torcs.scr_protocol import SHUTDOWN, ScrState
+from sb3_torcs.scr_protocol import RESTART, SHUTDOWN, ScrState
 from sb3_torcs.tracks import load_track
 
 pytestmark = pytest.mark.usefixtures("game")
@@ -283,6 +283,26 @@ def test_a_car_that_was_taken_out_stands():
     assert [round(car.time, 6) for car in cars] == [0.1, 0.2, 0.3, 0.4]
     assert cars[-1].speed_x == 0.0
     assert cars[-1].distance_raced == cars[-2].distance_raced
+
+
+class Anew(Loopback):
+    """A race that another client has begin anew, once in the countdown and once later."""
+
+    restarts = (-1, 60)
+
+    def say(self, message):
+        if self.restarts and self.tick == self.restarts[0]:
+            self.restarts = self.restarts[1:]
+            message = RESTART
+        super().say(message)
+
+
+def test_an_agent_drives_on_in_a_race_that_begins_anew():
+    with Anew(ticks=100) as server:
+        agent = Agent("scripted", {"host": server.host, "port": server.port})
+        agent.drive()
+    assert len(server.inits) == 3
+    assert agent.distance == 99.0
 
 
 class LastLap(Loopback):

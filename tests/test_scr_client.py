@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+import time
 from array import array
 
 import numpy as np
@@ -197,6 +198,19 @@ def test_a_server_that_falls_silent_is_given_up_in_time():
         answer(client, message)
         with pytest.raises(ServerLost, match="nothing came for"):
             client.receive()
+        client.close()
+
+
+def test_a_race_that_somebody_pauses_is_waited_for():
+    with Loopback() as server:
+        client = client_of(server, patience=0.1, silence=60.0, pause=0.02)
+        client.identify()
+        message = client.receive()
+        say, until = server.say, time.monotonic() + 0.5
+        server.say = lambda message: say(message) if time.monotonic() > until else None
+        answer(client, message)
+        assert client.receive() != message
+        assert time.monotonic() > until
         client.close()
 
 

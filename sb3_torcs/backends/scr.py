@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import os
+import socket
 from array import array
 from collections.abc import Sequence
 from contextlib import suppress
@@ -32,6 +34,7 @@ MAX_PORT = 65535
 HOST = "127.0.0.1"
 PATIENCE = 60.0  # [s] with a game of our own, which also has to load on a busy machine
 PATIENCE_WITH_OTHERS = 10.0  # [s] with a server that should be there already
+SILENCE = 600.0  # [s] of a server elsewhere: the race waits for all clients; somebody may pause it
 PAUSE = 0.02  # [s] before an action is said again to our own server, which knows it again
 GRACE = 5.0  # [s] for a game whose port is closed to have ended
 STANDING = Controls(0.0, 0.0, 1.0, 0)  # until the race begins: as the cars of the engine do
@@ -160,6 +163,11 @@ class ScrBackend:
         return self._client is None or self._client.over
 
     @property
+    def restarted(self) -> bool:
+        """Whether the race has ended to begin anew, with whoever is back by then."""
+        return self._client is not None and self._client.restarted
+
+    @property
     def lost_ticks(self) -> int:
         """Control ticks for which an answer came too late, or none; since the world was made."""
         return self._lost_before + (0 if self._client is None else self._client.lost)
@@ -204,9 +212,11 @@ class ScrBackend:
         if self._own:
             self._launch()
         host, port = self._address
-        manners: dict[str, Any] = {"patience": PATIENCE_WITH_OTHERS, "latencies": self.latencies}
-        if self._own:
-            manners = {"patience": PATIENCE, "pause": PAUSE, "watch": self._watch}
+        manners: dict[str, Any] = {"patience": PATIENCE, "pause": PAUSE, "watch": self._watch}
+        if not self._own:
+            manners = {"patience": PATIENCE_WITH_OTHERS, "latencies": self.latencies}
+            # Here it is noticed when a port is closed, so that no silence is too long.
+            manners["silence"] = math.inf if _is_here(host) else SILENCE
         self._client = ScrClient(host, port, self.range_finder_angles, **manners)
         self._client.identify(start)
 
@@ -246,7 +256,13 @@ class ScrBackend:
         """
         client = self._client
         assert client is not None, "_connect makes it"
-        while (message := client.receive()) is not None:
+        while True:
+            message = client.receive()
+            if message is None and client.restarted:  # by another client, before it began
+                client.identify(start)
+                continue
+            if message is None:
+                break
             lap_time = parse_engine(message).lap_time
             if lap_time >= 0.0:
                 return message
@@ -296,6 +312,18 @@ class ScrBackend:
             raise EngineForked(
                 "this game belongs to the parent process; make the environment after the fork"
             )
+
+
+def _is_here(host: str) -> bool:
+    """
+    Say whether a server is on this machine.
+
+    :param host: name or address
+    """
+    try:
+        return socket.gethostbyname(host).startswith("127.")
+    except (OSError, UnicodeError):  # the client tells
+        return False
 
 
 def _action(controls: Controls, gear: int, lap_time: float) -> bytes:

@@ -61,11 +61,15 @@ def run(args: argparse.Namespace) -> int:
     one_track(settings.get("track"))
     with quiet_output(args.json):
         agent = Agent(args.model, settings, args.algo)
-        agent.drive()
-    if args.json:
-        print_json(_figures(agent))
-    else:
-        _show(agent)
+    try:
+        with quiet_output(args.json):
+            agent.drive()
+    finally:
+        # What was driven counts, also when the server is gone or Ctrl-C has ended it.
+        if agent.backend.latencies and args.json:
+            print_json(_figures(agent))
+        elif agent.backend.latencies:
+            _show(agent)
     return 0
 
 
