@@ -29,6 +29,7 @@ __all__ = ["read_track_file", "write_track_file"]
 
 MAGIC = ["sb3-torcs track", "1"]
 NUMBERS_PER_SEGMENT = 8
+MIN_CURVATURE = 1e-9  # [1/m] a radius of a million kilometres
 FIELDS = {
     "name": 1,
     "category": 1,
@@ -101,6 +102,8 @@ class _Reader:
         segment = Segment(*numbers, *surfaces)  # type: ignore[arg-type] # FIELDS has counted them
         if segment.length <= 0.0:
             raise self.fail(f"a segment's length is {segment.length} m; it has to be above 0")
+        if 0.0 < abs(segment.curvature) < MIN_CURVATURE:
+            raise self.fail(f"a curvature of {segment.curvature} 1/m is none; write 0")
         if min(segment.width_start, segment.width_end) <= 0.0:
             raise self.fail("the road's width has to be above 0")
         if min(numbers[4:]) < 0.0:
@@ -121,12 +124,17 @@ class _Reader:
         if keyword == "segment":
             self.segments.append(self.segment(values))
         elif keyword == "surface":
-            name, *numbers = values
-            self.surfaces[name] = Surface(name, *map(self.number, numbers))
+            name, *texts = values
+            numbers = [self.number(text) for text in texts]
+            if min(numbers) < 0.0:
+                raise self.fail("the numbers of a surface may not be negative")
+            self.surfaces[name] = Surface(name, *numbers)
         elif keyword == "grid":
             self.grid = Grid(*map(self.number, values))
         elif keyword == "start":
             x, y, heading = map(self.number, values)
+            if abs(heading) > math.tau:
+                raise self.fail(f"the heading is {heading} rad; expected -2 pi to 2 pi")
             self.start = (x, y, heading)
         else:
             self.texts[keyword] = values[0]

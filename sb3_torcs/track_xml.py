@@ -138,14 +138,18 @@ class _Builder:
         :return: the surface
         """
         inside = () if self.version >= 4 else ("List",)
-        numbers = self.root.child("Surfaces", *inside, name).numbers
-        return Surface(
+        section = self.root.child("Surfaces", *inside, name)
+        numbers = section.numbers
+        surface = Surface(
             name,
             numbers.get("friction", 0.8),
             numbers.get("rolling resistance", 0.001),
             numbers.get("rebound", 0.5 if self.version >= 4 else 1.0),
             numbers.get("dammage", 10.0),
         )
+        if min(surface[1:]) < 0.0:
+            raise TrackFileError(f"{section.place}: the surface '{name}' has a negative number")
+        return surface
 
     def add(self, section: Section) -> None:
         """
@@ -355,8 +359,8 @@ def read_track_xml(path: Path) -> Track:
     root = read_params(path)
     header = root.child("Header")
     version = int(header.numbers.get("version", 0.0))
-    if version > 4:
-        raise TrackFileError(f"{header.place}: version {version} of the format; known are up to 4")
+    if not 0 <= version <= 4:
+        raise TrackFileError(f"{header.place}: version {version} of the format; known are 0 to 4")
     builder = _Builder(root, version)
     listed = builder.main.child("Track Segments" if version >= 4 else "segments")
     for section in listed.children.values():

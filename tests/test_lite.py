@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from sb3_torcs.backends import lite_physics as physics
 from sb3_torcs.backends.lite import LiteBackend
 from sb3_torcs.backends.lite_rays import RANGE, cast, road_edges
 from sb3_torcs.car import Controls, Start
-from sb3_torcs.errors import InvalidOption
+from sb3_torcs.errors import CarLost, InvalidOption
 from sb3_torcs.tracks import Grid, Track
 
 RNG = np.random.default_rng(0)
@@ -245,6 +246,15 @@ def test_beams_agree_with_a_slow_and_obvious_ray_march():
             state[physics.Y] = y + walked * math.sin(heading - math.radians(angle))
             physics.locate(state, track.table)
         assert beam == pytest.approx(min(walked, RANGE), abs=0.02)
+
+
+def test_a_road_that_holds_too_well_loses_the_car(oval):
+    """The tyres shake it apart; so the episode ends, as on the real game, and no NaN is learned."""
+    glue = [s._replace(road=s.road._replace(friction=1e3)) for s in oval.segments]
+    world = LiteBackend(replace(oval, segments=tuple(glue)))
+    world.reset(np.random.default_rng(0), Start(0.0, 0.0, 0.3, 60.0))
+    with pytest.raises(CarLost, match="see the surfaces of that track"):
+        world.step(Controls(1.0, 1.0, 0.0), 1000)
 
 
 def test_a_car_it_does_not_have_is_refused(oval):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from sb3_torcs.backends import lite_physics as physics
 from sb3_torcs.backends.lite_rays import RANGE, Edges, road_edges
 from sb3_torcs.backends.lite_road import road_width
 from sb3_torcs.car import CarState, Controls, FloatArray, Start
-from sb3_torcs.errors import InvalidOption
+from sb3_torcs.errors import CarLost, InvalidOption
 from sb3_torcs.sensors import range_finder_angles
 from sb3_torcs.tracks import Track, load_track
 
@@ -85,6 +86,11 @@ class LiteBackend:
             ticks,
             self._flying,
         )
+        if not math.isfinite(self._state[physics.X] + self._state[physics.VX]):
+            raise CarLost(
+                f"the physics has come to no number on {self.track.name}, the car is nowhere; see "
+                "the surfaces of that track, and call reset to go on"
+            )
         return self._read()
 
     def close(self) -> None:
