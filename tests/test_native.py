@@ -572,9 +572,19 @@ class TestAmongRobots:
         full = backend.reset(rng, None).fuel
         assert backend.step(Controls(0.0, 1.0, 0.0), 200).fuel < full
 
-    def test_a_name_alone_is_no_list_of_opponents(self):
-        with pytest.raises(InvalidOption, match="opponents is 'inferno'; expected a list of names"):
-            NativeBackend("aalborg", opponents="inferno")
+    @pytest.mark.parametrize("opponents", ["inferno", None, 5, [1], {"inferno", "bt"}])
+    def test_what_is_no_list_of_opponents(self, opponents):
+        with pytest.raises(InvalidOption, match=r"opponents is .*; expected a list of names"):
+            NativeBackend("aalborg", opponents=opponents)
+
+    def test_nobody_drives_two_cars(self):
+        with pytest.raises(InvalidOption, match="inferno:3 is named twice"):
+            NativeBackend("aalborg", opponents=("inferno", "bt", "inferno:3"))
+
+    @pytest.mark.parametrize("laps", ["three", 2.5, 0, -5, 1 << 31])
+    def test_laps_that_nobody_can_drive(self, laps):
+        with pytest.raises(InvalidOption, match="expected a whole number from 1 to 1073741824"):
+            NativeBackend("aalborg", opponents=("inferno",), laps=laps)
 
     def test_the_default_driver_has_the_agent_s_car(self, game):
         for name in ("inferno", "bt", "olethros"):
@@ -634,6 +644,9 @@ class TestFieldsAndWalls:
         backend = NativeBackend("e-track-2")
         with pytest.raises(InvalidOption, match="would stand in a wall"):
             backend.reset(rng, Start(53.87, 0.952))
+        pickle.loads(pickle.dumps(backend))  # which has not begun
+        assert np.isfinite(backend.engine.read(0).x)
+        assert np.isfinite(backend.step(Controls(0.0, 1.0, 0.0), 5).x)
         assert np.isfinite(backend.reset(rng, Start(53.87, 0.3)).x)
 
     def test_an_agent_that_comes_last_drives_on(self, rng):

@@ -12,6 +12,7 @@ import re
 import sys
 import threading
 import time
+from contextlib import nullcontext
 
 import gymnasium as gym
 import numpy as np
@@ -269,6 +270,10 @@ def value(name, new):
 
 
 MAIN_WIDTH = r'(<section name="Main Track">.*?<attnum name="width"[^>]*val=")[^"]*"'
+PIT_LENGTH = r'(<section name="Pits">.*?<attnum name="length"[^>]*val=")[^"]*"'
+FAR_GRID = """<section name="Starting Grid">
+  <attnum name="distance to start" val="30000"/>
+</section>"""
 BROKEN_TRACKS = {
     "empty": lambda text: "",
     "truncated": lambda text: text[: len(text) // 2],
@@ -287,7 +292,26 @@ BROKEN_TRACKS = {
     "negative width": lambda text: changed(MAIN_WIDTH, r'\g<1>-15"', text),
     "surfaces elsewhere": lambda text: text.replace("data/tracks/surfaces", "nowhere/surfaces"),
     "another version": lambda text: changed(*value("version", 9), text),
+    "negative version": lambda text: changed(*value("version", -1), text),
+    "negative friction": lambda text: changed(*value("friction", -1), text),
+    "no pits": lambda text: changed(PIT_LENGTH, r'\g<1>0"', text),
+    "short pits": lambda text: changed(PIT_LENGTH, r'\g<1>1e-30"', text),
+    "grid beyond": lambda text: changed('<section name="Main Track">', rf"{FAR_GRID}\g<0>", text),
 }
+
+
+def circle(arcs, radius):
+    """A track that bends to the left for ever: degrees and metres."""
+    segments = "".join(
+        f"""<section name="{number}"><attstr name="type" val="lft"/>
+        <attnum name="arc" unit="deg" val="{arc}"/><attnum name="radius" val="{radius}"/>
+        </section>"""
+        for number, arc in enumerate(arcs)
+    )
+    return f"""<params name="circle"><section name="Header">
+        <attstr name="name" val="circle"/><attnum name="version" val="4"/></section>
+        <section name="Main Track"><attnum name="width" val="10"/>
+        <section name="Track Segments">{segments}</section></section></params>"""
 
 
 class TestTracks:
@@ -306,6 +330,20 @@ class TestTracks:
             if raised[0] != "TrackFileError" or path.name not in raised[1]
         }
         assert wrong == {}
+
+    @pytest.mark.parametrize(
+        ("arcs", "radius", "message"),
+        [
+            ((180, 180), 100, None),
+            ((240, 120), 100, "turns by 240 degrees, and 180 is the most"),
+            ((180, 180), 9, "is 57 m long, and its grid has place 1 100 m before the line"),
+        ],
+    )
+    def test_a_circle(self, arcs, radius, message, tmp_path):
+        path = tmp_path / "circle.xml"
+        path.write_text(circle(arcs, radius))
+        with pytest.raises(TrackFileError, match=message) if message else nullcontext():
+            NativeBackend(path)
 
     @pytest.mark.parametrize("name", ["aalbrog", "road/aalbrog", "", "oval/aalborg", "../aalborg"])
     def test_a_name_that_is_none(self, name):

@@ -4,6 +4,7 @@
 #include <unistd.h>
 
 #include <algorithm>
+#include <cerrno>
 #include <cmath>
 #include <cstring>
 
@@ -13,12 +14,16 @@ namespace torcs {
 
 namespace {
 
+constexpr float PI = 3.14159265f;
+constexpr float HALF_CIRCLE = PI + 1e-3f;  // [rad] and what rounding adds
+
 // Reads memory that may not be mapped: writing it into a pipe fails politely then.
 class Probe {
 public:
     Probe() {
         if (pipe2(ends_, O_CLOEXEC) != 0)
-            throw Error("BackendUnavailable", "no free file descriptor for a pipe");
+            throw Error("BackendUnavailable",
+                        std::string("a pipe cannot be had: ") + std::strerror(errno) + MORE_FILES);
     }
     ~Probe() {
         close(ends_[0]);
@@ -107,6 +112,11 @@ void check_track(const TrackData* track, const Params& file, const std::string& 
         if (!(std::isfinite(next.length) && next.length > 0.0f))
             throw Error("TrackFileError", path + " has a segment that is " +
                                               std::to_string(next.length) + " m long");
+        // Range finders would look past its other end.
+        if (next.type != STRAIGHT && !(next.arc <= HALF_CIRCLE))
+            throw Error("TrackFileError", path + " has a segment that turns by " +
+                                              std::to_string(std::lround(next.arc * 180.0f / PI)) +
+                                              " degrees, and 180 is the most; cut it into two");
     }
     if (address != data.last)
         disagree("the number of segments", "that of the ring",

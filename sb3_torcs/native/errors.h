@@ -12,4 +12,8 @@ struct Error : std::runtime_error {
     const char* python_class;
 };
 
+// What to do about EMFILE.
+constexpr const char* MORE_FILES =
+    "; each module of a race keeps a file open: raise the limit with ulimit -n";
+
 }  // namespace torcs

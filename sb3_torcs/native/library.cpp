@@ -280,7 +280,7 @@ void forget_needs(std::vector<char>& bytes, const std::string& folder) {
     std::string remedy = REINSTALL;
     if (reason.find(strerror(EMFILE)) != std::string::npos) {
         error = "BackendUnavailable";
-        remedy = "; each module of a race keeps a file open: raise the limit with ulimit -n";
+        remedy = MORE_FILES;
     } else if (access("/proc/self/fd", F_OK) != 0) {
         error = "BackendUnavailable";
         remedy = "; the loader finds copies of modules in /proc, which is not mounted";

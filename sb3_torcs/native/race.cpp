@@ -3,6 +3,7 @@
 
 #include <algorithm>
 #include <atomic>
+#include <cerrno>
 #include <cmath>
 #include <cstring>
 
@@ -16,6 +17,7 @@ namespace {
 constexpr std::size_t RACE_MEMORY = std::size_t{128} << 20;  // reserved; a full grid uses 17
 constexpr std::size_t TRACK_MEMORY = std::size_t{64} << 20;
 
+constexpr float PIT_LENGTH = 15.0f, SHORTEST_PIT = 1.0f;  // [m] by default; longer than nothing
 constexpr double COUNTDOWN = -2.0;   // [s]
 constexpr int SETTLING_STEPS = 500;  // of standing on the brake, so that the springs come to rest
 constexpr int MANY_LAPS = 1 << 30;
@@ -42,11 +44,6 @@ Arena& take_arena(Game& game, std::size_t size) {
     return *arena;
 }
 
-void give_back(Arena& arena, std::size_t size) {
-    arena.clear();
-    spare_arenas(size).push_back(&arena);
-}
-
 void copy_name(char (&to)[NAME_LENGTH], const std::string& from) {
     std::strncpy(to, from.c_str(), NAME_LENGTH - 1);
 }
@@ -66,23 +63,40 @@ void no_race(int, CarElement*, Situation*) {}
 int no_pit(int, CarElement*, Situation*) { return 0; }
 void no_shutdown(int) {}
 
+[[noreturn]] void refuse_file(const char* error, const std::string& path) {
+    const std::string reason = printed();
+    if (reason.find(std::strerror(EMFILE)) != std::string::npos)
+        throw Error("BackendUnavailable", path + ": " + reason + MORE_FILES);
+    throw Error(error, path + ": " + reason);
+}
+
 Robot agent_robot() {
     return {no_track, no_race, no_race, no_race, no_pit, no_shutdown, 0};
 }
 
 }  // namespace
 
+LentArena::LentArena(Game& game, std::size_t size)
+    : game_(game), size_(size), arena_(take_arena(game, size)) {}
+
+LentArena::~LentArena() {
+    std::lock_guard<std::mutex> lock(game_.mutex);
+    arena_.clear();
+    spare_arenas(size_).push_back(&arena_);
+}
+
 Race::Race(Game& game, RaceOptions options)
     : game_(game),
       options_(std::move(options)),
-      arena_(take_arena(game, RACE_MEMORY)),
-      track_arena_(take_arena(game, TRACK_MEMORY)),
+      memory_(game, RACE_MEMORY),
+      track_memory_(game, TRACK_MEMORY),
+      arena_(memory_.arena()),
       session_(game, nullptr) {
     static std::atomic<std::uint64_t> races{0};
     number_ = ++races;
     std::lock_guard<std::mutex> lock(game_.mutex);
     host_ = {&arena_, new_random(arena_), game_.data};
-    track_host_ = {&track_arena_, host_.random, game_.data};
+    track_host_ = {&track_memory_.arena(), host_.random, game_.data};
     try {
         load_track();
         load_cars();
@@ -104,7 +118,7 @@ void Race::close() {
         for (int i = 0; i < world_->situation.cars_number; i++) {
             CarElement& car = world_->cars[i];
             try {
-                if (car.robot && car.robot->shutdown) car.robot->shutdown(car.robot->index);
+                if (i < set_up_ && car.robot->shutdown) car.robot->shutdown(car.robot->index);
             } catch (const Error&) {
                 // Its memory goes with the race all the same.
             }
@@ -120,8 +134,6 @@ void Race::close() {
     for (auto& library : robot_libraries_) Library::give_back(std::move(library));
     Library::give_back(std::move(simulation_library_));
     Library::give_back(std::move(track_library_));
-    give_back(arena_, RACE_MEMORY);
-    give_back(track_arena_, TRACK_MEMORY);
 }
 
 // ---- Loading ------------------------------------------------------------------------------------
@@ -131,22 +143,26 @@ void Race::load_track() {
     track_library_ = game_.take_module("modules/track", "track");
     ModuleInfo module = module_info(*track_library_, "track", 0);
     module.init(module.index, &track_interface_);
-    if (!Params::read(game_, options_.track))
-        throw Error("TrackFileError", options_.track + ": " + printed());
+    const Params file = Params::read(game_, options_.track);
+    if (!file) refuse_file("TrackFileError", options_.track);
     std::string path = options_.track;
+    // The game's loader lays pits until the end of the lane, however short they are.
+    if (!(file.number("Main Track", "pit length", PIT_LENGTH) >= SHORTEST_PIT &&
+          file.number("Main Track/Pits", "length", PIT_LENGTH) >= SHORTEST_PIT))
+        throw Error("TrackFileError", path + " has pits of no length; 15 m are usual");
     forget_printed();
     try {
         track_ = track_interface_.build(path.data());
     } catch (const Error& error) {
         throw Error("TrackFileError", path + ": " + error.what());
     }
-    check_track(track_, Params::read(game_, options_.track), options_.track);
+    check_track(track_, file, path);
 }
 
 Params Race::load_car(const std::string& name) {
     const std::string path = "cars/" + name + "/" + name + ".xml";
     Params car = Params::read(game_, path);
-    if (!car) throw Error("CarFileError", game_.data + path + ": " + printed());
+    if (!car) refuse_file("CarFileError", game_.data + path);
     const std::string category = car.text("Car", "category");
     if (category.empty())
         throw Error("CarFileError",
@@ -260,6 +276,7 @@ void Race::load_driver(CarElement& car, const Entry& entry) {
     copy_name(car.info.category, params.text("Car", "category"));
     void* own = nullptr;
     car.robot->new_track(entry.index, track_, params.handle(), &own, &world_->situation);
+    set_up_++;
     if (own) {
         Params setup(game_, own);
         if (setup.misfits(params))
@@ -329,7 +346,14 @@ float Race::grid_to_right(int index) const {
 }
 
 void Race::place_on_grid(CarElement& car) {
-    place(field(), car, grid_distance(car.index), grid_to_right(car.index), 0.0f,
+    const float distance = grid_distance(car.index);
+    if (!(distance >= 0.0f && distance <= track_->length))
+        throw Error("TrackFileError",
+                    options_.track + " is " + std::to_string(std::lround(track_->length)) +
+                        " m long, and its grid has place " + std::to_string(car.index + 1) + " " +
+                        std::to_string(std::lround(track_->length - distance)) +
+                        " m before the line; name fewer opponents, or see its Starting Grid");
+    place(field(), car, distance, grid_to_right(car.index), 0.0f,
           grid_number("initial height", 0.3f));
 }
 
@@ -406,6 +430,15 @@ void Race::start() { restore(on_grid_); }
 
 void Race::start(const Start& start) {
     restore(ready_);
+    try {
+        start_elsewhere(start);
+    } catch (...) {
+        this->start();  // what was begun cannot be driven
+        throw;
+    }
+}
+
+void Race::start_elsewhere(const Start& start) {
     Hosted hosted(host_);
     Situation& situation = world_->situation;
     const std::vector<double> distances = put_down(field(), situation, start, rest_heights_);

@@ -62,6 +62,22 @@ struct Snapshot {
     std::vector<Variables> variables;
 };
 
+// Memory that comes from a race that is closed, if there is one, and goes to a later one.
+class LentArena {
+public:
+    LentArena(Game& game, std::size_t size);
+    ~LentArena();
+    LentArena(const LentArena&) = delete;
+    LentArena& operator=(const LentArena&) = delete;
+
+    Arena& arena() const { return arena_; }
+
+private:
+    Game& game_;
+    std::size_t size_;
+    Arena& arena_;
+};
+
 class Race {
 public:
     Race(Game& game, RaceOptions options);
@@ -146,6 +162,7 @@ private:
     Field field() const;
     void assign_pits();
     void prepare();
+    void start_elsewhere(const Start& start);
 
     void step();
     bool call_is_due() const;
@@ -171,9 +188,9 @@ private:
     std::uint64_t number_;
     Game& game_;
     RaceOptions options_;
-    Arena& arena_;
+    LentArena memory_, track_memory_;
+    Arena& arena_;  // of memory_
     Host host_;
-    Arena& track_arena_;
     Host track_host_;
     std::unique_ptr<Library> track_library_, simulation_library_;
     std::vector<std::unique_ptr<Library>> robot_libraries_;
@@ -188,6 +205,7 @@ private:
     World* world_ = nullptr;
     SimulatedCar** simulated_ = nullptr;
     int agent_ = -1;
+    int set_up_ = 0;  // drivers that know the track
     std::vector<float> rest_heights_;  // [m] of each car's mass centre over the road, standing
     Snapshot ready_, on_grid_;
 };
