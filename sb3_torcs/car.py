@@ -16,11 +16,13 @@ from sb3_torcs.errors import InvalidOption
 
 __all__ = [
     "CONTROL_TICK",
+    "MANY_LAPS",
     "MAX_DAMAGE",
     "CarState",
     "Controls",
     "FloatArray",
     "Start",
+    "checked_laps",
     "checked_start",
     "checked_start_speed",
     "is_count",
@@ -32,6 +34,9 @@ FloatArray = npt.NDArray[np.float64]
 CONTROL_TICK = 0.02
 """[s] The interval at which TORCS calls its robots; one decision lasts a whole number of them."""
 
+
+MANY_LAPS = 1 << 30
+"""That nobody drives to the end; the game counts to twice as many."""
 
 MAX_DAMAGE = 10000.0
 """[points] At which TORCS takes a car out of the race; its drag has doubled by then."""
@@ -70,6 +75,23 @@ class Start(NamedTuple):
 
 STARTS = ("grid", "random")
 MAX_START_SPEED = 150.0  # [m/s] what the observation of the speed can say
+
+
+def checked_laps(laps: int | None) -> int | None:
+    """
+    Check the length of a race.
+
+    :param laps: ``None`` drives on
+    :return: the same
+    :raises InvalidOption: if nobody can drive so many
+    """
+    if laps is None:
+        return None
+    if not is_count(laps) or laps > MANY_LAPS:
+        raise InvalidOption(
+            f"laps is {laps!r}; expected a whole number from 1 to {MANY_LAPS}, or None"
+        )
+    return int(laps)
 
 
 def checked_start(start: str) -> str:

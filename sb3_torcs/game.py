@@ -162,8 +162,8 @@ class Game:
         :raises UnknownCar: if there is none of this name
         """
         cars = self.cars()
-        if name not in cars:
-            hint = near_miss(name, cars)
+        if not isinstance(name, str) or name not in cars:
+            hint = near_miss(str(name), cars)
             raise UnknownCar(
                 f"the game at {self.data} has no car '{name}'{hint} it has {', '.join(cars)}"
             )
@@ -180,7 +180,7 @@ class Game:
         :raises UnknownRobot: if there is none of this name, or none with this index
         """
         name, colon, index = text.strip().partition(":")
-        if not name or (colon and not index.isdigit()):
+        if not name or (colon and not (index.isascii() and index.isdigit())):
             raise InvalidOption(f"robot {text!r}: expected NAME or NAME:INDEX, e.g. inferno:3")
         if colon:
             return name, self.find_robot(name, int(index)).index
@@ -466,5 +466,5 @@ def _drivers(path: Path) -> list[RobotEntry]:
     return sorted(
         RobotEntry(int(index), section.texts.get("name", ""), section.texts.get("car name", ""))
         for index, section in listed.items()
-        if index.isdigit() and section.texts.get("type", "robot") == "robot"
+        if index.isascii() and index.isdigit() and section.texts.get("type", "robot") == "robot"
     )

@@ -10,12 +10,11 @@ from pathlib import Path
 from typing import Literal
 from xml.etree import ElementTree
 
-from sb3_torcs.car import is_count
+from sb3_torcs.car import MANY_LAPS, checked_laps
 from sb3_torcs.errors import GameIncomplete, InvalidOption
 from sb3_torcs.game import Game
 
 __all__ = [
-    "MANY_LAPS",
     "RACE_FILE",
     "SCR_DRIVERS",
     "SCR_SERVER",
@@ -30,7 +29,6 @@ Session = Literal["practice", "race"]
 SESSIONS: Mapping[str, str] = {"practice": "practice", "race": "quickrace"}
 """The game's own descriptions of the sessions; all but track, drivers and laps stays as there."""
 
-MANY_LAPS = 1 << 30  # that nobody drives to the end; as many as in the engine
 RACE_FILE = "race.xml"  # names the folder of the results, too
 ENGINE_SETTINGS = "config/raceengine.xml"
 
@@ -72,8 +70,7 @@ class RaceSetup:
     def __post_init__(self) -> None:
         if self.session not in SESSIONS:
             raise InvalidOption(f"session is {self.session!r}; expected {' or '.join(SESSIONS)}")
-        if not is_count(self.laps):
-            raise InvalidOption(f"laps is {self.laps!r}; expected a whole number >= 1")
+        checked_laps(self.laps)
         drivers = list(self.drivers)
         if self.session == "practice" and len(drivers) != 1:
             raise InvalidOption(

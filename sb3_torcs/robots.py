@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from sb3_torcs.backends.native import make_engine
-from sb3_torcs.car import CarState, is_count
+from sb3_torcs.car import CarState
 from sb3_torcs.errors import InvalidOption, OutputNotWritable
 from sb3_torcs.game import find_game
+from sb3_torcs.race_file import RaceSetup, Session
 from sb3_torcs.race_results import Lap, RobotResult
 
 __all__ = ["TELEMETRY_FIELDS", "race"]
@@ -28,7 +29,7 @@ def race(
     track: str,
     laps: int,
     *,
-    session: str = "practice",
+    session: Session = "practice",
     telemetry: Path | None = None,
 ) -> list[RobotResult]:
     """
@@ -45,8 +46,7 @@ def race(
     """
     if not robots or len(robots) > MAX_ROBOTS:
         raise InvalidOption(f"{len(robots)} robots; expected 1 to {MAX_ROBOTS}")
-    if not is_count(laps):
-        raise InvalidOption(f"laps is {laps!r}; expected a whole number >= 1")
+    RaceSetup(track, robots, laps, session)  # refuses what the game itself would not drive
     engine = make_engine(find_game(), track, robots, session=session, laps=laps)
     try:
         engine.start()

@@ -173,7 +173,8 @@ def test_random_starts_are_as_fast_as_asked(oval):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"action_repeat": 0}, "action_repeat is 0; expected a whole number >= 1"),
+        ({"action_repeat": 0}, "action_repeat is 0; expected a whole number from 1 to"),
+        ({"action_repeat": 1 << 31}, "action_repeat is 2147483648"),
         ({"laps": 0}, "laps is 0"),
         ({"laps": True}, "laps is True"),
         ({"start": "pits"}, "start is 'pits'; expected 'grid' or 'random'"),
@@ -189,6 +190,7 @@ def test_a_bad_option_says_what_is_allowed(oval, options, message):
     ("options", "message"),
     [
         ({"place": 3.0}, "unknown reset option 'place'"),
+        (["distance"], "options of reset is .* expected a dict"),
         ({"speed": math.nan}, "reset option speed is nan"),
         ({"speed": -1.0}, "expected 0 to 150"),
         ({"speed": 5000.0}, "speed is 5000 m/s; expected 0 to 150"),
@@ -217,6 +219,20 @@ def test_a_wrong_shape_says_the_right_one(oval):
     env.reset(seed=0)
     with pytest.raises(InvalidAction, match=r"shape \(2,\), expected \(3,\)"):
         env.step(np.zeros(2, np.float32))
+
+
+def test_after_a_reset_that_failed_there_is_no_step(oval, monkeypatch):
+    env = RacingEnv(ScriptedBackend(oval))
+    env.reset(seed=0)
+
+    def reset(rng, start):
+        raise InvalidOption("start elsewhere")
+
+    monkeypatch.setattr(env.backend, "reset", reset)
+    with pytest.raises(InvalidOption, match="start elsewhere"):
+        env.reset(options={"distance": 10.0})
+    with pytest.raises(EnvClosed, match="call reset first"):
+        env.step(GAS)
 
 
 def test_an_environment_out_of_use_says_what_to_do(oval):

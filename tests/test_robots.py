@@ -137,14 +137,16 @@ class TestRefusals:
         [
             ([], 1, "0 robots; expected 1 to 20"),
             ([("inferno", 3)] * (MAX_ROBOTS + 1), 1, "21 robots; expected 1 to 20"),
-            ([("inferno", 3)], 0, "laps is 0; expected a whole number >= 1"),
+            ([("inferno", 3)], 0, "laps is 0; expected a whole number from 1 to 1073741824"),
+            ([("inferno", 3)], 1 << 31, "laps is 2147483648"),
+            ([("inferno", 3)] * 2, 1, "expected at least one, none of them twice"),
             ([("inferno", 3)], 1.5, "laps is 1.5"),
             ([("inferno", 3)], True, "laps is True"),
         ],
     )
     def test_a_race_that_is_none(self, robots, laps, message):
         with pytest.raises(InvalidOption, match=message):
-            race(robots, "aalborg", laps)
+            race(robots, "aalborg", laps, session="race" if len(robots) > 1 else "practice")
 
     def test_a_session_that_is_none(self, game):
         with pytest.raises(InvalidOption, match="session is 'rally'; expected practice or race"):
@@ -166,7 +168,7 @@ class TestRefusals:
         with pytest.raises(TrackNotFound, match="no track 'aalbrog'; did you mean 'aalborg'"):
             race([("inferno", 3)], "aalbrog", 1)
 
-    @pytest.mark.parametrize("name", ["inferno:", "inferno:x", "inferno:-1", "inferno:3:4"])
+    @pytest.mark.parametrize("name", ["inferno:", "inferno:x", "inferno:-1", "inferno:3:4", "bt:²"])
     def test_the_name_of_an_opponent_has_a_form(self, game, name):
         with pytest.raises(InvalidOption, match="expected NAME or NAME:INDEX"):
             game.parse_robot(name)

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sb3_torcs.car import CarState, Controls, FloatArray, Start, is_count
+from sb3_torcs.car import MANY_LAPS, CarState, Controls, FloatArray, Start, checked_laps, is_count
 from sb3_torcs.errors import BackendUnavailable, InvalidOption
 from sb3_torcs.game import BUILD, Game, find_game
-from sb3_torcs.race_file import MANY_LAPS, SCR_SERVER, SESSIONS, RaceSetup
+from sb3_torcs.race_file import SCR_SERVER, SESSIONS, RaceSetup
 from sb3_torcs.sensors import range_finder_angles
 from sb3_torcs.tracks import Track, load_track
 
@@ -57,9 +57,10 @@ def make_engine(
     :param laps: of the race; 0 drives on
     :param angles: (19,) of the range finders [rad], left negative
     :return: the engine, not yet started
+    :raises InvalidOption: if a driver is named twice, or there is no such session
     :raises BackendUnavailable: if the extension or the game is missing, or not as expected
     :raises TrackNotFound: if there is no such track
-    :raises TrackFileError: if the track's file is broken
+    :raises TrackFileError: if the track's file is broken, or its grid too small
     :raises UnknownCar: if there is no such car
     :raises CarFileError: if the car's file is broken
     :raises UnknownRobot: if there is no such robot
@@ -69,6 +70,11 @@ def make_engine(
         raise InvalidOption(f"session is {session!r}; expected {' or '.join(SESSIONS)}")
     game.find_car(car)
     for name, index in entries:
+        if entries.count((name, index)) > 1:
+            raise InvalidOption(
+                f"{name or 'agent'}:{index} is named twice; name another driver of it, "
+                "`sb3-torcs robots` lists them"
+            )
         if (name, index) != AGENT:
             game.find_robot(name, index)
     path = track_path(game, track)
@@ -118,8 +124,10 @@ def starting_list(
     :raises InvalidOption: if there is no such place, or the opponents are no list
     :raises UnknownRobot: if there is no such robot
     """
-    if isinstance(opponents, str):
-        raise InvalidOption(f"opponents is {opponents!r}; expected a list of names")
+    if not isinstance(opponents, (list, tuple)) or not all(isinstance(o, str) for o in opponents):
+        raise InvalidOption(
+            f"opponents is {opponents!r}; expected a list of names, e.g. ['inferno', 'berniw:3']"
+        )
     entries = [game.parse_robot(name) for name in opponents]
     place = len(entries) + 1 if grid_place is None else grid_place
     if not is_count(place) or place > len(entries) + 1:
@@ -156,6 +164,7 @@ class NativeBackend:
     ) -> None:
         game = find_game()
         entries = starting_list(game, opponents, grid_place)
+        checked_laps(laps)
         self.car = car
         self.range_finder_angles = range_finder_angles(range_finders)
         self._settings: dict[str, Any] = {
@@ -211,12 +220,13 @@ class NativeBackend:
         return self._begin(start, int(rng.integers(2**63)) if self._noise else None)
 
     def _begin(self, start: Start | None, noise: int | None) -> CarState:
-        self._drive = [(start, noise)]
+        self._drive = []
         self.engine.set_noise(noise)
         if start is None:
             self.engine.start()
         else:
             self.engine.start_at(*start)
+        self._drive.append((start, noise))
         self._state: CarState = self.engine.read(self._agent)
         return self._state
 
@@ -283,6 +293,7 @@ class Fleet:
 
     def __init__(self, backends: Sequence[NativeBackend], threads: int) -> None:
         self._backends = list(backends)
+        self._begun: dict[int, tuple[Controls, int]] = {}  # the latest step of each
         self._fleet = _extension().Fleet([backend.engine for backend in backends], threads)
 
     def begin(self, place: int, controls: Controls, ticks: int) -> None:
@@ -293,7 +304,7 @@ class Fleet:
         :param controls: as of ``step``
         :param ticks: as of ``step``
         """
-        self._backends[place]._drive.append((controls, ticks))
+        self._begun[place] = controls, ticks
         self._fleet.begin(place, *controls, ticks)
 
     def wait(self, place: int) -> CarState:
@@ -304,7 +315,9 @@ class Fleet:
         :return: as of ``step``
         """
         state: CarState = self._fleet.wait(place)
-        self._backends[place]._state = state
+        backend = self._backends[place]
+        backend._state = state
+        backend._drive.append(self._begun[place])
         return state
 
     def finish(self) -> None:

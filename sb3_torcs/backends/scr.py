@@ -16,11 +16,11 @@ import numpy as np
 from sb3_torcs.backends.native import AGENT, starting_list, track_path
 from sb3_torcs.backends.scr_car import CarReader
 from sb3_torcs.backends.scr_gearbox import read_gearbox
-from sb3_torcs.car import CONTROL_TICK, CarState, Controls, Start, is_count
+from sb3_torcs.car import CONTROL_TICK, MANY_LAPS, CarState, Controls, Start, is_count
 from sb3_torcs.errors import EngineForked, GameFailed, GameTimeout, InvalidOption, ServerLost
 from sb3_torcs.game import find_game
 from sb3_torcs.game_process import GameProcess, compiled_library
-from sb3_torcs.race_file import MANY_LAPS, SCR_SERVER, RaceSetup
+from sb3_torcs.race_file import SCR_SERVER, RaceSetup
 from sb3_torcs.scr_client import ScrClient
 from sb3_torcs.scr_game import SCR_PORT, open_ports, start_server
 from sb3_torcs.scr_protocol import ScrAction, format_action, parse_engine, parse_state
@@ -125,7 +125,7 @@ class ScrBackend:
                 "of reset, or leave out host"
             )
         self._check_owner()
-        self._drive = [start]
+        self._drive = []
         try:
             self._connect(start)
             self._message = self._first_state(start)
@@ -133,6 +133,7 @@ class ScrBackend:
         except BaseException:
             self._hang_up()
             raise
+        self._drive.append(start)
         return self._state
 
     def step(self, controls: Controls, ticks: int) -> CarState:

@@ -22,6 +22,7 @@ from sb3_torcs.car import (
     Controls,
     FloatArray,
     Start,
+    checked_laps,
     checked_start,
     checked_start_speed,
     is_count,
@@ -35,6 +36,8 @@ from sb3_torcs.tracks import Track
 __all__ = ["RacingEnv", "RacingInfo"]
 
 Observation = npt.NDArray[np.float32]
+
+MAX_ACTION_REPEAT = 50_000  # [-] a decision every quarter of an hour
 
 STUCK_SPEED = 5.0 / 3.6  # [m/s] along the road; slower than walking counts as standing
 STUCK_TICKS = 75  # control ticks of standing that end an episode: 1.5 s
@@ -89,10 +92,11 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         laps: int | None = None,
         render_mode: str | None = None,
     ) -> None:
-        if not is_count(action_repeat):
-            raise InvalidOption(f"action_repeat is {action_repeat!r}; expected a whole number >= 1")
-        if laps is not None and not is_count(laps):
-            raise InvalidOption(f"laps is {laps!r}; expected a whole number >= 1, or None")
+        if not is_count(action_repeat) or action_repeat > MAX_ACTION_REPEAT:
+            raise InvalidOption(
+                f"action_repeat is {action_repeat!r}; expected a whole number from 1 to "
+                f"{MAX_ACTION_REPEAT}"
+            )
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             modes = ", ".join(repr(mode) for mode in self.metadata["render_modes"])
             raise InvalidOption(f"render_mode is {render_mode!r}; expected None or one of {modes}")
@@ -100,7 +104,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         self._encode: Callable[[CarState], Observation] = getattr(backend, "encode", encode)
         self._draw_track = getattr(backend, "draw_track", None)
         self.action_repeat = int(action_repeat)
-        self.laps = None if laps is None else int(laps)
+        self.laps = checked_laps(laps)
         self.render_mode = render_mode
         self.metadata = {
             **self.metadata,
@@ -182,6 +186,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         if self._draw_track is not None:
             self._draw_track(self.np_random)
         start = self._place(options) if options else self._draw_start()
+        self.car = None  # if that fails, there is nothing to step
         self.car = self.backend.reset(self.np_random, start)
         self._controls = Controls(0.0, 0.0, 0.0)
         self._patience = STUCK_TICKS if start is not None and start.speed > 0.0 else GRACE_TICKS
@@ -321,6 +326,10 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
 
     def _place(self, options: dict[str, Any]) -> Start:
         """Read the options of ``reset``."""
+        if not isinstance(options, Mapping):
+            raise InvalidOption(
+                f"options of reset is {options!r}; expected a dict, e.g. {{'distance': 100.0}}"
+            )
         for name, value in options.items():
             if name not in RESET_OPTIONS:
                 raise InvalidOption(

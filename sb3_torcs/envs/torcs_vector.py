@@ -109,10 +109,15 @@ class TorcsVectorEnv(SyncVectorEnv):
             )
         anew = self._begin_anew()
         ticks = self.envs[0].action_repeat
+        # All before any drives: a wrong one leaves all races where they are.
+        controls = {
+            place: env.begin_step(rows[place])
+            for place, env in enumerate(self.envs)
+            if not anew[place]
+        }
         try:
-            for place, env in enumerate(self.envs):
-                if not anew[place]:
-                    self._fleet.begin(place, env.begin_step(rows[place]), ticks)
+            for place, asked in controls.items():
+                self._fleet.begin(place, asked, ticks)
             return self._collect(anew)
         except BaseException:
             self._fleet.finish()  # so that a reset finds no thread at work
