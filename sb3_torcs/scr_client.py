@@ -7,6 +7,7 @@ server recognises (see :attr:`sb3_torcs.scr_protocol.ScrAction.lap_time`).
 
 from __future__ import annotations
 
+import math
 import os
 import socket
 import struct
@@ -51,8 +52,9 @@ class ScrClient:
     :param angles: (19,) of the range finders [rad], left negative
     :param patience: without an answer to the first word, or to a wish for a restart, after which
         the server is given up [s]
-    :param silence: without a state after which it is given up later [s], for a race that waits for
-        other clients, or that somebody has paused; ``None`` is as ``patience``
+    :param silence: without a state after which a server elsewhere is given up later [s]: the race
+        waits for other clients, or somebody has paused it; one on this machine is then waited for
+        as long as its port is open. ``None`` is as ``patience`` for both
     :param pause: before an action is said again [s], then twice that, and so on: servers but ours
         take each for the answer to another state, so it should be rare
     :param latencies: to which the time from each state to its answer is added [s], for a server
@@ -84,7 +86,6 @@ class ScrClient:
         self._arrived = 0.0
         self._angles = angles
         self._patience = patience
-        self._silence = patience if silence is None else silence
         self._pause = pause
         self._watch = watch
         self._said = b""  # the last word, to be said again
@@ -102,6 +103,8 @@ class ScrClient:
             raise ServerNotFound(
                 f"there is no way to {self.address} ({error}); check --host and --port"
             ) from error
+        here = self._socket.getpeername()[0].startswith("127.")
+        self._silence = patience if silence is None else math.inf if here else silence
 
     def identify(self, start: Start | None = None) -> None:
         """

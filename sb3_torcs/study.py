@@ -10,12 +10,14 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
+import signal
 import tempfile
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from sb3_torcs.errors import RayUnavailable, StudyError
+from sb3_torcs.errors import OutputNotWritable, RayUnavailable, StudyError
 from sb3_torcs.study_file import Study, Trial
 from sb3_torcs.study_folder import Files, StudyFolder
 
@@ -25,6 +27,8 @@ RETRIES = 3  # of a trial whose worker was lost or whose code failed, per run of
 SESSION = ".session"  # where a killed run's temporary files are
 SCRATCH = "st-"  # what folders with temporary files are called: short, since sockets lie in them
 MARK = ".of-a-study"  # a file that says so
+PRIVATE = "sb3_torcs_study"  # a resource by which a study's own Ray is known to others
+FAILED = "failed"  # the phase of a row that tells of a mistake instead of a race
 
 Progress = Callable[[Trial, dict[str, Any]], None]
 """Called with a trial and the last of its rows, or with ``{"state": …}``."""
@@ -179,7 +183,7 @@ def _ray(place: StudyFolder, jobs: int | None, address: str | None) -> Iterator[
     if address is None:
         options.update(
             address="local", num_cpus=jobs or len(os.sched_getaffinity(0)),
-            include_dashboard=False, _temp_dir=str(scratch),
+            include_dashboard=False, _temp_dir=str(scratch), resources={PRIVATE: 1},
         )  # fmt: skip
     else:
         options["address"] = address
@@ -196,11 +200,30 @@ def _ray(place: StudyFolder, jobs: int | None, address: str | None) -> Iterator[
                 else f"no Ray cluster at '{address}' ({error}); start one with `ray start --head` "
                 "and give the address that it prints, or leave --address out"
             ) from error
-        yield scratch
+        if address is not None and PRIVATE in ray.cluster_resources():
+            raise RayUnavailable(
+                f"the Ray at '{address}' belongs to another study, and ends with it; leave "
+                "--address out, or start a cluster with `ray start --head`"
+            )
+        with _killed_politely():
+            yield scratch
     finally:
         ray.shutdown()
         shutil.rmtree(scratch, ignore_errors=True)
         session.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def _killed_politely() -> Iterator[None]:
+    """Take SIGTERM for Ctrl-C, which Tune knows; Ray would take it for a crash."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    rays = signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, rays)
 
 
 def _remove_scratch(session: Path) -> None:
@@ -225,7 +248,7 @@ def _tune(trials: list[Trial], place: StudyFolder, scratch: Path, progress: Prog
     def trainable(config: dict[str, Any]) -> None:
         if scratch.is_dir():  # on this machine: what a killed worker leaves is removed with it
             tempfile.tempdir = str(scratch)
-        run_trial(trials[config["trial"]], _Remote(actor), tune.report)
+        _run_or_tell(trials[config["trial"]], _Remote(actor), tune.report)
 
     here_only = _HereOnly(progress)
 
@@ -240,6 +263,8 @@ def _tune(trials: list[Trial], place: StudyFolder, scratch: Path, progress: Prog
             here_only.call(trial, row)
             if row["phase"] == "final":
                 here_only.call(trial, {"state": "done"})
+            elif row["phase"] == FAILED:
+                here_only.call(trial, {"state": "failed"})
 
     results = tune.Tuner(
         tune.with_resources(trainable, {"cpu": 1}),
@@ -254,20 +279,35 @@ def _tune(trials: list[Trial], place: StudyFolder, scratch: Path, progress: Prog
     ).fit()
     # One that Ctrl-C found waiting for its turn has no config.
     found = [results[number] for number in range(len(results))]
-    errors = {result.config["trial"]: result.error for result in found if result.config}
+    errors = {result.config["trial"]: _error(result) for result in found if result.config}
     for number, trial in enumerate(trials):
-        error = errors.get(number)
         if place.ended(trial):
             progress(trial, {"state": "done"})
-        elif error is None:
+        elif errors.get(number) is None:
             progress(trial, {"state": "stopped"})
         else:
-            progress(trial, {"state": "failed", "error": _last_line(error)})
+            progress(trial, {"state": "failed", "error": errors[number]})
+
+
+def _run_or_tell(trial: Trial, place: Any, report: Callable[[dict[str, Any]], None]) -> None:
+    """Run a trial; what another worker would fail of, too, is a last row and no error to Tune."""
+    try:
+        run_trial(trial, place, report)
+    except (StudyError, OutputNotWritable) as error:
+        report({"phase": FAILED, "error": _last_line(error)})
 
 
 def _nobody(trial: Trial, row: dict[str, Any]) -> None:
     """Watch nothing."""
     del trial, row
+
+
+def _error(result: Any) -> str | None:
+    """Say why a trial has failed: in its own words, or in the last of a worker's traceback."""
+    if result.error is not None:
+        return _last_line(result.error)
+    said: str | None = (result.metrics or {}).get("error")
+    return said
 
 
 def _last_line(error: Exception) -> str:

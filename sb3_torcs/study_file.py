@@ -189,8 +189,13 @@ def _read(file: Path) -> dict[str, Any]:
         said = yaml.load(file.read_text(encoding="utf-8"), Loader=_Once)
     except OSError as error:
         raise StudyError(f"{file} cannot be read: {error.strerror or error}") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise StudyError(f"{file}: not YAML: {error}") from error
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark
+        line = f", line {mark.line + 1}" if mark else ""
+        raise StudyError(f"{file}{line}: not YAML: {error.problem or error.context}") from error
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+        why = " ".join(str(error).split())
+        raise StudyError(f"{file}: not YAML: {why}") from error
     if not isinstance(said, dict):
         raise StudyError(f"{file}: expected 'key: value' lines, got {said!r}")
     return said
@@ -240,8 +245,12 @@ def _trials(
         raise StudyError(f"{file}: eval_interval is {interval!r}; expected decisions, e.g. 5000")
     env_kwargs = entry.get("env_kwargs") or {}
     own = env_kwargs.get("track", "aalborg")
-    eval_tracks = _tracks(source["eval_tracks"] or own, f"{place}: eval_tracks")
-    final_tracks = _tracks(said.get("final_tracks") or list(eval_tracks), f"{file}: final_tracks")
+    given = source["eval_tracks"]
+    eval_tracks = _tracks(own if given is None else given, f"{place}: eval_tracks")
+    final_tracks = eval_tracks
+    if said.get("final_tracks") is not None:
+        chosen = _tracks(said["final_tracks"], f"{file}: final_tracks")
+        final_tracks = _united(eval_tracks, chosen)
     gym.make(env_id, **env_kwargs).close()
     for seed in seeds:
         yield Trial(
@@ -277,12 +286,19 @@ def _tracks(value: Any, what: str) -> tuple[str, ...]:
     if value == ROAD:
         return tuple(f"{s.category}/{s.name}" for s in available_tracks() if s.category == ROAD)
     tracks = [value] if isinstance(value, str) else value
-    if not isinstance(tracks, list) or not all(isinstance(track, str) for track in tracks):
+    listed = isinstance(tracks, list) and all(isinstance(track, str) for track in tracks)
+    if not listed or not tracks:
         raise StudyError(f"{what} is {value!r}; expected a list of tracks, or '{ROAD}' for all")
     names = [track_name(track) for track in tracks]
     if len(set(names)) < len(names):
         raise StudyError(f"{what}: {', '.join(names)}: one is there twice; take it out")
     return tuple(tracks)
+
+
+def _united(one: Sequence[str], other: Sequence[str]) -> tuple[str, ...]:
+    """Put two lists of tracks together; a track may have another name in each."""
+    named = {track_name(track): track for track in (*one, *other)}
+    return tuple(named.values())
 
 
 def _check_keys(mapping: Mapping[str, Any], known: Sequence[str], what: str) -> None:

@@ -27,6 +27,7 @@ from typing import Any
 import yaml
 
 from sb3_torcs.errors import OutputNotWritable, StudyError
+from sb3_torcs.models import BEST_MODEL
 from sb3_torcs.study_file import FIELDS, Study, Trial, track_name
 
 __all__ = ["RECIPE", "RESULTS", "ROWS", "Files", "StudyFolder", "write_whole"]
@@ -37,7 +38,7 @@ Files = dict[str, bytes]
 RESULTS = "results.csv"
 RECIPE, ROWS, LOCK = "recipe.yml", "rows.json", ".lock"
 CHECKPOINT = "checkpoint-"
-FOR_DRIVERS = ("best_model.zip", "vecnormalize.pkl", "config.yml", "args.yml")
+FOR_DRIVERS = (BEST_MODEL, "vecnormalize.pkl", "config.yml", "args.yml")
 
 
 class StudyFolder:
@@ -69,7 +70,12 @@ class StudyFolder:
                     f"another process runs the study in '{self.path}'; wait for it, or give "
                     "another --folder"
                 ) from error
-            yield
+            try:
+                yield
+            finally:
+                with contextlib.suppress(OSError):
+                    if [item.name for item in self.path.iterdir()] == [LOCK]:
+                        shutil.rmtree(self.path)  # nothing was begun
 
     def of(self, trial: Trial) -> Path:
         """
@@ -88,8 +94,7 @@ class StudyFolder:
             recipe
         """
         for file in self.path.glob(f"*/{RECIPE}"):
-            recipe = _parsed(file, yaml.safe_load)
-            other = recipe.get("study") if isinstance(recipe, dict) else recipe
+            other = _parsed(file, _recipe)["study"]
             if other != self.study.name:
                 raise StudyError(
                     f"'{self.path}' holds the study '{other}'; give another --folder for "
@@ -101,11 +106,17 @@ class StudyFolder:
             if not file.is_file():
                 write_whole(file, yaml.safe_dump(recipe, sort_keys=False).encode())
                 continue
-            before = _parsed(file, yaml.safe_load)
+            before = _parsed(file, _recipe)
             if before != recipe:
                 raise StudyError(
                     f"'{file.parent}' was begun with another {_difference(before, recipe)}; give "
                     "another --folder, or remove that one to begin it anew"
+                )
+            needed = BEST_MODEL if self.trained(trial) else f"{CHECKPOINT}*"
+            if self.rows(trial) and not any(self.of(trial).glob(needed)):
+                raise StudyError(
+                    f"'{file.parent}' has lost its {needed}; remove that folder to begin this "
+                    "agent anew"
                 )
 
     def rows(self, trial: Trial) -> list[dict[str, Any]]:
@@ -233,7 +244,22 @@ class StudyFolder:
 
 
 def _rows(file: Path) -> list[dict[str, Any]]:
-    return _parsed(file, json.loads) if file.is_file() else []
+    rows: list[dict[str, Any]] = _parsed(file, _table) if file.is_file() else []
+    return rows
+
+
+def _table(text: str) -> list[dict[str, Any]]:
+    rows: Any = json.loads(text)
+    if not isinstance(rows, list) or any(set(FIELDS) - set(row) for row in rows):
+        raise ValueError(f"expected a list of rows with {', '.join(FIELDS)}")
+    return rows
+
+
+def _recipe(text: str) -> dict[str, Any]:
+    recipe: Any = yaml.safe_load(text)
+    if not isinstance(recipe, dict) or "study" not in recipe:
+        raise ValueError("expected 'key: value' lines, study among them")
+    return recipe
 
 
 def _difference(before: Any, after: Any) -> str:
@@ -262,9 +288,10 @@ def _parsed(file: Path, parse: Callable[[str], Any]) -> Any:
     """Read a file that was written here."""
     try:
         return parse(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError, yaml.YAMLError) as error:
+    except (OSError, TypeError, ValueError, yaml.YAMLError) as error:
+        why = " ".join(str(error).split())
         raise StudyError(
-            f"'{file}' cannot be read ({error}); repair it, or remove '{file.parent}' to begin "
+            f"'{file}' cannot be read ({why}); repair it, or remove '{file.parent}' to begin "
             "this agent anew"
         ) from error
 

@@ -71,6 +71,7 @@ def read_results(folder: Path) -> list[Results]:
     try:
         with file.open(newline="", encoding="utf-8") as lines:
             rows = [_read(row) for row in csv.DictReader(lines, restval="")]
+        trials = _trials(rows)
     except (FileNotFoundError, NotADirectoryError):
         raise StudyError(
             f"'{folder}' holds no {RESULTS}; give the folder of a study: sb3-torcs study FILE.yml"
@@ -82,10 +83,17 @@ def read_results(folder: Path) -> list[Results]:
         ) from error
     if not rows:
         raise StudyError(f"{file} is empty: no agent was evaluated yet; let the study run on")
+    return trials
+
+
+def _trials(rows: Sequence[dict[str, Any]]) -> list[Results]:
+    """Sort rows into trials, and make sure that each has what the report builds on."""
     trials = []
     for (variant, seed), group in itertools.groupby(rows, lambda r: (r["variant"], r["seed"])):
         own = list(group)
         train = [row for row in own if row["phase"] == "train"]
+        if not any(row["kept"] for row in train):
+            raise ValueError(f"no evaluation of {variant}, {seed} has kept a model")
         trials.append(Results(variant, seed, train, [r for r in own if r["phase"] == "final"]))
     return trials
 
@@ -99,6 +107,8 @@ def _read(row: dict[str, str]) -> dict[str, Any]:
     }
     whole = {key: int(row[key]) for key in ("seed", "decisions", "episodes", "laps")}
     truths = {key: row[key] == "1" for key in ("completes", "kept")}
+    if row["ladder"] not in ("", *RUNGS):
+        raise ValueError(f"there is no rung '{row['ladder']}'")
     return {**row, **numbers, **whole, **truths, "lap_times_s": laps}
 
 
@@ -181,7 +191,7 @@ def write_report(folder: Path, output: Path) -> Path:
     lines += [
         "Thin: every seed; bold: the interquartile mean of the seeds. A seed without a lap counts "
         "as infinitely slow, so the mean of the lap times begins when enough seeds have one. "
-        "Curves end where the seed ends that has come least far.",
+        "Bold curves end where the seed ends that has come least far.",
         "",
     ]
     report = output / "report.md"
@@ -199,7 +209,10 @@ def _waiting(folder: Path) -> list[str]:
 def _homes(trials: Sequence[Results]) -> str:
     """Name the track that chose the models, the first if there are several."""
     names = {trial.train[0]["track"] for trial in trials}
-    return f"on {names.pop()}" if len(names) == 1 else "each on the first that chose its model"
+    if len(names) > 1:
+        return "each on the first track that chose its model"
+    several = any(len(trial.evaluations[0]) > 1 for trial in trials)
+    return f"on {names.pop()}" + (", the first of those that chose the models" if several else "")
 
 
 def _variants(trials: Sequence[Results]) -> dict[str, list[Results]]:
@@ -212,7 +225,8 @@ def _variants(trials: Sequence[Results]) -> dict[str, list[Results]]:
 def _markdown(title: str, headers: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     """Lay out a section with a table; numbers stand to the right of the first column."""
     rules = ["---", *["---:"] * (len(headers) - 1)]
-    return [f"## {title}", "", *(f"| {' | '.join(row)} |" for row in (headers, rules, *rows)), ""]
+    cells = [[" ".join(cell.split()).replace("|", "\\|") for cell in row] for row in rows]
+    return [f"## {title}", "", *(f"| {' | '.join(row)} |" for row in (headers, rules, *cells)), ""]
 
 
 def _seconds(value: float | None) -> str:
@@ -339,27 +353,23 @@ def _shares(trials: Sequence[Results]) -> list[str]:
     return _markdown("Tracks completed", headers, rows)
 
 
-def _curves(group: Sequence[Results]) -> dict[str, Array]:
+def _curves(trial: Results) -> dict[str, Array]:
     """
-    Arrange the evaluations as (seeds, evaluations), as far as all seeds are.
+    Arrange the evaluations of a trial, means over its tracks.
 
-    :param group: trials of one variant
-    :return: decisions, distance [m], best lap so far [s], and whether all laps were driven
+    :param trial: that was evaluated
+    :return: decisions, distance [m], best lap so far [s], and whether all laps were driven, each
+        (evaluations,)
     """
-    every = [trial.evaluations for trial in group]
-    length = min(len(evaluations) for evaluations in every)
 
-    def table(value: Callable[[dict[str, Any]], float]) -> Array:
-        return np.array(
-            [[np.mean([value(row) for row in tracks]) for tracks in e[:length]] for e in every]
-        )
+    def curve(value: Callable[[dict[str, Any]], float]) -> Array:
+        return np.array([np.mean([value(row) for row in tracks]) for tracks in trial.evaluations])
 
-    laps = table(lambda row: row["best_flying_lap_s"] or NO_LAP)
     return {
-        "decisions": table(lambda row: row["decisions"]),
-        "distance": table(lambda row: row["distance_m"]),
-        "lap": np.minimum.accumulate(laps, axis=1),
-        "completes": table(lambda row: row["completes"]),
+        "decisions": curve(lambda row: row["decisions"]),
+        "distance": curve(lambda row: row["distance_m"]),
+        "lap": np.minimum.accumulate(curve(lambda row: row["best_flying_lap_s"] or NO_LAP)),
+        "completes": curve(lambda row: row["completes"]),
     }
 
 
@@ -367,8 +377,11 @@ def _drawn(variant: str, group: Sequence[Results]) -> bytes:
     """Draw distance, lap time and success over decisions, as PNG."""
     from matplotlib.figure import Figure
 
-    curves = _curves(group)
-    decisions = curves["decisions"].mean(axis=0) / 1000.0
+    every = [_curves(trial) for trial in group]
+    length = min(len(curves["decisions"]) for curves in every)
+    # As far as all seeds are.
+    shared = {name: np.array([curves[name][:length] for curves in every]) for name in every[0]}
+    decisions = shared["decisions"].mean(axis=0) / 1000.0
     figure = Figure(figsize=(12.0, 3.4), layout="constrained")
     panels = figure.subplots(1, 3)
     for panel, name, label in zip(
@@ -377,23 +390,24 @@ def _drawn(variant: str, group: Sequence[Results]) -> bytes:
         ("distance of three laps [m]", "best flying lap so far [s]"),
         strict=True,
     ):
-        for seed in curves[name]:
-            panel.plot(decisions, _drawable(seed), color="tab:blue", alpha=0.35, linewidth=0.8)
-        _band(panel, decisions, estimate(curves[name]))
+        for curves in every:
+            own = curves["decisions"] / 1000.0, _drawable(curves[name])
+            panel.plot(*own, color="tab:blue", alpha=0.35, linewidth=0.8)
+        _band(panel, decisions, estimate(shared[name]))
         panel.set_ylabel(label)
     panels[0].set_ylim(bottom=0.0)
-    if not np.isfinite(curves["lap"]).any():
+    if not any(np.isfinite(curves["lap"]).any() for curves in every):
         panels[1].set_yticks([])
         panels[1].text(0.5, 0.5, "no seed has one", ha="center", transform=panels[1].transAxes)
-    _band(panels[2], decisions, estimate(curves["completes"], share))
-    so_far = np.maximum.accumulate(curves["completes"], axis=1).mean(axis=0)
+    _band(panels[2], decisions, estimate(shared["completes"], share))
+    so_far = np.maximum.accumulate(shared["completes"], axis=1).mean(axis=0)
     panels[2].plot(decisions, so_far, color="tab:blue", linestyle="--")
     panels[2].set_ylabel("share of races that complete")
     panels[2].set_ylim(-0.03, 1.03)
     panels[2].legend(["in this evaluation", "95 %", "in one so far"], fontsize=8)
     for panel in panels:
         panel.set_xlabel("thousand decisions learned from")
-        panel.set_xlim(0.0, 1.02 * decisions[-1])
+        panel.set_xlim(0.0, 1.02 * max(curves["decisions"][-1] for curves in every) / 1000.0)
         panel.grid(alpha=0.3)
     figure.suptitle(f"{variant}: {len(group)} seeds", fontsize=11)
     picture = io.BytesIO()

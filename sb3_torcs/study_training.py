@@ -46,6 +46,7 @@ class Training:
 
     :param trial: what is to be learned, and how
     :param checkpoint: a folder that :meth:`save` has written; ``None`` begins anew
+    :raises StudyError: if the checkpoint cannot be read
     """
 
     def __init__(self, trial: Trial, checkpoint: Path | None = None) -> None:
@@ -58,8 +59,15 @@ class Training:
         self._spent = np.zeros(2)  # [s] of the clock and of the processor, before this process
         self._races: dict[str, Any] = {}
         self.model, self.callbacks, self._records = _build(trial)
-        if checkpoint is not None:
+        if checkpoint is None:
+            return
+        try:
             self._load(checkpoint)
+        except Exception as error:  # a broken file can raise anything
+            raise StudyError(
+                f"its checkpoint cannot be read ({type(error).__name__}: {error}); remove the "
+                f"folder {trial.name} of the study to begin that agent anew"
+            ) from error
 
     @property
     def slices(self) -> int:

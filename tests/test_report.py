@@ -115,7 +115,26 @@ def test_the_track_that_chose_the_models_is_named(tmp_path):
     report = write_report(written(tmp_path / "study", rows[:2]), tmp_path / "out")
     assert lines_of(report, "## ")[:2] == ["## Summary, on aalborg", "## Every seed, on aalborg"]
     report = write_report(written(tmp_path / "study", rows), tmp_path / "out")
-    assert lines_of(report, "## Sum") == ["## Summary, each on the first that chose its model"]
+    assert lines_of(report, "## Sum") == [
+        "## Summary, each on the first track that chose its model"
+    ]
+    rows = [row(0), row(0, track="forza"), row(0, "final")]
+    report = write_report(written(tmp_path / "study", rows), tmp_path / "out")
+    assert lines_of(report, "## Sum") == [
+        "## Summary, on aalborg, the first of those that chose the models"
+    ]
+
+
+def test_a_name_is_no_table(tmp_path):
+    rows = [row(0, variant="a | b"), row(0, "final", variant="a | b")]
+    report = write_report(written(tmp_path / "study", rows), tmp_path / "out")
+    assert lines_of(report, "| a \\| b |")[0].replace("\\|", "").count("|") == 9
+
+
+@pytest.mark.parametrize("change", [{"phase": "final"}, {"kept": False}, {"ladder": "flies"}])
+def test_rows_that_say_nothing_are_told(tmp_path, capsys, change):
+    assert main(["report", str(written(tmp_path / "study", [{**row(0), **change}]))]) == 2
+    assert "results.csv cannot be read as results (ValueError" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("text", ["a,b\n1,2\n", "{}\nbase,0\n", "\xff"])

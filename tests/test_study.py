@@ -4,6 +4,7 @@ import csv
 import errno
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,7 +18,7 @@ import yaml
 from sb3_torcs.cli import main
 from sb3_torcs.cli.study import Board
 from sb3_torcs.errors import RayUnavailable, StudyError
-from sb3_torcs.study import MARK, SESSION, run_study, run_trial
+from sb3_torcs.study import MARK, PRIVATE, SESSION, run_study, run_trial
 from sb3_torcs.study_file import FIELDS, read_study
 from sb3_torcs.study_folder import StudyFolder
 
@@ -61,11 +62,11 @@ def undisturbed(tmp_path_factory):
 def test_the_table_has_every_evaluation_of_every_trial(undisturbed):
     for seed in "01":
         rows = [row for row in undisturbed if row["seed"] == seed]
-        assert [row["decisions"] for row in rows[:-1]] == [str(240 * n) for n in range(1, 9)]
-        assert [row["phase"] for row in rows] == ["train"] * 8 + ["final"]
-        assert {row["track"] for row in rows[:-1]} == {"aalborg"}
-        assert rows[-1]["track"] == "g-track-1"
-        assert len({row["return"] for row in rows[:-1]}) == 8  # each drives what was learned
+        assert [row["decisions"] for row in rows[:-2]] == [str(240 * n) for n in range(1, 9)]
+        assert [row["phase"] for row in rows] == ["train"] * 8 + ["final"] * 2
+        assert {row["track"] for row in rows[:-2]} == {"aalborg"}
+        assert [row["track"] for row in rows[-2:]] == ["aalborg", "g-track-1"]
+        assert len({row["return"] for row in rows[:-2]}) == 8  # each drives what was learned
 
 
 def evaluated(trial):
@@ -119,12 +120,41 @@ def test_a_full_disk_is_told_and_leaves_everything_as_it_was(begun, tmp_path, mo
     assert not [file for file in tmp_path.rglob(".*") if file.name != ".lock"]
 
 
-@pytest.mark.parametrize("name", ["rows.json", "recipe.yml"])
-def test_a_damaged_folder_is_told(begun, capsys, name):
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("rows.json", b"{\xff"),
+        ("rows.json", b'{"a": 1}'),
+        ("rows.json", b"[1]"),
+        ("rows.json", b"[{}]"),
+        ("recipe.yml", b"{\xff"),
+        ("recipe.yml", b""),
+    ],
+)
+def test_a_damaged_folder_is_told(begun, capsys, name, content):
     study, place = begun
-    (place.of(study.trials[0]) / name).write_bytes(b"{\xff")
+    (place.of(study.trials[0]) / name).write_bytes(content)
     assert main(["study", str(study.path), "--folder", str(place.path)]) == 2
-    assert f"small-nets-seed0/{name}' cannot be read (" in capsys.readouterr().err
+    err = capsys.readouterr().err
+    assert f"small-nets-seed0/{name}' cannot be read (" in err
+    assert err.count("\n") == 1
+
+
+def test_what_was_lost_of_a_folder_is_told(begun, capsys):
+    study, place = begun
+    shutil.rmtree(place.checkpoint(study.trials[0]))
+    assert main(["study", str(study.path), "--folder", str(place.path)]) == 2
+    assert "small-nets-seed0' has lost its checkpoint-*; remove" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_damaged_checkpoint_is_told_once(begun, capsys):
+    study, place = begun
+    assert main(["study", str(study.path), "--folder", str(place.path)]) == 1
+    out = capsys.readouterr().out
+    assert "small-nets-seed0 failed: its checkpoint cannot be read (" in out
+    assert "remove the folder small-nets-seed0 of the study" in out
+    assert "1 of 2 agents trained and measured" in out
 
 
 # Where the algorithm cannot be built, the zoo drops the environments that it has made unclosed.
@@ -252,6 +282,19 @@ def test_a_lost_machine_costs_one_interval_at_most_and_changes_no_result(
 
 
 @pytest.mark.slow
+def test_the_ray_of_another_study_is_not_joined(begun, short_folder):
+    from ray.cluster_utils import Cluster
+
+    node = {"num_cpus": 1, "include_dashboard": False, "temp_dir": short_folder}
+    cluster = Cluster(initialize_head=True, head_node_args={**node, "resources": {PRIVATE: 1}})
+    try:
+        with pytest.raises(RayUnavailable, match="belongs to another study, and ends with it"):
+            run_study(begun[0], begun[1].path, address=cluster.address)
+    finally:
+        cluster.shutdown()
+
+
+@pytest.mark.slow
 def test_a_killed_study_goes_on_with_the_same_command_and_leaves_nothing(
     undisturbed, tmp_path, short_folder, monkeypatch, capsys
 ):
@@ -298,7 +341,8 @@ def test_a_killed_study_goes_on_with_the_same_command_and_leaves_nothing(
 
 
 @pytest.mark.slow
-def test_ctrl_c_keeps_everything_and_says_how_to_go_on(tmp_path):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_keeps_everything_and_says_how_to_go_on(tmp_path, number):
     """Also while a trial still waits for its turn."""
     words = ["study", str(study_file(tmp_path)), "--folder", str(tmp_path / "out"), "--jobs", "1"]
     command = [sys.executable, "-m", "sb3_torcs.cli", *words]
@@ -306,7 +350,7 @@ def test_ctrl_c_keeps_everything_and_says_how_to_go_on(tmp_path):
     while not seeds_so_far(tmp_path / "out"):
         assert process.poll() is None, "it ended before it could be interrupted"
         time.sleep(0.05)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
     out, err = process.communicate(timeout=60)
     assert process.returncode == 130, err
     assert "0 of 2 agents trained and measured" in out

@@ -64,6 +64,7 @@ def test_the_shipped_studies_can_be_run(path):
         ({"variants": {"a": {"env_kwargs": 3}}}, "env_kwargs is 3; expected '{key: value}'"),
         ({"variants": {"a": {"env_kwargs": {"reward": "blgo"}}}}, "did you mean 'blog'?"),
         ({"variants": {"a": {"n_steps": None}}}, "null takes 'n_steps' away, but it is not there"),
+        ({"final_tracks": []}, "final_tracks is []; expected a list of tracks"),
         ({"variants": {"a": {"frame_stack": 2}}}, "frame_stack is not for studies"),
     ],
 )
@@ -79,7 +80,9 @@ def test_a_mistake_is_told_before_anything_starts(tmp_path, capsys, changes, say
     [
         ("a: [", "not YAML"),
         ("- 1", "expected 'key: value'"),
-        ("variants:\n  a: {}\n  a: {}\n", "key 'a' is there twice; rename one"),
+        ("variants:\n  a: {}\n  a: {}\n", r"s\.yml, line 3: .* key 'a' is there twice; rename one"),
+        ("a:\n\t- 1", r"s\.yml, line 2: not YAML: .*cannot start any token"),
+        ("name: " + 20_000 * "[", "not YAML: "),
     ],
 )
 def test_a_file_that_is_no_study_is_told(tmp_path, text, says):

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
 import os
-import socket
 from array import array
 from collections.abc import Sequence
 from contextlib import suppress
@@ -215,9 +213,8 @@ class ScrBackend:
         host, port = self._address
         manners: dict[str, Any] = {"patience": PATIENCE, "pause": PAUSE, "watch": self._watch}
         if not self._own:
-            manners = {"patience": PATIENCE_WITH_OTHERS, "latencies": self.latencies}
-            # Here it is noticed when a port is closed, so that no silence is too long.
-            manners["silence"] = math.inf if _is_here(host) else SILENCE
+            manners = {"patience": PATIENCE_WITH_OTHERS, "silence": SILENCE}
+            manners["latencies"] = self.latencies
         self._client = ScrClient(host, port, self.range_finder_angles, **manners)
         self._client.identify(start)
 
@@ -313,18 +310,6 @@ class ScrBackend:
             raise EngineForked(
                 "this game belongs to the parent process; make the environment after the fork"
             )
-
-
-def _is_here(host: str) -> bool:
-    """
-    Say whether a server is on this machine.
-
-    :param host: name or address
-    """
-    try:
-        return socket.gethostbyname(host).startswith("127.")
-    except (OSError, UnicodeError):  # the client tells
-        return False
 
 
 def _action(controls: Controls, gear: int, lap_time: float) -> bytes:
