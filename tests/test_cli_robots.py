@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import subprocess
 import sys
+import time
 import types
 
 import pytest
@@ -54,6 +58,18 @@ class TestByTheGame:
             "robot": "inferno", "index": 3, "track": "aalborg", "car": "car1-trb1",
             "laps": [{"time": time, "damage": 0} for time in times],
         }  # fmt: skip
+
+    @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+    def test_a_polite_kill_ends_the_game_too(self, game, number, tmp_path):
+        words = ["robots", "inferno", "--track", "aalborg", "--laps", "5000", "--game"]
+        command = [sys.executable, "-m", "sb3_torcs.cli", *words]
+        process = subprocess.Popen(command, env={**os.environ, "TMPDIR": str(tmp_path)})
+        while not list(tmp_path.glob("*/words")):
+            assert process.poll() is None, "it ended before it could be killed"
+            time.sleep(0.05)
+        process.send_signal(number)
+        assert process.wait(30.0) == 128 + number
+        assert list(tmp_path.iterdir()) == []
 
     def test_a_practice_as_a_table(self, game, capsys):
         _, out, _ = run(capsys, "sparkle", "--index", "0", "--track", "g-track-1", "--laps", "1",

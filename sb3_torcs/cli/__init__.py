@@ -5,8 +5,11 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from types import FrameType
 
 from sb3_torcs.cli import (
     bench,
@@ -50,7 +53,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if args.zoo_args and args.verb != "train":
         parser.error(f"{args.verb} passes nothing on; leave out '--' and what follows it")
     try:
-        status: int = args.run(args)
+        with _ended_politely():
+            status: int = args.run(args)
         sys.stdout.flush()
     except Sb3TorcsError as error:
         print(f"sb3-torcs: {error}", file=sys.stderr)
@@ -68,6 +72,27 @@ def main(argv: Sequence[str] | None = None) -> int:
         print("sb3-torcs: interrupted", file=sys.stderr)
         return INTERRUPTED
     return status
+
+
+@contextlib.contextmanager
+def _ended_politely() -> Iterator[None]:
+    """Clean up before SIGTERM, or the terminal's going away, ends the process."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def end(number: int, frame: FrameType | None) -> None:
+        del frame
+        raise SystemExit(128 + number)
+
+    default = [n for n in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(n) == signal.SIG_DFL]
+    for number in default:  # nohup ignores the latter
+        signal.signal(number, end)
+    try:
+        yield
+    finally:
+        for number in default:
+            signal.signal(number, signal.SIG_DFL)
 
 
 def _drop_output() -> None:
