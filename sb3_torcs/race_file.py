@@ -90,6 +90,18 @@ class RaceSetup:
         """Whether some drive by the SCR protocol."""
         return any(name == SCR_SERVER for name, _ in self.drivers)
 
+    def cars(self, game: Game) -> list[str]:
+        """
+        Say who drives which car.
+
+        :param game: the installation
+        :return: the cars of the drivers, in their order
+        """
+        return [
+            self.car if name == SCR_SERVER else game.find_robot(name, index).car
+            for name, index in self.drivers
+        ]
+
 
 def write_race(game: Game, folder: Path, race: RaceSetup) -> str:
     """

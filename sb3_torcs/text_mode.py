@@ -48,7 +48,7 @@ def run(
     :raises GameTimeout: if the game does not end in time
     """
     race = RaceSetup(track, robots, laps, session)
-    cars = [game.find_robot(name, index).car for name, index in robots]
+    cars = race.cars(game)
     if timeout is None:
         timeout = PATIENCE + PATIENCE_PER_LAP * laps * len(robots)
     with GameProcess(game, race) as process:

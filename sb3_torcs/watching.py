@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from sb3_torcs.drivers import SCRIPTED
 from sb3_torcs.driving import Agent
-from sb3_torcs.errors import GameFailed, ServerLost
+from sb3_torcs.errors import GameFailed, InvalidOption, ServerLost
 from sb3_torcs.film import FPS, Film, side_by_side
 from sb3_torcs.game import Game
 from sb3_torcs.game_process import GameProcess
@@ -97,12 +97,7 @@ class Show:
         :param process: of the game
         """
         if process.poll() == 0:
-            race = self.race
-            cars = [
-                race.car if name == SCR_SERVER else self.game.find_robot(name, index).car
-                for name, index in race.drivers
-            ]
-            self.results = read_results(process, race, cars)
+            self.results = read_results(process, self.race, self.race.cars(self.game))
 
 
 def show_in_window(show: Show, window: Window) -> None:
@@ -143,11 +138,17 @@ def film_shows(
     :param size: width and height of the whole picture [pixels]
     :param view: one of :data:`sb3_torcs.game_window.VIEWS`
     :param fps: frames per second of simulated time
+    :raises InvalidOption: if the picture cannot be divided so
     :raises DisplayUnavailable: if there is no virtual display
     :raises OutputNotWritable: if the file cannot be written; no part of it is left behind
     :raises GameFailed: if a game ends too early; the same holds
     """
     part = (size[0] // len(shows), size[1])
+    if len(shows) > 1 and size[0] % (2 * len(shows)):
+        raise InvalidOption(
+            f"size is {size[0]}x{size[1]}; the width of a film with {len(shows)} side by side has "
+            f"to be a multiple of {2 * len(shows)}"
+        )
     with ExitStack() as stack:
         films = [
             stack.enter_context(

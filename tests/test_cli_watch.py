@@ -20,7 +20,8 @@ from sb3_torcs.scr_game import start_server
 
 pytestmark = pytest.mark.usefixtures("game", "nothing_is_left")
 
-SMALL = ["--track", "a-speedway", "--size", "160x120", "--fps", "5"]
+TINY = ["--track", "a-speedway", "--size", "160x120"]
+SMALL = [*TINY, "--fps", "5"]  # films
 
 
 @pytest.fixture
@@ -89,6 +90,18 @@ def test_two_drivers_side_by_side(tmp_path, capsys):
     assert abs(frames - 5 * (slower + 2.0)) <= 2
 
 
+def test_two_side_by_side_are_on_one_track(monkeypatch):
+    filmed = []
+    monkeypatch.setattr(watching, "film_shows", lambda shows, *_, **__: filmed.extend(shows))
+    words = ["--beside", "ddpg-aalborg", "--film", "both.mp4"]
+    assert main(["watch", "ddpg-league", *words]) == 0
+    assert main(["watch", "inferno", *words, "--track", "forza"]) == 0
+    assert main(["watch", "bt", "--beside", "ddpg-league", "--film", "both.mp4"]) == 0
+    tracks = [show.track for show in filmed]
+    assert tracks == ["corkscrew"] * 2 + ["forza"] * 2 + ["corkscrew"] * 2
+    assert [show.race.car for show in filmed[:2]] == ["car1-ow1", "car1-trb1"]
+
+
 def test_a_film_ends_soon_after_the_agents_drive(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(driving, "load_driver", lambda *_: Turning())
     film = tmp_path / "off.mp4"
@@ -134,7 +147,7 @@ def test_a_game_that_is_killed_says_how_it_ended(film, tmp_path, monkeypatch, ca
     monkeypatch.setattr(driving, "load_driver", lambda *_: Killing())
     with VirtualDisplay((320, 240)) as display:
         monkeypatch.setenv("DISPLAY", display.name)
-        assert main(["watch", "scripted", *SMALL, *film]) == 2
+        assert main(["watch", "scripted", *TINY, *film]) == 2
     assert "the game ended with SIGKILL" in capsys.readouterr().err
     assert list(Path().glob("*.mp4")) == []
 
@@ -153,6 +166,12 @@ def test_without_a_display_it_offers_a_film(monkeypatch, capsys):
         (["infernal"], "there is no model 'infernal'"),
         (["infernal"], "nor is there a robot 'infernal'; did you mean 'inferno'?"),
         (["inferno", "--beside", "bt"], "--beside is for films; add --film FILE.mp4"),
+        (["inferno", "--fps", "10"], "--fps is for films; add --film FILE.mp4"),
+        (["inferno", "--beside", "bt:4", "--car", "buggy", "--film", "lap.mp4"], "--car is for"),
+        (
+            ["inferno", "--beside", "bt", "--size", "642x360", "--film", "lap.mp4"],
+            "size is 642x360; the width of a film with 2 side by side has to be a multiple of 4",
+        ),
         (["inferno", "--film", "lap.avi"], "'lap.avi' should end in .mp4"),
         (["inferno", "--film", "lap.mp4", "--view", "behnd"], "did you mean 'behind'?"),
         (["inferno", "--film", "lap.mp4", "--fps", "0"], "fps is 0; expected 1 to 500"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from sb3_torcs.cli.common import MODEL_HELP, positive, writable_file
@@ -50,7 +51,7 @@ def add_parser(subparsers: Any) -> None:
     add("--view", default="behind", metavar="V", help="where the camera is; default: behind")
     add("--size", type=_size, default=(1280, 720), metavar="WxH", help="default: 1280x720")
     add("--film", metavar="FILE.mp4", help="film it")
-    add("--fps", type=float, default=30.0, metavar="N", help="of the film; default: 30")
+    add("--fps", type=float, metavar="N", help="of the film; default: 30")
     add("--beside", metavar="MODEL|ROBOT", help="film this one, too, to the right")
     parser.set_defaults(run=run)
 
@@ -64,16 +65,18 @@ def run(args: argparse.Namespace) -> int:
     from sb3_torcs.game import find_game
     from sb3_torcs.watching import film_shows
 
-    if args.beside is not None and args.film is None:
-        raise InvalidOption("--beside is for films; add --film FILE.mp4")
+    for option in ("beside", "fps"):
+        if getattr(args, option) is not None and args.film is None:
+            raise InvalidOption(f"--{option} is for films; add --film FILE.mp4")
     film = writable_file(args.film, (".mp4",)) if args.film else None
     game = find_game()
     names = [args.name] if args.beside is None else [args.name, args.beside]
-    shows = [_show(game, name, args) for name in names]
+    shows = _shows(game, names, args)
     if film is None:
         _in_window(shows[0], args)
     else:
-        film_shows(shows, film, size=args.size, view=args.view, fps=args.fps)
+        fps = {} if args.fps is None else {"fps": args.fps}
+        film_shows(shows, film, size=args.size, view=args.view, **fps)
     for name, show in zip(names, shows, strict=True):
         _report(name, show)
     if film is not None:
@@ -94,29 +97,38 @@ def _size(text: str) -> tuple[int, int]:
     return int(width), int(height)
 
 
-def _show(game: Game, name: str, args: argparse.Namespace) -> Show:
+def _shows(game: Game, names: Sequence[str], args: argparse.Namespace) -> list[Show]:
     """
-    Decide who drives what.
+    Decide who drives what, all on one track.
 
     :param game: the installation
-    :param name: of a model or a robot
+    :param names: of models or robots
     :param args: from the command line
     """
+    from sb3_torcs.errors import InvalidOption
     from sb3_torcs.models import TrainingRecord, one_track
     from sb3_torcs.watching import Show
 
-    robot, record = None, TrainingRecord()
-    if name.partition(":")[0] in game.robots():
-        robot = game.parse_robot(name)
-    else:
-        record = _record(game, name)
-    settings = record.kept(KEPT)
-    if args.car is not None:
-        settings["car"] = args.car
+    known = game.robots()
+    robots = [game.parse_robot(n) if n.partition(":")[0] in known else None for n in names]
+    if args.car is not None and all(robots):
+        raise InvalidOption(
+            f"--car is for models; a robot has one for each index, e.g. {names[0]}:1, and "
+            "`sb3-torcs robots` lists them"
+        )
+    records = [
+        _record(game, name) if robot is None else TrainingRecord()
+        for name, robot in zip(names, robots, strict=True)
+    ]
+    trained = [r.env_kwargs["track"] for r in records if "track" in r.env_kwargs]
+    track = one_track(args.track or next(iter(trained), "aalborg"))
     words = args.robots.split(",") if args.robots else []
     opponents = [game.parse_robot(word) for word in words]
-    track = one_track(args.track or record.env_kwargs.get("track", "aalborg"))
-    return Show(game, track, robot, name, settings, opponents, args.laps)
+    own = {} if args.car is None else {"car": args.car}
+    return [
+        Show(game, track, robot, name, {**record.kept(KEPT), **own}, opponents, args.laps)
+        for name, robot, record in zip(names, robots, records, strict=True)
+    ]
 
 
 def _record(game: Game, name: str) -> TrainingRecord:
@@ -147,7 +159,7 @@ def _in_window(show: Show, args: argparse.Namespace) -> None:
     from sb3_torcs.game_window import Window
     from sb3_torcs.watching import show_in_window
 
-    display = find_display()
+    display = find_display("`--film FILE.mp4` films the race without one")
     window = Window(size=args.size, view=args.view, display=display, driver=show.driver_name)
     show_in_window(show, window)
 
