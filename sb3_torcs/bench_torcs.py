@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 import statistics
 import time
 from collections.abc import Callable
@@ -243,6 +244,7 @@ def _serve(pipe: Connection, controls: FloatArray) -> None:
     """Drive for as many seconds as are asked for, until none are, and say how fast it went."""
     from sb3_torcs.backends.native import NativeBackend
 
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # which is for the parent, who ends this process
     backend = NativeBackend()
     pipe.send("ready")
     while seconds := pipe.recv():

@@ -20,7 +20,6 @@ __all__ = ["VirtualDisplay", "find_display"]
 
 PROGRAM = "Xvfb"
 INSTALL = "`sb3-torcs install-torcs --film`, or: `sudo apt install xvfb`"
-FILM = "`--film FILE.mp4` films the race without one"
 PATIENCE = 20.0  # [s] for a server to start on a busy machine
 GRACE = 5.0  # [s] for a server to end
 ANSWER_TIME = 5.0  # [s] for a server to greet
@@ -30,21 +29,22 @@ GREETING = b"l\0\x0b\0\0\0" + bytes(6)  # little endian, protocol 11.0, no passw
 WELCOME = b"\x01"
 
 
-def find_display() -> str:
+def find_display(otherwise: str) -> str:
     """
     Find the user's display.
 
+    :param otherwise: what to do where there is none
     :return: its name, from ``$DISPLAY``
     :raises DisplayUnavailable: if there is none, or no server answers there
     """
     name = os.environ.get("DISPLAY", "")
     if not name:
-        raise DisplayUnavailable(f"there is no display ($DISPLAY is not set); {FILM}")
+        raise DisplayUnavailable(f"there is no display ($DISPLAY is not set); {otherwise}")
     try:
         _connect(name).close()
     except (OSError, ValueError) as error:
         raise DisplayUnavailable(
-            f"no X server answers at $DISPLAY={name} ({error}); {FILM}"
+            f"no X server answers at $DISPLAY={name} ({error}); {otherwise}"
         ) from error
     return name
 

@@ -20,6 +20,7 @@ from pathlib import Path
 from sb3_torcs.errors import BackendUnavailable, GameFailed, GameIncomplete, GameTimeout
 from sb3_torcs.game import BUILD, Game
 from sb3_torcs.race_file import RACE_FILE, SCR_SERVER, RaceSetup, write_race
+from sb3_torcs.tracks import load_track
 
 __all__ = ["GameProcess", "compiled_library", "game_environment"]
 
@@ -43,6 +44,7 @@ class GameProcess:
     :param preload: a library of ours that the game's program loads first, instead of text mode
     :param files: texts for the private folder, by their place in it
     :raises TrackNotFound: if the game has no such track
+    :raises TrackFileError: if the track's file is broken
     :raises UnknownRobot: if the game has no such robot
     :raises UnknownCar: if the game has not the car of a driver
     :raises GameIncomplete: if the game lacks its program, or a file that a race needs
@@ -142,7 +144,7 @@ class GameProcess:
     def last_words(self) -> str:
         """Return the last lines that the game printed, as one."""
         lines = self.words().splitlines()
-        said = [line.strip() for line in lines if line.strip()][-LAST_LINES:]
+        said = [" ".join(line.split()) for line in lines if line.strip()][-LAST_LINES:]
         return " / ".join(said) or "nothing"
 
     def words(self) -> str:
@@ -203,14 +205,15 @@ def _data(game: Game, folder: Path, race: RaceSetup) -> tuple[Path, RaceSetup]:
     if not track.lower().endswith(".xml"):
         return game.data, replace(race, track=game.find_track(track))
     file = Path(os.path.expanduser(track)).absolute()
+    load_track(file)  # the game would end without a word
     data = folder / "data"
     (data / "tracks").mkdir(parents=True)
     _link_all(game.data, data, besides="tracks")
     _link_all(game.data / "tracks", data / "tracks")
     own = data / "tracks" / OWN_TRACKS / file.stem
     own.mkdir(parents=True)
-    if file.parent.is_dir():
-        _link_all(file.parent, own)
+    _link_all(file.parent, own, besides=file.name)
+    (own / f"{file.stem}.xml").symlink_to(file)  # however its suffix is written
     return data, replace(race, track=f"{OWN_TRACKS}/{file.stem}")
 
 

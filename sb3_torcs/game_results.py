@@ -42,8 +42,15 @@ def _results(process: GameProcess) -> ElementTree.Element:
     """
     race_name = process.race_name
     for file in (process.folder / "results" / Path(RACE_FILE).stem).glob("*.xml"):
+        try:
+            root = ElementTree.parse(file).getroot()
+        except ElementTree.ParseError as error:
+            raise GameFailed(
+                f"the results that the game wrote are cut off ({error}); is there room in "
+                f"'{process.folder.parent}'?"
+            ) from error
         # The section of the track goes by the name that its author gave it: any will do.
-        for section in ElementTree.parse(file).getroot().findall("section"):
+        for section in root.findall("section"):
             found = section.find(f"section[@name='Results']/section[@name='{race_name}']")
             if found is not None:
                 return found

@@ -47,9 +47,11 @@ def open_ports(
         except OSError as error:
             for opened in sockets:
                 opened.close()
+            taken = error.errno == errno.EADDRINUSE
+            remedy = "end the program that has it, or choose another" if taken else "choose another"
             raise PortTaken(
-                f"UDP port {wanted} at {host} cannot be had ({error.strerror or error}); end the "
-                "program that has it, or choose another with --port"
+                f"UDP port {wanted} at {host} cannot be had ({error.strerror or error}); {remedy} "
+                "with --port, or another address with --host"
             ) from error
     return sockets
 

@@ -109,7 +109,8 @@ def test_whatever_ends_it_nothing_is_left(folder, number):
         assert len(games_of(folder)) == 1
         process.send_signal(number)
         _, err = process.communicate(timeout=PATIENCE)
-        assert process.returncode == (130 if number == signal.SIGINT else -number)
+        ends = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGKILL: -9}
+        assert process.returncode == ends[number]
         if number == signal.SIGINT:
             assert "sb3-torcs: interrupted" in err
     deadline = time.monotonic() + PATIENCE  # a game without its owner ends itself
@@ -159,7 +160,9 @@ def test_a_window_shows_the_race(folder):
         (["--deadline", "0"], "--deadline is 0 ms; expected 0.001 to 3.6e+06, or --wait"),
         (["--deadline", "0.0001"], "--deadline is 0.0001 ms"),
         (["--deadline", "inf"], "--deadline is inf ms"),
-        (["--drivers", "11"], "scr_server has no driver 10; expected 0 to 9"),
+        (["--drivers", "11"], "--drivers is 11; expected 1 to 10"),
+        (["--track", "nowhere.xml"], "there is no track file"),
+        (["--host", "::1"], "choose another with --port, or another address with --host"),
         (["--track", "forzza"], "no track 'forzza'; did you mean 'forza'?"),
         (["--robots", "infernal"], "no robot 'infernal'; did you mean 'inferno'?"),
         (["--car", "car1-trb9"], "no car 'car1-trb9'; did you mean"),

@@ -7,6 +7,7 @@ import os
 import re
 import tempfile
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from fake_game import write, write_game, write_program
@@ -16,12 +17,15 @@ from sb3_torcs.errors import (
     GameIncomplete,
     GameTimeout,
     InvalidOption,
+    TrackFileError,
     TrackNotFound,
     UnknownCar,
     UnknownRobot,
 )
 from sb3_torcs.game import find_game
 from sb3_torcs.game_process import game_environment
+from sb3_torcs.game_results import read_results
+from sb3_torcs.race_file import RaceSetup
 from sb3_torcs.race_results import Lap
 from sb3_torcs.text_mode import missing_libraries, run
 
@@ -273,3 +277,28 @@ def test_libraries_that_are_not_there_are_named(game):
         dataclasses.replace(game, libraries=libraries, extra_libraries=None)
     )
     assert "libtgf.so" in missing
+
+
+class TestOwnTracks:
+    @pytest.mark.parametrize("name", ["mine.xml", "Mine.XML", "two words.xml"])
+    def test_a_file_of_any_name(self, game, name, tmp_path):
+        (tmp_path / name).write_bytes(game.tracks()["oval/a-speedway"].read_bytes())
+        path = tmp_path / name
+        assert run(game, path, [("bt", 4)], 1) == run(game, "a-speedway", [("bt", 4)], 1)
+
+    @pytest.mark.parametrize("content", [None, "hello"])
+    def test_a_file_that_is_none(self, game, content, tmp_path):
+        path = tmp_path / "mine.xml"
+        if content:
+            path.write_text(content)
+        with pytest.raises((TrackNotFound, TrackFileError), match=r"mine\.xml"):
+            run(game, path, [("bt", 4)])
+
+
+def test_results_that_are_cut_off_are_told(tmp_path):
+    results = tmp_path / "results" / "race"
+    results.mkdir(parents=True)
+    (results / "results.xml").write_text("<params><sec")
+    process = SimpleNamespace(folder=tmp_path, race_name="Practice", last_words=lambda: "")
+    with pytest.raises(GameFailed, match=r"cut off .* is there room in"):
+        read_results(process, RaceSetup("aalborg", [("bt", 4)], 1), ["car1-trb1"])

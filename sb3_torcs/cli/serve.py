@@ -66,9 +66,11 @@ def run(args: argparse.Namespace) -> int:
     from sb3_torcs.game import find_game
     from sb3_torcs.game_results import read_results
     from sb3_torcs.game_window import Window
-    from sb3_torcs.race_file import SCR_SERVER, RaceSetup, session_for
+    from sb3_torcs.race_file import SCR_DRIVERS, SCR_SERVER, RaceSetup, session_for
     from sb3_torcs.scr_game import open_ports, start_server
 
+    if args.drivers > SCR_DRIVERS:
+        raise InvalidOption(f"--drivers is {args.drivers}; expected 1 to {SCR_DRIVERS}")
     if not SHORTEST_DEADLINE <= args.deadline <= LONGEST_DEADLINE:
         raise InvalidOption(
             f"--deadline is {args.deadline:g} ms; expected {SHORTEST_DEADLINE:g} to "
@@ -78,9 +80,13 @@ def run(args: argparse.Namespace) -> int:
     robots = [game.parse_robot(name) for name in args.robots.split(",")] if args.robots else []
     drivers = [(SCR_SERVER, number) for number in range(args.drivers)] + robots
     race = RaceSetup(args.track, drivers, args.laps, session_for(drivers), args.car)
-    cars = [args.car] * args.drivers + [game.find_robot(*robot).car for robot in robots]
+    cars = race.cars(game)
     deadline = None if args.wait else args.deadline / 1000.0
-    window = Window(display=find_display(), driver="scr_server 0") if args.window else None
+    window = (
+        Window(display=find_display("leave --window out"), driver="scr_server 0")
+        if args.window
+        else None
+    )
     sockets = open_ports(args.drivers, args.port, args.host)
     try:
         process = start_server(game, race, sockets, deadline=deadline, window=window)
