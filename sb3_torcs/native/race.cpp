@@ -347,7 +347,7 @@ float Race::grid_to_right(int index) const {
 
 void Race::place_on_grid(CarElement& car) {
     const float distance = grid_distance(car.index);
-    if (!(distance >= 0.0f && distance <= track_->length))
+    if (!(distance >= 0.0f))
         throw Error("TrackFileError",
                     options_.track + " is " + std::to_string(std::lround(track_->length)) +
                         " m long, and its grid has place " + std::to_string(car.index + 1) + " " +
