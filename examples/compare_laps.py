@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from sb3_torcs.driving_metrics import BRAKING
 from sb3_torcs.evaluation import drive, race_environment
 from sb3_torcs.game import find_game
-from sb3_torcs.models import find_model, load_driver, training_record
+from sb3_torcs.models import driver_record, load_driver
 from sb3_torcs.robots import race
 from sb3_torcs.track_plot import KMH, edges
 from sb3_torcs.tracks import load_track
@@ -54,7 +54,7 @@ def robot_samples(name, track):
 
 def model_samples(name, track):
     """What a model does in three laps, once per decision."""
-    record = training_record(find_model(name))
+    record = driver_record(name)
     env = race_environment(record.env_id or "Torcs-v0", record.env_kwargs, track)
     rows = [
         {**step.car._asdict(), "throttle": step.action[1], "brake": step.action[2]}
