@@ -12,12 +12,12 @@ import os
 import shutil
 import signal
 import tempfile
-import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 from sb3_torcs.errors import OutputNotWritable, RayUnavailable, StudyError
+from sb3_torcs.signals import answered
 from sb3_torcs.study_file import Study, Trial
 from sb3_torcs.study_folder import Files, StudyFolder
 
@@ -205,25 +205,13 @@ def _ray(place: StudyFolder, jobs: int | None, address: str | None) -> Iterator[
                 f"the Ray at '{address}' belongs to another study, and ends with it; leave "
                 "--address out, or start a cluster with `ray start --head`"
             )
-        with _killed_politely():
+        # Tune knows Ctrl-C; SIGTERM Ray would take for a crash.
+        with answered(lambda *_: signal.raise_signal(signal.SIGINT), signal.SIGTERM):
             yield scratch
     finally:
         ray.shutdown()
         shutil.rmtree(scratch, ignore_errors=True)
         session.unlink(missing_ok=True)
-
-
-@contextlib.contextmanager
-def _killed_politely() -> Iterator[None]:
-    """Take SIGTERM for Ctrl-C, which Tune knows; Ray would take it for a crash."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    rays = signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, rays)
 
 
 def _remove_scratch(session: Path) -> None:

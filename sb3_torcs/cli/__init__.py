@@ -7,8 +7,8 @@ import contextlib
 import os
 import signal
 import sys
-import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from signal import SIGHUP, SIGTERM
 from types import FrameType
 
 from sb3_torcs.cli import (
@@ -26,6 +26,7 @@ from sb3_torcs.cli import (
     watch,
 )
 from sb3_torcs.errors import Sb3TorcsError
+from sb3_torcs.signals import answered
 
 __all__ = ["main"]
 
@@ -53,7 +54,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     if args.zoo_args and args.verb != "train":
         parser.error(f"{args.verb} passes nothing on; leave out '--' and what follows it")
     try:
-        with _ended_politely():
+        # nohup ignores the latter.
+        ends = [n for n in (SIGTERM, SIGHUP) if signal.getsignal(n) == signal.SIG_DFL]
+        with answered(_end, *ends):
             status: int = args.run(args)
         sys.stdout.flush()
     except Sb3TorcsError as error:
@@ -74,25 +77,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     return status
 
 
-@contextlib.contextmanager
-def _ended_politely() -> Iterator[None]:
+def _end(number: int, frame: FrameType | None) -> None:
     """Clean up before SIGTERM, or the terminal's going away, ends the process."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def end(number: int, frame: FrameType | None) -> None:
-        del frame
-        raise SystemExit(128 + number)
-
-    default = [n for n in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(n) == signal.SIG_DFL]
-    for number in default:  # nohup ignores the latter
-        signal.signal(number, end)
-    try:
-        yield
-    finally:
-        for number in default:
-            signal.signal(number, signal.SIG_DFL)
+    del frame
+    raise SystemExit(128 + number)
 
 
 def _drop_output() -> None:

@@ -9,7 +9,6 @@ import shlex
 import signal
 import sys
 import tempfile
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from types import FrameType
@@ -17,6 +16,7 @@ from typing import Any
 
 from sb3_torcs.cli.common import positive, seed, writable_folder
 from sb3_torcs.errors import InvalidOption, OutputNotWritable
+from sb3_torcs.signals import answered
 
 __all__ = ["Run", "TrainOptions", "add_parser", "run", "train", "train_run"]
 
@@ -335,9 +335,6 @@ def _noted_interrupts() -> Iterator[list[int]]:
     A second one, while the model is being saved, must not break the file: only a third does.
     """
     seen: list[int] = []
-    if threading.current_thread() is not threading.main_thread():
-        yield seen
-        return
 
     def note(number: int, frame: FrameType | None) -> None:
         del frame
@@ -347,12 +344,8 @@ def _noted_interrupts() -> Iterator[list[int]]:
             return
         raise KeyboardInterrupt
 
-    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
+    with answered(note, signal.SIGINT, signal.SIGTERM):
         yield seen
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _closing_words(options: TrainOptions, result: Run) -> list[str]:
