@@ -211,10 +211,11 @@ class ScrBackend:
         if self._own:
             self._launch()
         host, port = self._address
-        manners: dict[str, Any] = {"patience": PATIENCE, "pause": PAUSE, "watch": self._watch}
-        if not self._own:
-            manners = {"patience": PATIENCE_WITH_OTHERS, "silence": SILENCE}
-            manners["latencies"] = self.latencies
+        manners: dict[str, Any] = {
+            "patience": PATIENCE_WITH_OTHERS, "silence": SILENCE, "latencies": self.latencies,
+        }  # fmt: skip
+        if self._own:
+            manners = {"patience": PATIENCE, "pause": PAUSE, "watch": self._watch}
         self._client = ScrClient(host, port, self.range_finder_angles, **manners)
         self._client.identify(start)
 
@@ -254,13 +255,10 @@ class ScrBackend:
         """
         client = self._client
         assert client is not None, "_connect makes it"
-        while True:
-            message = client.receive()
-            if message is None and client.restarted:  # by another client, before it began
+        while (message := client.receive()) is not None or client.restarted:
+            if message is None:  # another client has the race begin anew
                 client.identify(start)
                 continue
-            if message is None:
-                break
             lap_time = parse_engine(message).lap_time
             if lap_time >= 0.0:
                 return message
