@@ -62,7 +62,8 @@ class TestTheUsersDisplay:
     @pytest.mark.parametrize("name", [":2999", "unix:2999", "localhost:2999"])
     def test_one_that_does_not_answer_is_an_error(self, monkeypatch, name):
         monkeypatch.setenv("DISPLAY", name)
-        with pytest.raises(DisplayUnavailable, match=rf"no X server .*{name}.*do without"):
+        told = rf"no X server answers at .*{name}.*do without one"
+        with pytest.raises(DisplayUnavailable, match=told):
             find_display("do without one")
 
     def test_what_is_no_name_is_an_error(self, monkeypatch):

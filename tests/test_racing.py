@@ -173,7 +173,7 @@ def test_random_starts_are_as_fast_as_asked(oval):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"action_repeat": 0}, "action_repeat is 0; expected a whole number from 1 to"),
+        ({"action_repeat": 0}, "action_repeat is 0; expected a whole number from 1 to 50000"),
         ({"action_repeat": 1 << 31}, "action_repeat is 2147483648"),
         ({"laps": 0}, "laps is 0"),
         ({"laps": True}, "laps is True"),

@@ -134,7 +134,11 @@ class TestRefusals:
             ([("racer", 3), ("racer", 10)], {}, r"a practice is for one robot, 2 are named"),
             ([], {"session": "race"}, r"robots are none; expected at least one"),
             ([("racer", 3)] * 2, {"session": "race"}, r"racer:3, racer:3; expected .* twice"),
-            ([("racer", 3)], {"laps": 0}, r"laps is 0; expected a whole number from 1"),
+            (
+                [("racer", 3)],
+                {"laps": 0},
+                r"laps is 0; expected .* from 1 to 1073741824",
+            ),
             ([("racer", 3)], {"session": "duel"}, r"session is 'duel'; expected practice or race"),
         ],
     )
