@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import signal
 
 import numpy as np
 import pytest
@@ -19,6 +20,10 @@ from sb3_torcs.tracks import Grid, Segment, Surface, Track
 ASPHALT = Surface("asphalt", 1.2, 0.001, 0.5, 10.0)
 GRASS = Surface("grass", 0.4, 0.01, 0.5, 10.0)
 WALL = Surface("wall", 0.1, 0.001, 0.5, 10.0)
+
+# `nohup make test &` ignores these, and so would every process that a test starts and signals.
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def segment(length, curvature=0.0, width=10.0, side=5.0):
