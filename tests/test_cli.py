@@ -338,6 +338,9 @@ def test_an_output_that_takes_no_more_is_told():
         ({"resume": "none.zip"}, "there is no model 'none.zip'"),
         ({"algo": "dpg"}, "no algorithm 'dpg'; did you mean 'ddpg'?"),
         ({"zoo_args": ("--log-folder", "x")}, "before -- there are --algo, --env, --timesteps"),
+        ({"zoo_args": ("--hyperparams", "batchsize:8")}, "unknown key 'batchsize'"),
+        ({"zoo_args": ("--hyperparams", "learning_rate:lin_1")}, "values are Python, e.g."),
+        ({"zoo_args": ("--env-kwargs", "trak:'oval'")}, "did you mean 'track'?"),
     ],
 )
 def test_a_mistake_is_told_before_anything_starts(tmp_path, changes, message):

@@ -9,7 +9,7 @@ import shlex
 import signal
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -174,6 +174,7 @@ def train_run(options: TrainOptions) -> Run:
     :param options: what to train, and where to put it
     :return: what came of it
     :raises ZooConfigError: if the hyperparameters have something that nothing would read
+    :raises InvalidOption: if the words for the zoo cannot be read, or would hide the model
     :raises OutputNotWritable: if a folder cannot be written
     """
     from sb3_torcs import zoo
@@ -185,11 +186,11 @@ def train_run(options: TrainOptions) -> Run:
                 f"'{word}' after -- would hide from sb3-torcs where the model is; before -- there "
                 "are --algo, --env, --timesteps, --folder and --conf-file"
             )
-    entry = _entry(options)
-    resume = _resumed(options, entry)
+    entry, changed = _entry(options)
+    resume = _resumed(options, entry, changed)
     folder = writable_folder(options.folder)
     tensorboard = writable_folder(options.tensorboard or folder / "tensorboard")
-    wanted = options.timesteps or zoo.decisions(entry)
+    wanted = options.timesteps or zoo.decisions(changed)
     if any(word.endswith("subproc") for word in options.zoo_args):
         wrappers = entry.get("env_wrapper") or []
         entry["env_wrapper"] = [*(wrappers if isinstance(wrappers, list) else [wrappers]), WORKER]
@@ -197,7 +198,7 @@ def train_run(options: TrainOptions) -> Run:
         entry["callback"] = _with_progress(entry.get("callback"))
     with tempfile.TemporaryDirectory() as scratch:
         conf_file = _write_entry(Path(scratch) / "zoo.yml", options.env, entry)
-        words = _zoo_words(options, wanted, entry.get("env_kwargs") or {})
+        words = _zoo_words(options, wanted, changed.get("env_kwargs") or {})
         words += ["--conf-file", str(conf_file), "--log-folder", str(folder)]
         words += ["--tensorboard-log", str(tensorboard)]
         words += ["--trained-agent", str(resume)] if resume else []
@@ -210,12 +211,17 @@ def train_run(options: TrainOptions) -> Run:
         wanted=wanted,
         interrupted=interrupted,
         last_model=last_model,
-        track=(entry.get("env_kwargs") or {}).get("track"),
+        track=(changed.get("env_kwargs") or {}).get("track"),
     )
 
 
-def _entry(options: TrainOptions) -> dict[str, Any]:
-    """Read and check the hyperparameters, and build the environment once to see that it can be."""
+def _entry(options: TrainOptions) -> tuple[dict[str, Any], dict[str, Any]]:
+    """
+    Read and check the hyperparameters, and build the environment once to see that it can be.
+
+    :param options: what to train
+    :return: the entry, and what the zoo will make of it by its own words
+    """
     import gymnasium as gym
 
     from sb3_torcs import zoo
@@ -226,13 +232,40 @@ def _entry(options: TrainOptions) -> dict[str, Any]:
     entry = zoo.read_entry(path, name)
     if options.track is not None:
         entry["env_kwargs"] = {**(entry.get("env_kwargs") or {}), "track": options.track}
-    zoo.check_entry(entry, options.algo, options.env, zoo.Place(path, name))
-    gym.make(options.env, **(entry.get("env_kwargs") or {})).close()
-    return entry
+    changed = {**entry, **_changes(options.zoo_args)}
+    zoo.check_entry(changed, options.algo, options.env, zoo.Place(path, name))
+    gym.make(options.env, **(changed.get("env_kwargs") or {})).close()
+    return entry, changed
 
 
-def _resumed(options: TrainOptions, entry: dict[str, Any]) -> Path | None:
-    """Find and check the model to go on from; with its memory it needs no new warm-up."""
+def _changes(zoo_args: Sequence[str]) -> dict[str, Any]:
+    """Find what the zoo will change of an entry, without a check of its own."""
+    from rl_zoo3.utils import StoreDict
+
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    parser.add_argument("-params", "--hyperparams", nargs="+", action=StoreDict, default={})
+    parser.add_argument("--env-kwargs", nargs="+", action=StoreDict)
+    try:
+        known, _ = parser.parse_known_args(zoo_args)
+    except Exception as error:  # values are evaluated, which can raise anything
+        raise InvalidOption(
+            f"'{shlex.join(zoo_args)}' cannot be read ({error}); values are Python, e.g. "
+            "--hyperparams gamma:0.98 \"learning_rate:'lin_0.001'\""
+        ) from error
+    if known.env_kwargs is None:
+        return dict(known.hyperparams)
+    return {**known.hyperparams, "env_kwargs": known.env_kwargs}
+
+
+def _resumed(options: TrainOptions, entry: dict[str, Any], changed: dict[str, Any]) -> Path | None:
+    """
+    Find and check the model to go on from; with its memory it needs no new warm-up.
+
+    :param options: what to train
+    :param entry: of the hyperparameter file; is adapted
+    :param changed: what the zoo will make of it
+    :return: the model's file; ``None`` begins anew
+    """
     if options.resume is None:
         return None
     import gymnasium as gym
@@ -240,8 +273,8 @@ def _resumed(options: TrainOptions, entry: dict[str, Any]) -> Path | None:
     from sb3_torcs.models import check_resumable, find_model
 
     path = find_model(options.resume, prefer_last=True)
-    env = gym.make(options.env, **(entry.get("env_kwargs") or {}))
-    memory = check_resumable(path, env, options.algo, entry.get("n_envs", 1))
+    env = gym.make(options.env, **(changed.get("env_kwargs") or {}))
+    memory = check_resumable(path, env, options.algo, changed.get("n_envs", 1))
     env.close()
     if "learning_starts" in entry and memory:
         entry["learning_starts"] = 0
