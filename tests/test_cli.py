@@ -391,6 +391,14 @@ def test_the_words_for_the_zoo_say_what_was_asked():
     assert words[words.index("--eval-env-kwargs") + 1 :] == ["track:'aalborg'", "laps:2"]
 
 
+def test_the_evaluation_is_on_the_track_that_the_zoo_s_own_words_name(monkeypatch, tmp_path):
+    asked = []
+    monkeypatch.setattr(train, "_run_zoo", lambda words: asked.extend(words) or 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        train.train(options(tmp_path, zoo_args=("--env-kwargs", "track:'corkscrew'")))
+    assert asked[asked.index("--eval-env-kwargs") + 1] == "track:'corkscrew'"
+
+
 def test_the_command_that_goes_on_means_the_same_options():
     asked = TrainOptions(
         entry="as the post", timesteps=5, seed=3, progress=False, zoo_args=("--save-freq", "2")
