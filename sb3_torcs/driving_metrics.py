@@ -6,6 +6,7 @@ The rows of ``monitor.csv`` are Monitor's business: :data:`MONITOR_KWARGS` tells
 
 from __future__ import annotations
 
+import copy
 import math
 import tempfile
 from collections.abc import Iterator
@@ -348,7 +349,10 @@ class DrivingMetricsCallback(BaseCallback):
         formats = self.logger.output_formats
         if not self.line or not any(isinstance(f, TensorBoardOutputFormat) for f in formats):
             return
+        chance = copy.deepcopy(env.get_attr("np_random"))
         line = drive_lap(self.model, env, self.line_decisions)
+        for index, generator in enumerate(chance):  # later evaluations are as if nobody had looked
+            env.set_attr("np_random", generator, index)
         if line.lap_time is not None:
             best = self.best_evaluation_lap_time or math.inf
             self.best_evaluation_lap_time = min(line.lap_time, best)

@@ -206,6 +206,25 @@ def test_measuring_changes_nothing_that_is_learned():
         np.testing.assert_array_equal(value.numpy(), measured[name].numpy(), name)
 
 
+@pytest.mark.parametrize("vec_env_cls", [DummyVecEnv, SubprocVecEnv])
+def test_a_line_that_is_drawn_changes_no_later_evaluation(vec_env_cls, monkeypatch):
+    """Of several tracks the evaluation draws one for each race."""
+    monkeypatch.setattr("sb3_torcs.driving_metrics.line_image", lambda line: line)
+
+    def races(*callbacks):
+        tracks = ["aalborg", "alpine-1", "corkscrew", "g-track-1"]
+        env = lite(2, vec_env_cls, track=tracks, start="random", max_episode_steps=5)
+        model = DDPG("MlpPolicy", lite(1, vec_env_cls), learning_starts=1000, **small())
+        model.set_logger(Logger(None, [Pictures()]))
+        evaluation = EvalCallback(env, n_eval_episodes=4, eval_freq=10, verbose=0)
+        model.learn(60, callback=[evaluation, *callbacks])
+        for used in (env, model.get_env()):
+            used.close()
+        return evaluation.last_mean_reward, evaluation.best_mean_reward
+
+    assert races(DrivingMetricsCallback(line_decisions=10)) == races()
+
+
 def test_q_is_the_critics_value_of_the_stored_transitions():
     model = DDPG("MlpPolicy", lite(), learning_starts=0, batch_size=8, train_freq=4, **small())
     assert mean_q(model) is None
