@@ -1,3 +1,4 @@
+import concurrent.futures
 import dataclasses
 import itertools
 import json
@@ -6,6 +7,7 @@ import shlex
 import signal
 import subprocess
 import sys
+import threading
 import time
 import types
 from pathlib import Path
@@ -397,6 +399,22 @@ def test_the_evaluation_is_on_the_track_that_the_zoo_s_own_words_name(monkeypatc
     with pytest.raises(ZeroDivisionError):
         train.train(options(tmp_path, zoo_args=("--env-kwargs", "track:'corkscrew'")))
     assert asked[asked.index("--eval-env-kwargs") + 1] == "track:'corkscrew'"
+
+
+def test_trainings_that_begin_at_once_get_folders_of_their_own(tmp_path):
+    """As the zoo does it: look which numbers there are, and make the next one's folder later."""
+
+    def begin(_):
+        with train._alone_until_numbered(tmp_path):
+            number = len(list(tmp_path.iterdir())) + 1
+            time.sleep(0.1)
+            (tmp_path / f"TorcsLite-v0_{number}").mkdir()
+            trained.wait()  # while the others begin
+
+    trained = threading.Barrier(4, timeout=20.0)
+    with concurrent.futures.ThreadPoolExecutor(4) as pool:
+        list(pool.map(begin, range(4)))
+    assert len(list(tmp_path.iterdir())) == 4
 
 
 def test_the_command_that_goes_on_means_the_same_options():

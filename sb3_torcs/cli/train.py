@@ -5,10 +5,13 @@ from __future__ import annotations
 import argparse
 import contextlib
 import dataclasses
+import fcntl
+import os
 import shlex
 import signal
 import sys
 import tempfile
+import threading
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import FrameType
@@ -202,7 +205,8 @@ def train_run(options: TrainOptions) -> Run:
         words += ["--conf-file", str(conf_file), "--log-folder", str(folder)]
         words += ["--tensorboard-log", str(tensorboard)]
         words += ["--trained-agent", str(resume)] if resume else []
-        interrupted = _run_zoo([*words, *options.zoo_args])
+        with _alone_until_numbered(folder / options.algo):
+            interrupted = _run_zoo([*words, *options.zoo_args])
     run_folder = _run_folder(folder / options.algo, conf_file)
     last_model = run_folder / f"{options.env.replace('/', '-')}.zip"
     return Run(
@@ -321,6 +325,37 @@ def _with_progress(callbacks: Any) -> list[Any]:
     """
     items = callbacks if isinstance(callbacks, list) else [] if callbacks is None else [callbacks]
     return [PROGRESS, *(item for item in items if item != PROGRESS)]
+
+
+@contextlib.contextmanager
+def _alone_until_numbered(parent: Path) -> Iterator[None]:
+    """
+    Let others wait until the run has its folder.
+
+    The zoo numbers a run by the folders that it finds, and makes the run's own a moment later: two
+    that began at once would write into one.
+
+    :param parent: of all runs of the algorithm; is made
+    """
+    parent.mkdir(parents=True, exist_ok=True)
+    directory = os.open(parent, os.O_RDONLY)
+    numbered = threading.Event()
+
+    def let_in() -> None:
+        while set(os.listdir(parent)) == before and not numbered.wait(0.02):
+            pass
+        os.close(directory)
+
+    with contextlib.suppress(OSError):  # of file systems without locks
+        fcntl.flock(directory, fcntl.LOCK_EX)
+    before = set(os.listdir(parent))
+    watch = threading.Thread(target=let_in)
+    watch.start()
+    try:
+        yield
+    finally:
+        numbered.set()
+        watch.join()
 
 
 def _run_folder(parent: Path, conf_file: Path) -> Path:
