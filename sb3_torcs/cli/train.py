@@ -180,6 +180,8 @@ def train_run(options: TrainOptions) -> Run:
     :raises InvalidOption: if the words for the zoo cannot be read, or would hide the model
     :raises OutputNotWritable: if a folder cannot be written
     """
+    import gymnasium as gym
+
     from sb3_torcs import zoo
     from sb3_torcs.models import saved_steps
 
@@ -190,7 +192,9 @@ def train_run(options: TrainOptions) -> Run:
                 "are --algo, --env, --timesteps, --folder and --conf-file"
             )
     entry, changed = _entry(options)
-    resume = _resumed(options, entry, changed)
+    # Made once, so that what is wrong with it is told before anything starts.
+    with contextlib.closing(gym.make(options.env, **changed["env_kwargs"])) as env:
+        resume = _resumed(options, entry, env, changed.get("n_envs", 1))
     folder = writable_folder(options.folder)
     tensorboard = writable_folder(options.tensorboard or folder / "tensorboard")
     wanted = options.timesteps or zoo.decisions(changed)
@@ -201,7 +205,7 @@ def train_run(options: TrainOptions) -> Run:
         entry["callback"] = _with_progress(entry.get("callback"))
     with tempfile.TemporaryDirectory() as scratch:
         conf_file = _write_entry(Path(scratch) / "zoo.yml", options.env, entry)
-        words = _zoo_words(options, wanted, changed.get("env_kwargs") or {})
+        words = _zoo_words(options, wanted, changed["env_kwargs"])
         words += ["--conf-file", str(conf_file), "--log-folder", str(folder)]
         words += ["--tensorboard-log", str(tensorboard)]
         words += ["--trained-agent", str(resume)] if resume else []
@@ -215,19 +219,17 @@ def train_run(options: TrainOptions) -> Run:
         wanted=wanted,
         interrupted=interrupted,
         last_model=last_model,
-        track=(changed.get("env_kwargs") or {}).get("track"),
+        track=changed["env_kwargs"].get("track"),
     )
 
 
 def _entry(options: TrainOptions) -> tuple[dict[str, Any], dict[str, Any]]:
     """
-    Read and check the hyperparameters, and build the environment once to see that it can be.
+    Read and check the hyperparameters.
 
     :param options: what to train
     :return: the entry, and what the zoo will make of it by its own words
     """
-    import gymnasium as gym
-
     from sb3_torcs import zoo
 
     zoo.check_registered(options.env)
@@ -238,8 +240,7 @@ def _entry(options: TrainOptions) -> tuple[dict[str, Any], dict[str, Any]]:
         entry["env_kwargs"] = {**(entry.get("env_kwargs") or {}), "track": options.track}
     changed = {**entry, **_changes(options.zoo_args)}
     zoo.check_entry(changed, options.algo, options.env, zoo.Place(path, name))
-    gym.make(options.env, **(changed.get("env_kwargs") or {})).close()
-    return entry, changed
+    return entry, {**changed, "env_kwargs": changed.get("env_kwargs") or {}}
 
 
 def _changes(zoo_args: Sequence[str]) -> dict[str, Any]:
@@ -261,25 +262,22 @@ def _changes(zoo_args: Sequence[str]) -> dict[str, Any]:
     return {**known.hyperparams, "env_kwargs": known.env_kwargs}
 
 
-def _resumed(options: TrainOptions, entry: dict[str, Any], changed: dict[str, Any]) -> Path | None:
+def _resumed(options: TrainOptions, entry: dict[str, Any], env: Any, n_envs: int) -> Path | None:
     """
     Find and check the model to go on from; with its memory it needs no new warm-up.
 
     :param options: what to train
     :param entry: of the hyperparameter file; is adapted
-    :param changed: what the zoo will make of it
+    :param env: one of those to train in
+    :param n_envs: how many they are
     :return: the model's file; ``None`` begins anew
     """
     if options.resume is None:
         return None
-    import gymnasium as gym
-
     from sb3_torcs.models import check_resumable, find_model
 
     path = find_model(options.resume, prefer_last=True)
-    env = gym.make(options.env, **(changed.get("env_kwargs") or {}))
-    memory = check_resumable(path, env, options.algo, changed.get("n_envs", 1))
-    env.close()
+    memory = check_resumable(path, env, options.algo, n_envs)
     if "learning_starts" in entry and memory:
         entry["learning_starts"] = 0
     if "n_steps" in entry:
