@@ -62,9 +62,10 @@ def drive(env: gym.Env, driver: Driver, start: Start | None) -> Drive:
     """Drive until the episode ends."""
     observation, info = env.reset(seed=0, options=start._asdict() if start else None)
     done = Drive([observation], [], [], 0.0)
-    ended = False
+    state, episode_start, ended = None, np.ones(1, dtype=bool), False
     while not ended:
-        action = driver.predict(observation, deterministic=True)[0]
+        action, state = driver.predict(observation, state, episode_start, deterministic=True)
+        episode_start = np.zeros(1, dtype=bool)
         observation, _, terminated, truncated, info = env.step(action)
         ended = terminated or truncated
         done.actions.append(action)

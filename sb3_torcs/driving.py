@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any, cast
 
 import gymnasium as gym
+import numpy as np
 from gymnasium import spaces
 
 from sb3_torcs.models import load_driver
@@ -64,8 +65,11 @@ class Agent:
     def _race(self, aftermath: float | None) -> None:
         """Drive until the race ends, or as ``drive`` says."""
         observation, _ = self.env.reset()
+        state, episode_start = None, np.ones(1, dtype=bool)
         while not self.backend.over and not self._has_enough(aftermath):
-            action, _ = self.driver.predict(observation, deterministic=True)
+            predict = self.driver.predict
+            action, state = predict(observation, state, episode_start, deterministic=True)
+            episode_start = np.zeros(1, dtype=bool)
             observation, _, terminated, _, info = self.env.step(action)
             self._note(info, terminated)
 

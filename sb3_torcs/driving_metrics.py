@@ -102,8 +102,9 @@ def drive_lap(model: BaseAlgorithm, env: VecEnv, limit: int = 1500) -> DrivenLin
     lap_time = None
     observation: Any = env.reset()
     (track,) = env.get_attr("track", 0)  # when the lap ends the next one may be on another
+    state, dones = None, np.ones(env.num_envs, dtype=bool)
     for _ in range(limit):
-        action, _ = model.predict(observation, deterministic=True)
+        action, state = model.predict(observation, state, dones, deterministic=True)
         observation, _, dones, infos = env.step(action)
         cars.append(infos[0]["car"])
         lap_time = infos[0].get("lap_time")

@@ -40,9 +40,13 @@ class Driver(Protocol):
     """What drives: a Stable-Baselines3 model, or anything that predicts like one."""
 
     def predict(
-        self, observation: npt.NDArray[np.float32], *, deterministic: bool = True
+        self,
+        observation: npt.NDArray[np.float32],
+        state: Any = None,
+        episode_start: npt.NDArray[np.bool_] | None = None,
+        deterministic: bool = False,
     ) -> tuple[npt.NDArray[np.float32], Any]:
-        """Choose an action."""
+        """Choose an action; the state that comes with it is given back at the next timestep."""
 
 
 @dataclass(frozen=True)
@@ -155,9 +159,10 @@ def drive(env: gym.Env[Any, Any], driver: Driver, *, seed: int | None = None) ->
     :return: the decisions, one by one
     """
     observation, _ = env.reset(seed=seed)
-    done = False
+    state, episode_start, done = None, np.ones(1, dtype=bool), False
     while not done:
-        action, _ = driver.predict(observation, deterministic=True)
+        action, state = driver.predict(observation, state, episode_start, deterministic=True)
+        episode_start = np.zeros(1, dtype=bool)
         observation, reward, terminated, truncated, info = env.step(action)
         done = terminated or truncated
         yield Step(info["car"], action, float(reward), info, done)

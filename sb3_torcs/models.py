@@ -90,18 +90,26 @@ class NormalizedDriver:
         self._statistics = statistics
 
     def predict(
-        self, observation: npt.NDArray[np.float32], *, deterministic: bool = True
+        self,
+        observation: npt.NDArray[np.float32],
+        state: Any = None,
+        episode_start: npt.NDArray[np.bool_] | None = None,
+        deterministic: bool = False,
     ) -> tuple[npt.NDArray[np.float32], Any]:
         """
         Choose an action.
 
         :param observation: as the environment gives it
+        :param state: of a recurrent model, as the call before returned it
+        :param episode_start: (1,) whether an episode begins here
         :param deterministic: whether to leave out chance
         :return: the action and the model's state
         """
         normalized = self._statistics.normalize_obs(observation)
-        action, state = self._model.predict(normalized, deterministic=deterministic)
-        return action, state
+        answer: tuple[npt.NDArray[np.float32], Any] = self._model.predict(
+            normalized, state, episode_start, deterministic
+        )
+        return answer
 
 
 class _PlainLoader(yaml.SafeLoader):

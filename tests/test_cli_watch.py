@@ -39,7 +39,7 @@ def nothing_is_left(tmp_path, monkeypatch):
 class Turning:
     """Leaves the road at once."""
 
-    def predict(self, observation, *, deterministic=True):
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
         return np.array([1.0, 1.0, 0.0], np.float32), None
 
 
@@ -48,7 +48,7 @@ class Failing(Turning):
 
     decisions = 0
 
-    def predict(self, observation, *, deterministic=True):
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
         self.decisions += 1
         if self.decisions > 30:
             raise ZeroDivisionError("as told")
@@ -136,7 +136,7 @@ def test_a_game_that_is_killed_says_how_it_ended(film, tmp_path, monkeypatch, ca
     class Killing(Turning):
         decisions = 0
 
-        def predict(self, observation, *, deterministic=True):
+        def predict(self, observation, state=None, episode_start=None, deterministic=False):
             self.decisions += 1
             if self.decisions == 20:
                 os.kill(started[0].pid, signal.SIGKILL)

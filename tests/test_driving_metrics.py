@@ -269,7 +269,7 @@ def test_no_lap_is_driven_when_nobody_would_see_it(monkeypatch):
 class Follows:
     """A driver that presses nothing."""
 
-    def predict(self, observation, deterministic):
+    def predict(self, observation, state, episode_start, deterministic):
         assert deterministic
         return np.zeros((len(observation), 3), np.float32), None
 
