@@ -24,7 +24,7 @@ from sb3_torcs.errors import InvalidOption, ModelMismatch, near_miss
 from sb3_torcs.sensors import range_finder_angles
 
 __all__ = [
-    "NormalizedDriver",
+    "Driver",
     "TrainingRecord",
     "check_resumable",
     "check_spaces",
@@ -65,6 +65,7 @@ class TrainingRecord:
     algo: str | None = None
     env_id: str | None = None
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)
+    hyperparameters: Mapping[str, Any] = field(default_factory=dict)  # the entry, as it was read
     statistics: Path | None = None  # of VecNormalize
 
     def kept(self, names: Iterable[str]) -> dict[str, Any]:
@@ -77,17 +78,18 @@ class TrainingRecord:
         return {name: self.env_kwargs[name] for name in names if name in self.env_kwargs}
 
 
-class NormalizedDriver:
+class Driver:
     """
-    A model that learned from normalized observations, with the statistics it learned with.
+    A saved model at the wheel, with the statistics of the observations that it learned with.
 
-    :param model: a Stable-Baselines3 model
-    :param statistics: a ``VecNormalize``
+    :param model: an algorithm or a policy of Stable-Baselines3
+    :param statistics: something with VecNormalize's ``normalize_obs``; ``None`` if the model
+        learned from the observations as they are
     """
 
-    def __init__(self, model: Any, statistics: Any) -> None:
-        self._model = model
-        self._statistics = statistics
+    def __init__(self, model: Any, statistics: Any = None) -> None:
+        self.model = model
+        self.statistics = statistics
 
     def predict(
         self,
@@ -105,9 +107,10 @@ class NormalizedDriver:
         :param deterministic: whether to leave out chance
         :return: the action and the model's state
         """
-        normalized = self._statistics.normalize_obs(observation)
-        answer: tuple[npt.NDArray[np.float32], Any] = self._model.predict(
-            normalized, state, episode_start, deterministic
+        if self.statistics is not None:
+            observation = self.statistics.normalize_obs(observation)
+        answer: tuple[npt.NDArray[np.float32], Any] = self.model.predict(
+            observation, state, episode_start, deterministic
         )
         return answer
 
@@ -200,6 +203,7 @@ def _record(folder: Path) -> TrainingRecord | None:
         algo=_recorded(arguments, "algo", str),
         env_id=_recorded(arguments, "env", str),
         env_kwargs=_recorded(config, "env_kwargs", dict) or {},
+        hyperparameters=_read_plain(config),
         statistics=statistics if statistics.is_file() else None,
     )
 
@@ -398,12 +402,12 @@ def load_driver(path: str | Path, env: gym.Env[Any, Any], algo: str | None = Non
     with _as_mismatch(f"'{model_file}' does not load as {name}", "give an --algo that fits, or"):
         model = algorithm.load(io.BytesIO(model_file.read_bytes()), **kwargs)
     if record.statistics is None:
-        return model
+        return Driver(model)
     with _as_mismatch(f"'{record.statistics}' holds no statistics of VecNormalize", "give"):
         statistics = pickle.loads(record.statistics.read_bytes())
         if not isinstance(statistics, VecNormalize):
             raise TypeError(f"a {type(statistics).__name__}")
-    return NormalizedDriver(model, statistics)
+    return Driver(model, statistics)
 
 
 def _scripted(env: gym.Env[Any, Any]) -> Any:

@@ -28,7 +28,7 @@ import sb3_torcs  # noqa: F401  registers the environments, in a worker too
 from sb3_torcs.errors import StudyError
 from sb3_torcs.evaluation import Episode, Merit, evaluate, merit, race_environment
 from sb3_torcs.ladder import rung
-from sb3_torcs.models import BEST_MODEL, NormalizedDriver, load_driver
+from sb3_torcs.models import BEST_MODEL, Driver, load_driver
 from sb3_torcs.study_file import FIELDS, Trial, track_name
 
 __all__ = ["Row", "Training", "final_row"]
@@ -189,10 +189,7 @@ class Training:
     def _race(self, track: str) -> Episode:
         if track not in self._races:
             self._races[track] = race_environment(self.trial.env_id, self.trial.env_kwargs, track)
-        driver: Any = self.model
-        if self.normalizer is not None:
-            driver = NormalizedDriver(driver, self.normalizer)
-        (episode,) = evaluate(self._races[track], driver)
+        (episode,) = evaluate(self._races[track], Driver(self.model, self.normalizer))
         return episode
 
     def _save_model(self, file: Path | io.BytesIO) -> None:

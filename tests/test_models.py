@@ -62,7 +62,8 @@ def test_the_record_of_the_zoo_names_the_algorithm_and_the_environment(saved, en
     record = models.training_record(path)
     assert (record.algo, record.env_id) == ("ddpg", "TorcsLite-v0")
     assert record.env_kwargs == {"track": "alpine-1", "range_finders": "narrow"}
-    assert isinstance(models.load_driver(path, env), DDPG)
+    assert record.hyperparameters == {"env_kwargs": record.env_kwargs, "gamma": 0.98}
+    assert isinstance(models.load_driver(path, env).model, DDPG)
 
 
 def test_a_record_below_belongs_to_the_model_only_if_it_is_the_only_one(saved):

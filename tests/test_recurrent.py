@@ -15,7 +15,7 @@ import sb3_torcs  # noqa: F401  (registers the environments)
 from sb3_torcs import driving
 from sb3_torcs.driving_metrics import drive_lap
 from sb3_torcs.evaluation import evaluate
-from sb3_torcs.models import NormalizedDriver, load_driver
+from sb3_torcs.models import Driver, load_driver
 from sb3_torcs.scr_protocol import RESTART
 
 
@@ -83,7 +83,7 @@ def test_a_saved_recurrent_model_drives_as_before(recurrent, tmp_path):
 
 def test_normalized_observations_leave_the_memory_alone(recurrent):
     statistics = VecNormalize(DummyVecEnv([lite]))
-    driver = NormalizedDriver(recurrent, statistics)
+    driver = Driver(recurrent, statistics)
     observation = np.full(29, 0.5, np.float32)
     _, state = recurrent.predict(statistics.normalize_obs(observation))
     for start in ([False], [True]):
