@@ -23,6 +23,8 @@ __all__ = [
     "Episode",
     "Merit",
     "Step",
+    "World",
+    "choose_world",
     "drive",
     "evaluate",
     "merit",
@@ -31,7 +33,9 @@ __all__ = [
 ]
 
 RACE_LAPS = 3  # from the grid in a row: what it takes to *complete* a track
-LONGEST_TRACK = 10000.0  # [m] for a random track, whose length is not known beforehand
+GAME, WITHOUT_GAME = "Torcs-v0", "TorcsLite-v0"
+RANDOM_TRACK = "random"
+LONGEST_TRACK = 10000.0  # [m] for such a one, whose length is not known beforehand
 KEPT = ("track", "car", "reward", "action_repeat", "range_finders")
 """What an evaluation takes from the training's environment, unless it is told otherwise."""
 
@@ -116,6 +120,40 @@ def merit(races: Sequence[Episode]) -> Merit:
     return Merit(len(finished), sum(others), -sum(race.race_time for race in finished))
 
 
+class World(NamedTuple):
+    """An environment, and why it was chosen."""
+
+    env_id: str
+    reason: str
+
+
+def choose_world(driver: str, trained_on: str | None, track: Any = None) -> World:
+    """
+    Choose where to drive: where the driver was trained, or else in the game if that can be.
+
+    :param driver: what it is called, for the reason
+    :param trained_on: the environment of its training, if that is known
+    :param track: to drive on
+    :return: the environment
+    """
+    from sb3_torcs.backends.native import check_layout
+    from sb3_torcs.errors import BackendUnavailable
+    from sb3_torcs.game import find_game
+
+    if trained_on is not None:
+        return World(trained_on, f"'{driver}' was trained there")
+    unknown = f"'{driver}' does not say where it was trained"
+    if track == RANDOM_TRACK:
+        return World(WITHOUT_GAME, f"{unknown}, and random tracks are there alone")
+    try:
+        check_layout(find_game())
+    except BackendUnavailable:
+        missing = "and Torcs-v0 does not run here, `sb3-torcs doctor` says why"
+        return World(WITHOUT_GAME, f"{unknown}, {missing}")
+    other = f"--env {WITHOUT_GAME} drives it without the game"
+    return World(GAME, f"{unknown}, and the game is installed; {other}")
+
+
 def time_limit(kwargs: Mapping[str, Any]) -> int:
     """
     Work out after how many decisions to give up: later than any drive that is not standing.
@@ -127,7 +165,7 @@ def time_limit(kwargs: Mapping[str, Any]) -> int:
     from sb3_torcs.tracks import load_track
 
     track = kwargs.get("track", "aalborg")
-    length = LONGEST_TRACK if track == "random" else load_track(track).length
+    length = LONGEST_TRACK if track == RANDOM_TRACK else load_track(track).length
     # One lap more than asked for: the way from the grid to the line, and some patience.
     seconds = (kwargs["laps"] + 1) * length / STUCK_SPEED
     return math.ceil(seconds / (kwargs.get("action_repeat", 5) * CONTROL_TICK))

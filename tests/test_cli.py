@@ -194,8 +194,11 @@ def test_a_picture_of_another_kind_is_refused(capsys):
 # evaluate
 
 
+LITE = ["--env", "TorcsLite-v0"]
+
+
 def test_an_evaluation_says_what_happened(capsys):
-    words = ["evaluate", "scripted", "--track", "g-track-1", "--laps", "1", "--json"]
+    words = ["evaluate", "scripted", *LITE, "--track", "g-track-1", "--laps", "1", "--json"]
     status, out, _ = run(capsys, *words)
     result = json.loads(out)
     assert status == 0
@@ -209,11 +212,73 @@ def test_an_evaluation_says_what_happened(capsys):
 
 
 def test_an_evaluation_as_a_table_has_a_row_per_episode(capsys):
-    words = ["evaluate", "scripted", "--track", "g-track-1", "--laps", "1", "--episodes", "2"]
+    words = ["evaluate", "scripted", *LITE, "--track", "g-track-1", "--laps", "1"]
+    words += ["--episodes", "2"]
     _, out, _ = run(capsys, *words)
     lines = out.splitlines()
     assert lines[0] == "TorcsLite-v0, g-track-1, car1-trb1"
     assert [line.split()[:2] for line in lines[3:]] == [["1", "1"], ["2", "1"]]
+
+
+@pytest.fixture
+def no_game(monkeypatch, tmp_path):
+    monkeypatch.setenv("SB3_TORCS_HOME", str(tmp_path))
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory):
+    """A model that plain SB3 saved: it knows nothing of its environment."""
+    file = tmp_path_factory.mktemp("plain") / "driver.zip"
+    DDPG("MlpPolicy", "sb3_torcs:TorcsLite-v0", buffer_size=1, device="cpu", seed=0).save(file)
+    return file
+
+
+def driven(capsys, *words):
+    """Evaluate: the world that was driven, and what is said about the choice."""
+    status, out, err = run(capsys, "evaluate", *map(str, words), "--laps", "1", "--json")
+    assert status == 0
+    return json.loads(out)["env"], err
+
+
+@pytest.mark.usefixtures("game")
+def test_who_does_not_say_where_it_was_trained_drives_in_the_game(capsys, plain):
+    for name, track in (("scripted", "a-speedway"), (plain, "aalborg")):
+        world, said = driven(capsys, name, "--track", track)
+        assert world == "Torcs-v0"
+        assert said == (
+            f"driving Torcs-v0: '{name}' does not say where it was trained, and the game is "
+            "installed; --env TorcsLite-v0 drives it without the game\n"
+        )
+
+
+@pytest.mark.usefixtures("no_game")
+def test_without_the_game_it_drives_in_the_world_that_needs_none(capsys, plain):
+    world, said = driven(capsys, plain)
+    assert world == "TorcsLite-v0"
+    assert "Torcs-v0 does not run here, `sb3-torcs doctor` says why" in said
+
+
+def test_an_agent_drives_in_the_world_of_its_training(capsys):
+    said = "driving TorcsLite-v0: 'ddpg-fallback' was trained there\n"
+    assert driven(capsys, "ddpg-fallback", "--track", "g-track-1") == ("TorcsLite-v0", said)
+
+
+def test_a_world_that_is_named_needs_no_reason(capsys):
+    words = ["ddpg-fallback", "--track", "g-track-1"]
+    assert driven(capsys, *words, "--env", "Torcs-v0") == ("Torcs-v0", "")
+
+
+def test_random_tracks_are_of_the_world_that_has_them(capsys):
+    world, said = driven(capsys, "scripted", "--track", "random")
+    assert world == "TorcsLite-v0"
+    assert "random tracks are there alone" in said
+
+
+@pytest.mark.usefixtures("no_game")
+def test_an_agent_of_the_game_is_not_driven_elsewhere(capsys):
+    status, out, err = run(capsys, "evaluate", "ddpg-aalborg", "--json")
+    assert (status, out) == (2, "")
+    assert "there is no TORCS in" in err
 
 
 @pytest.mark.parametrize("folder", ["none", "~nobody-of-this-name"])
@@ -223,8 +288,8 @@ def test_a_missing_model_is_told(capsys, folder):
     assert f"there is no model '{folder}" in err
 
 
-def test_torcs_is_not_replaced_by_something_else(capsys, monkeypatch, tmp_path):
-    monkeypatch.setenv("SB3_TORCS_HOME", str(tmp_path))
+@pytest.mark.usefixtures("no_game")
+def test_torcs_is_not_replaced_by_something_else(capsys):
     status, out, err = run(capsys, "evaluate", "scripted", "--env", "Torcs-v0", "--json")
     assert (status, out) == (2, "")
     assert err.startswith("sb3-torcs: there is no TORCS in")

@@ -237,7 +237,7 @@ def test_the_page_on_architecture_has_a_world_in_forty_lines(capsys):
 
 def test_the_documented_json_is_what_evaluate_prints(capsys):
     (example,) = fenced(ROOT / "docs" / "evaluation.md", "json")
-    words = "evaluate scripted --track g-track-1 --laps 1 --json"
+    words = "evaluate scripted --env TorcsLite-v0 --track g-track-1 --laps 1 --json"
     assert cli.main(words.split()) == 0
     assert shape(json.loads(example)) == shape(json.loads(capsys.readouterr().out))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from typing import TYPE_CHECKING, Any
 
 from sb3_torcs.cli.common import (
@@ -21,8 +22,6 @@ if TYPE_CHECKING:
 
 __all__ = ["add_parser", "environment_kwargs", "run"]
 
-DEFAULT_ENV = "TorcsLite-v0"
-
 HEADERS = ("episode", "laps", "lap times s", "distance m", "end", "damage", "return")
 
 DESCRIPTION = """\
@@ -33,7 +32,9 @@ breaks. The time limit is what the slowest car needs that does not count as stan
 no lap short.
 
 What is not given is as in the training, if its config.yml lies beside the model (the RL Zoo puts
-it there): environment, track, car, reward, action repeat and range finders.
+it there): environment, track, car, reward, action repeat and range finders. A model that does not
+say where it was trained drives in the game, or in TorcsLite-v0 where Torcs-v0 does not run.
+Standard error tells which world that is, and why.
 """
 
 
@@ -49,7 +50,7 @@ def add_parser(subparsers: Any) -> None:
     )
     add = parser.add_argument
     add("model", metavar="MODEL", help=MODEL_HELP)
-    add("--env", metavar="ID", help=f"default: that of the training, or {DEFAULT_ENV}")
+    add("--env", metavar="ID", help="default: that of the training, or Torcs-v0 if it runs here")
     add("--track", metavar="T", help="default: that of the training, or aalborg")
     add("--car", metavar="C", help="default: that of the training, or car1-trb1")
     add("--episodes", type=positive, default=1, metavar="N", help="default: 1")
@@ -93,12 +94,15 @@ def run(args: argparse.Namespace) -> int:
 def _drive(args: argparse.Namespace) -> tuple[list[Episode], Any]:
     """Build the environment, load the driver, drive."""
     from sb3_torcs.cli.recording import Recorder
-    from sb3_torcs.evaluation import evaluate, time_limit
+    from sb3_torcs.evaluation import choose_world, evaluate, time_limit
     from sb3_torcs.models import driver_record, load_driver
     from sb3_torcs.zoo import check_racing
 
     record = driver_record(args.model)
-    env_id = args.env or record.env_id or DEFAULT_ENV
+    env_id = args.env
+    if env_id is None:
+        env_id, reason = choose_world(args.model, record.env_id, args.track)
+        print(f"driving {env_id}: {reason}", file=sys.stderr)
     check_racing(env_id)
     kwargs = environment_kwargs(args, record)
     recorder = Recorder(env_id, kwargs, time_limit(kwargs))
