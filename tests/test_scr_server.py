@@ -498,6 +498,115 @@ class TestRestart:
         client.identify()
 
 
+class Original:
+    """
+    A client as the first Python programs for this protocol have it, one object for each episode.
+
+    It asks for a restart by ``meta``, opens another socket without closing the one before, and
+    introduces itself once a second until it is heard. It does not wait for ``***restart***``.
+    """
+
+    ANGLES = "-45 -19 -12 -7 -4 -2.5 -1.7 -1 -.5 0 .5 1 1.7 2.5 4 7 12 19 45"
+
+    def __init__(self, port):
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.settimeout(1.0)
+        self.server = ("127.0.0.1", port)
+
+    def introduce(self):
+        self.socket.sendto(f"SCR(init {self.ANGLES})".encode(), self.server)
+
+    def connect(self):
+        message = b""
+        until = time.monotonic() + PATIENCE
+        while b"***identified***" not in message:
+            assert time.monotonic() < until, "nobody answers"
+            self.introduce()
+            with contextlib.suppress(TimeoutError):
+                message = self.socket.recv(2**17)
+        return self.state()
+
+    def state(self):
+        """The next state: words are passed over, but for those that end the episode."""
+        while b"***identified***" in (message := self.socket.recv(2**17)):
+            pass
+        assert not message.startswith(b"***"), f"a new episode began with {message}"
+        return message
+
+    def answer(self, meta=0):
+        text = f"(accel 0.200)(brake 0.000)(clutch 0.000)(gear 1)(steer 0.000)(meta {meta})"
+        self.socket.sendto(text.encode(), self.server)
+
+
+@contextlib.contextmanager
+def stopped(process):
+    """Let what is sent meanwhile wait for the game, all at once."""
+    os.kill(process.pid, signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        os.kill(process.pid, signal.SIGCONT)
+
+
+class TestOriginalClients:
+    """A restart, and at once another socket that introduces itself: always the new race."""
+
+    EPISODES = 20
+
+    @pytest.mark.parametrize("deadline", [None, 0.2])
+    @pytest.mark.parametrize("metas", [1, 2])  # at the end of `step`, and again in `reset`
+    @pytest.mark.parametrize("at_once", [True, False])
+    def test_each_episode_begins_on_the_grid(self, serve, deadline, metas, at_once):
+        process, known = serve(deadline=deadline)
+        port = known.socket.getpeername()[1]
+        with contextlib.ExitStack() as stack:
+            client = Original(port)
+            stack.callback(client.socket.close)
+            first = state = client.connect()
+            for _ in range(self.EPISODES):
+                assert state == first
+                for _ in range(3):
+                    client.answer()
+                    client.state()
+                with stopped(process) if at_once else contextlib.nullcontext():
+                    for _ in range(metas):
+                        client.answer(meta=1)
+                    client = Original(port)
+                    stack.callback(client.socket.close)
+                    if at_once:
+                        client.introduce()
+                state = client.connect()
+        assert process.poll() is None
+
+    def test_also_of_a_client_that_owes_answers(self, serve):
+        """The game awaits the late answers to older states, but none after a wish to restart."""
+        process, known = serve(deadline=0.2)
+        port = known.socket.getpeername()[1]
+        with contextlib.ExitStack() as stack:
+            client = Original(port)
+            stack.callback(client.socket.close)
+            first = client.connect()
+            assert client.state() != first  # is not answered in time
+            with stopped(process):
+                client.answer(meta=1)
+                client = Original(port)
+                stack.callback(client.socket.close)
+                client.introduce()
+            assert client.connect() == first
+
+    def test_nobody_else_is_asked_once_one_wants_a_restart(self, serve):
+        """Both clients may be of one program, which begins both episodes anew."""
+        _, first, second = serve([DRIVER, ("scr_server", 1)])
+        first.identify()
+        second.identify()
+        state = first.receive()
+        first.send("(meta 1)")
+        assert first.receive() == second.receive() == b"***restart***\0"
+        second.send(INIT)
+        first.identify()
+        assert first.receive() == state
+
+
 def memory(pid):
     """Read what a process has in memory [kB]."""
     return int(re.search(r"VmRSS:\s+(\d+)", Path(f"/proc/{pid}/status").read_text())[1])

@@ -118,7 +118,7 @@ std::optional<Action> Client::ask(const State& state) {
     const Clock::time_point until = Clock::now() + deadline_;
     // Who answers state after state, and was late, answers the older ones first. Taken for the answer
     // to this one, they would keep him behind for the rest of the race.
-    while (!answer_ || (owed_ > 0 && !forever)) {
+    while (!wants_restart() && (!answer_ || (owed_ > 0 && !forever))) {
         watch_owner();
         const Clock::time_point next = Clock::now() + WATCH;
         if (wait(forever ? next : std::min(until, next))) read_all(true);
@@ -186,8 +186,16 @@ bool Client::is_from_client() const {
     return sender_size_ == client_size_ && std::memcmp(&sender_, &client_, client_size_) == 0;
 }
 
+bool Client::wants_restart() const { return answer_ && answer_->restart; }
+
+// What comes after the wish for a restart is for the race that follows: a client that introduces
+// itself at once would else be taken into the one that ends.
 void Client::read_all(bool answers) {
-    while (const auto text = receive()) read(*text, answers);
+    while (!wants_restart()) {
+        const auto text = receive();
+        if (!text) return;
+        read(*text, answers);
+    }
 }
 
 void Client::read(std::string_view text, bool answers) {

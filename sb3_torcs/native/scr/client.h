@@ -54,7 +54,9 @@ private:
     bool wait(Clock::time_point until);  // whether a datagram came
     std::optional<std::string_view> receive();  // the next one that has come
     bool is_from_client() const;
-    // Everything that has come; `answers` is whether to the state that was sent last.
+    bool wants_restart() const;
+    // Everything that has come, up to the wish for a restart; `answers` is whether to the state
+    // that was sent last.
     void read_all(bool answers);
     void read(std::string_view text, bool answers);
     void adopt(std::string_view text);

@@ -37,7 +37,7 @@ void Driver::new_race(CarElement* car, const Situation* situation) {
 }
 
 bool Driver::drive() {
-    if (!client_.has_network()) return false;
+    if (!client_.has_network() || restart_requested()) return false;
     const State state = sense();
     const auto answer = client_.ask(state);
     if (!answer) return false;  // the car goes on with what it was told last
@@ -53,7 +53,8 @@ bool Driver::drive() {
 }
 
 bool Driver::watch() {
-    if (!car_ || !client_.has_network() || !(car_->pub.status & NOT_SIMULATED)) return false;
+    if (!car_ || !client_.has_network() || restart_requested()) return false;
+    if (!(car_->pub.status & NOT_SIMULATED)) return false;
     const auto answer = client_.ask(sense());
     return answer && answer->restart;
 }

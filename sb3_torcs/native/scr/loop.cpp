@@ -58,6 +58,8 @@ void enter_loop() {
 
 void request_restart() { restart_wanted = true; }
 
+bool restart_requested() { return restart_wanted; }
+
 Leaving leaving() { return why; }
 
 }  // namespace torcs::scr

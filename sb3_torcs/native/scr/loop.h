@@ -10,8 +10,9 @@ namespace torcs::scr {
 // To be called whenever a race begins: the engine gets its simulation anew for each.
 void enter_loop();
 
-// At the next step.
+// At the next step. Until then nobody is asked any more.
 void request_restart();
+bool restart_requested();
 
 // Why drivers are shut down.
 enum class Leaving {
