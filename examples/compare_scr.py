@@ -70,7 +70,7 @@ def drive(env: gym.Env, driver: Driver, start: Start | None) -> Drive:
         ended = terminated or truncated
         done.actions.append(action)
         done.observations.append(observation)
-        if "lap_time" in info:
+        if info["lap_time"]:
             done.laps.append(info["lap_time"])
     return done._replace(damage=info["damage"])
 

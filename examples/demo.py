@@ -221,8 +221,8 @@ def best_lap(folder: Path) -> tuple[list[Step], slice, float | None]:
         steps = list(drive(env, driver, seed=0))
     best, seconds, first = slice(0, len(steps)), None, 0
     for number, step in enumerate(steps):
-        lap_time = step.info.get("lap_time")
-        if lap_time is None:
+        lap_time = step.info["lap_time"]
+        if not lap_time:
             continue
         if seconds is None or lap_time < seconds:
             best, seconds = slice(first, number + 1), lap_time

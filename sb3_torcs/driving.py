@@ -82,7 +82,7 @@ class Agent:
         """
         self.time = info["car"].time
         self.distance = info["distance"]
-        if "lap_time" in info:
+        if info["lap_time"]:
             self.lap_times.append(info["lap_time"])
         if terminated and self.end is None:
             self.end, self.end_time = info["end"], self.time

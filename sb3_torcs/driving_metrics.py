@@ -50,7 +50,7 @@ For ``Monitor`` and ``make_vec_env(monitor_kwargs=...)``, and as a plain mapping
       info_keywords: [laps, best_lap_time, distance, damage, end]
 
 Each episode's row of ``monitor.csv`` then holds these, too. Monitor adds the two together, and its
-default for the first is a tuple: hence the empty list. An empty ``best_lap_time`` is no whole lap.
+default for the first is a tuple: hence the empty list. A ``best_lap_time`` of 0 is no whole lap.
 """
 
 ENDS = ("off_track", "backwards", "stuck", "damage", "lost", "laps", "time_limit")
@@ -99,7 +99,7 @@ def drive_lap(model: BaseAlgorithm, env: VecEnv, limit: int = 1500) -> DrivenLin
     :return: the line of the lap, or of what there was of it
     """
     cars: list[CarState] = []
-    lap_time = None
+    lap_time = 0.0
     observation: Any = env.reset()
     (track,) = env.get_attr("track", 0)  # when the lap ends the next one may be on another
     state, dones = None, np.ones(env.num_envs, dtype=bool)
@@ -107,11 +107,11 @@ def drive_lap(model: BaseAlgorithm, env: VecEnv, limit: int = 1500) -> DrivenLin
         action, state = model.predict(observation, state, dones, deterministic=True)
         observation, _, dones, infos = env.step(action)
         cars.append(infos[0]["car"])
-        lap_time = infos[0].get("lap_time")
-        if lap_time is not None or dones[0]:
+        lap_time = infos[0]["lap_time"]
+        if lap_time or dones[0]:
             break
     x, y, speed = np.array([(car.x, car.y, car.speed_x) for car in cars]).T
-    return DrivenLine(track, x, y, speed, cars[-1].distance_raced, lap_time)
+    return DrivenLine(track, x, y, speed, cars[-1].distance_raced, lap_time or None)
 
 
 def line_image(line: DrivenLine) -> npt.NDArray[np.uint8]:
@@ -287,7 +287,7 @@ class DrivingMetricsCallback(BaseCallback):
             for index, (low, high) in enumerate(self._limits):
                 if not low < action[index] < high:
                     pending.saturated[index] += 1
-            if "lap_time" in info:
+            if info.get("lap_time"):
                 self._record_lap(info["lap_time"])
             if done:
                 self._record_episode(info)

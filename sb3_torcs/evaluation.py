@@ -225,7 +225,7 @@ def evaluate(
         for step in drive(env, driver, seed=seed if number == 0 else None):
             info = step.info
             total += step.reward
-            if "lap_time" in info:
+            if info["lap_time"]:
                 lap_times.append(info["lap_time"])
         results.append(
             Episode(

@@ -116,7 +116,7 @@ class RacingProgressCallback(BaseCallback):
 
     def _on_step(self) -> bool:
         for info, done in zip(self.locals["infos"], self.locals["dones"], strict=True):
-            if "lap_time" in info:
+            if info.get("lap_time"):
                 self._take_lap(info["lap_time"])
             if done:
                 self.episodes += 1

@@ -136,6 +136,14 @@ class Reward:
             if name in TERMS
         )
 
+    def nothing(self) -> dict[str, float]:
+        """
+        Value what has not begun yet.
+
+        :return: all terms, each 0
+        """
+        return dict.fromkeys((*(name for name, _, _ in self._terms), "crash"), 0.0)
+
     def __call__(
         self, before: CarState, after: CarState, controls: Controls, end: str | None
     ) -> dict[str, float]:

@@ -22,8 +22,10 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 import sb3_torcs
+from sb3_torcs.car import CarState
 from sb3_torcs.drivers import ScriptedDriver
 from sb3_torcs.errors import BackendUnavailable
+from sb3_torcs.rewards import Reward
 from sb3_torcs.sensors import encode
 
 
@@ -194,9 +196,28 @@ def test_the_reward_is_the_sum_of_its_terms(world):
         assert sum(info["reward_terms"].values()) == reward
 
 
-def test_info_has_what_it_promises(world):
-    _, _, _, _, info = rollout(world, 4, 1)[1]
-    assert {"laps", "best_lap_time", "distance", "off_track", "damage", "reward_terms"} <= set(info)
+def kinds(info):
+    """The names in ``info``, with the types of their values."""
+    return {
+        name: kinds(value) if name == "reward_terms" else type(value)
+        for name, value in info.items()
+    }
+
+
+@pytest.mark.parametrize("reward", ["blog", {"damage": -1, "crash": -1}])
+def test_info_has_the_same_names_and_types_from_the_reset_to_the_end(world, reward):
+    """Recorders make one column of each, and have no place for None or for a later name."""
+    infos = [answer[-1] for answer in rollout(world, 4, reward=reward)]
+    assert kinds(infos[0]) == {
+        **dict.fromkeys(("distance", "lap_time", "best_lap_time", "damage"), float),
+        "laps": int,
+        "off_track": bool,
+        "end": str,
+        "car": CarState,
+        "reward_terms": dict.fromkeys(Reward(reward).nothing(), float),
+    }
+    assert [kinds(info) for info in infos] == [kinds(infos[0])] * len(infos)
+    assert "" in {info["end"] for info in infos} > {""}
 
 
 def test_actions_out_of_range_are_clipped(world):
@@ -299,4 +320,4 @@ def test_a_model_of_one_world_drives_in_the_other():
         for _ in range(100):
             observation, *_, info = env.step(driver.predict(observation)[0])
         assert info["distance"] > 50.0
-        assert info["end"] is None
+        assert info["end"] == ""

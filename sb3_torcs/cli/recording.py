@@ -23,7 +23,7 @@ class Decision(NamedTuple):
 
     action: npt.NDArray[np.float32]
     car: CarState
-    lap_time: float | None  # [s] if it completed a lap
+    lap_time: float  # [s] if it completed a lap, else 0
 
 
 class Stretch(NamedTuple):
@@ -45,7 +45,7 @@ def best_stretch(episodes: list[list[Decision]]) -> Stretch:
     for number, decisions in enumerate(episodes):
         first = 0
         for index, decision in enumerate(decisions):
-            if decision.lap_time is None:
+            if not decision.lap_time:
                 continue
             if decision.lap_time < best_time:
                 best, best_time = Stretch(number, first, index + 1), decision.lap_time
@@ -96,7 +96,7 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
         """
         result = self.env.step(action)
         info = result[4]
-        self.episodes[-1].append(Decision(action, info["car"], info.get("lap_time")))
+        self.episodes[-1].append(Decision(action, info["car"], info["lap_time"]))
         return result
 
     def names(self) -> dict[str, str]:

@@ -53,18 +53,18 @@ RANDOM_SPEED = 40.0  # [m/s] unless somebody sets another
 RESET_OPTIONS = ("distance", "track_position", "heading_error", "speed")
 
 
-class RacingInfo(TypedDict, total=False):
-    """What ``info`` holds. ``lap_time`` is there only when a lap was just completed."""
+class RacingInfo(TypedDict):
+    """What ``info`` holds, from the reset to the end. What has not happened is 0 or empty."""
 
     laps: int  # whole laps driven in this episode
-    lap_time: float  # [s] of the lap that was just completed
-    best_lap_time: float | None  # [s] of the best whole lap
+    lap_time: float  # [s] of the lap that this step has completed, else 0
+    best_lap_time: float  # [s] of the best whole lap, 0 before there is one
     distance: float  # [m] along the road since the episode began
     off_track: bool
     damage: float  # [points]
     reward_terms: dict[str, float]  # they sum to the reward exactly
     car: CarState  # everything else
-    end: str | None  # why the episode ended; stays None when a time limit cut it
+    end: str  # why the episode ended; stays empty when a time limit cut it
 
 
 class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
@@ -193,7 +193,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         self._standing = 0
         if self.render_mode == "human":
             self.render()
-        return self._encode(self.car), self._info(self.car, {}, None)
+        return self._encode(self.car), self._info(self.car, 0.0, self._reward.nothing(), None)
 
     def step(
         self, action: npt.NDArray[np.float32]
@@ -241,9 +241,8 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
             after, end = before, "lost"
         self.car = after
         terms = self._reward(before, after, self._controls, end)
-        info = self._info(after, terms, end)
-        if after.laps > before.laps:
-            info["lap_time"] = after.last_lap_time
+        lap_time = after.last_lap_time if after.laps > before.laps else 0.0
+        info = self._info(after, lap_time, terms, end)
         if self.render_mode == "human":
             self.render()
         truncated = end == "laps"
@@ -298,16 +297,19 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         self._standing += self.action_repeat
         return "stuck" if self._standing > self._patience else None
 
-    def _info(self, car: CarState, terms: dict[str, float], end: str | None) -> dict[str, Any]:
+    def _info(
+        self, car: CarState, lap_time: float, terms: dict[str, float], end: str | None
+    ) -> dict[str, Any]:
         info: RacingInfo = {
             "laps": car.laps,
-            "best_lap_time": car.best_lap_time or None,
+            "lap_time": lap_time,
+            "best_lap_time": car.best_lap_time,
             "distance": car.distance_raced,
             "off_track": car.off_track,
             "damage": car.damage,
             "reward_terms": terms,
             "car": car,
-            "end": end,
+            "end": end or "",
         }
         return info  # type: ignore[return-value]  # Gymnasium says dict, and it is one
 
