@@ -40,6 +40,7 @@ __all__ = [
     "UnknownCar",
     "UnknownRewardTerm",
     "UnknownRobot",
+    "WorkerLost",
     "ZooConfigError",
 ]
 
@@ -166,6 +167,10 @@ class StudyError(Sb3TorcsError, ValueError):
 
 class RayUnavailable(Sb3TorcsError, RuntimeError):
     """A study needs Ray, which is not installed or does not answer."""
+
+
+class WorkerLost(Sb3TorcsError, RuntimeError):
+    """A process that drives cars of a training has ended."""
 
 
 class ZooConfigError(Sb3TorcsError, ValueError):

@@ -86,6 +86,7 @@ class RacingProgressCallback(BaseCallback):
         self.best_lap_time: float | None = None  # [s]
         self._stream = stream
         self._bar: Any = None
+        self._ended = True  # or rather, not begun
 
     def _on_training_start(self) -> None:
         stream: Any = Unbroken(self._stream or sys.stderr)

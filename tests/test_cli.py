@@ -1,4 +1,3 @@
-import concurrent.futures
 import dataclasses
 import itertools
 import json
@@ -7,10 +6,8 @@ import shlex
 import signal
 import subprocess
 import sys
-import threading
 import time
 import types
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,7 +19,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_torcs import bench, evaluation, game_process, models
 from sb3_torcs.cli import VERBS, common, doctor, evaluate, main, recording, train
 from sb3_torcs.cli.train import TrainOptions
-from sb3_torcs.errors import BackendUnavailable, InvalidOption, OutputNotWritable
+from sb3_torcs.errors import BackendUnavailable, InvalidOption
 
 NAMES = [verb.__name__.rpartition(".")[2].replace("_", "-") for verb in VERBS]
 PNG = b"\x89PNG"
@@ -460,26 +457,10 @@ def test_the_words_for_the_zoo_say_what_was_asked():
 
 def test_the_evaluation_is_on_the_track_that_the_zoo_s_own_words_name(monkeypatch, tmp_path):
     asked = []
-    monkeypatch.setattr(train, "_run_zoo", lambda words: asked.extend(words) or 1 / 0)
+    monkeypatch.setattr(train, "_run_zoo", lambda _, words, *rest: asked.extend(words) or 1 / 0)
     with pytest.raises(ZeroDivisionError):
         train.train(options(tmp_path, zoo_args=("--env-kwargs", "track:'corkscrew'")))
     assert asked[asked.index("--eval-env-kwargs") + 1] == "track:'corkscrew'"
-
-
-def test_trainings_that_begin_at_once_get_folders_of_their_own(tmp_path):
-    """As the zoo does it: look which numbers there are, and make the next one's folder later."""
-
-    def begin(_):
-        with train._alone_until_numbered(tmp_path):
-            number = len(list(tmp_path.iterdir())) + 1
-            time.sleep(0.1)
-            (tmp_path / f"TorcsLite-v0_{number}").mkdir()
-            trained.wait()  # while the others begin
-
-    trained = threading.Barrier(4, timeout=20.0)
-    with concurrent.futures.ThreadPoolExecutor(4) as pool:
-        list(pool.map(begin, range(4)))
-    assert len(list(tmp_path.iterdir())) == 4
 
 
 def test_the_command_that_goes_on_means_the_same_options():
@@ -542,18 +523,6 @@ def test_an_interrupted_training_keeps_what_it_learned_and_says_how_to_go_on(cap
     config = models._read_plain(folder / "TorcsLite-v0" / "config.yml")
     assert config["learning_starts"] == 0  # it has its memory, so it needs no new warm-up
     assert signal.getsignal(signal.SIGINT) is handler
-
-
-def test_a_run_is_known_by_its_own_record(tmp_path):
-    """Two trainings that begin at once may each have either number."""
-    for number in (1, 2):
-        record = tmp_path / f"TorcsLite-v0_{number}" / "TorcsLite-v0" / "args.yml"
-        record.parent.mkdir(parents=True)
-        record.write_text(f"conf_file: /tmp/of{number}/zoo.yml\n")
-    found = train._run_folder(tmp_path, Path("/tmp/of2/zoo.yml"))
-    assert found == tmp_path / "TorcsLite-v0_2"
-    with pytest.raises(OutputNotWritable, match="has left nothing"):
-        train._run_folder(tmp_path, Path("/tmp/of3/zoo.yml"))
 
 
 @pytest.mark.slow

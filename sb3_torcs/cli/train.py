@@ -5,21 +5,21 @@ from __future__ import annotations
 import argparse
 import contextlib
 import dataclasses
-import fcntl
-import os
 import shlex
 import signal
 import sys
 import tempfile
-import threading
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sb3_torcs.cli.common import positive, seed, writable_folder
-from sb3_torcs.errors import InvalidOption, OutputNotWritable
+from sb3_torcs.errors import InvalidOption, OutputNotWritable, WorkerLost
 from sb3_torcs.signals import answered
+
+if TYPE_CHECKING:
+    from sb3_torcs.zoo_training import Manager
 
 __all__ = ["Run", "TrainOptions", "add_parser", "run", "train", "train_run"]
 
@@ -35,7 +35,8 @@ EPILOG = """\
 What follows -- goes to the RL Zoo as it is, after our own words, so it wins:
   sb3-torcs train --timesteps 20000 -- --save-freq 5000 --hyperparams batch_size:64
 
-Ctrl-C keeps what was learned and prints the command that goes on.
+Ctrl-C keeps what was learned and prints the command that goes on. A kill or a full disk loses at
+most what was learned since the last evaluation.
 """
 
 
@@ -85,11 +86,11 @@ class Run:
     steps: int  # decisions learned from
     wanted: int  # decisions that were asked for
     interrupted: bool
-    last_model: Path
+    last_model: Path | None  # None: the zoo has searched hyperparameters, as its words asked for
     track: Any  # a name, or a list of them
 
     @property
-    def best_model(self) -> Path:
+    def best_model(self) -> Path | None:
         """The best model by evaluation, or the last one if there was no evaluation yet."""
         best = self.folder / "best_model.zip"
         return best if best.is_file() else self.last_model
@@ -183,7 +184,6 @@ def train_run(options: TrainOptions) -> Run:
     import gymnasium as gym
 
     from sb3_torcs import zoo
-    from sb3_torcs.models import saved_steps
 
     for word in options.zoo_args:
         if word.partition("=")[0] in OURS:
@@ -209,18 +209,8 @@ def train_run(options: TrainOptions) -> Run:
         words += ["--conf-file", str(conf_file), "--log-folder", str(folder)]
         words += ["--tensorboard-log", str(tensorboard)]
         words += ["--trained-agent", str(resume)] if resume else []
-        with _alone_until_numbered(folder / options.algo):
-            interrupted = _run_zoo([*words, *options.zoo_args])
-    run_folder = _run_folder(folder / options.algo, conf_file)
-    last_model = run_folder / f"{options.env.replace('/', '-')}.zip"
-    return Run(
-        folder=run_folder,
-        steps=saved_steps(last_model),
-        wanted=wanted,
-        interrupted=interrupted,
-        last_model=last_model,
-        track=changed["env_kwargs"].get("track"),
-    )
+        track = changed["env_kwargs"].get("track")
+        return _run_zoo(options, [*words, *options.zoo_args], wanted, track)
 
 
 def _entry(options: TrainOptions) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -325,72 +315,55 @@ def _with_progress(callbacks: Any) -> list[Any]:
     return [PROGRESS, *(item for item in items if item != PROGRESS)]
 
 
-@contextlib.contextmanager
-def _alone_until_numbered(parent: Path) -> Iterator[None]:
-    """
-    Let others wait until the run has its folder.
-
-    The zoo numbers a run by the folders that it finds, and makes the run's own a moment later: two
-    that began at once would write into one.
-
-    :param parent: of all runs of the algorithm; is made
-    """
-    parent.mkdir(parents=True, exist_ok=True)
-    directory = os.open(parent, os.O_RDONLY)
-    numbered = threading.Event()
-
-    def let_in() -> None:
-        while set(os.listdir(parent)) == before and not numbered.wait(0.02):
-            pass
-        os.close(directory)
-
-    with contextlib.suppress(OSError):  # of file systems without locks
-        fcntl.flock(directory, fcntl.LOCK_EX)
-    before = set(os.listdir(parent))
-    watch = threading.Thread(target=let_in)
-    watch.start()
-    try:
-        yield
-    finally:
-        numbered.set()
-        watch.join()
-
-
-def _run_folder(parent: Path, conf_file: Path) -> Path:
-    """
-    Find the run that the zoo has numbered; another training may have taken the number before.
-
-    :param parent: of all runs of the algorithm
-    :param conf_file: that this training alone was given; the run's record names it
-    """
-    records = [file for file in parent.glob("*/*/args.yml") if str(conf_file) in file.read_text()]
-    if not records:
-        raise OutputNotWritable(f"the training has left nothing in '{parent}'; start it again")
-    return records[0].parent.parent
-
-
-def _run_zoo(words: list[str]) -> bool:
+def _run_zoo(options: TrainOptions, words: list[str], wanted: int, track: Any) -> Run:
     """
     Run the zoo's own training in this process.
 
-    :param words: of its command line
-    :return: whether it was interrupted
+    :param options: what to train
+    :param words: of the zoo's command line
+    :param wanted: decisions to learn from
+    :param track: a name, or a list of them
     """
-    from rl_zoo3.train import train as zoo_train
-
+    from sb3_torcs import zoo_training
     from sb3_torcs.progress import Unbroken
 
-    before = sys.argv
-    sys.argv = ["rl_zoo3.train", *words]
+    managers: list[Manager] = []
     # Whoever reads may leave, e.g. `tee` at Ctrl-C, before the zoo says that it saves the model.
     out, err = Unbroken(sys.stdout), Unbroken(sys.stderr)
+    redirected = contextlib.redirect_stdout(out), contextlib.redirect_stderr(err)
     try:
-        redirected = contextlib.redirect_stdout(out), contextlib.redirect_stderr(err)
         with redirected[0], redirected[1], _noted_interrupts() as seen:
-            zoo_train()
-    finally:
-        sys.argv = before
-    return bool(seen)
+            zoo_training.train(words, managers)
+    except (OSError, WorkerLost) as error:
+        if not managers:
+            raise
+        raise _told(error, _result(managers[0], wanted, track, False), options) from error
+    return _result(managers[0], wanted, track, bool(seen))
+
+
+def _result(manager: Manager, wanted: int, track: Any, interrupted: bool) -> Run:
+    """Find out what came of a training."""
+    from sb3_torcs.models import saved_steps
+
+    if manager.optimize_hyperparameters:
+        return Run(Path(manager.log_path), 0, wanted, interrupted, None, track)
+    folder = Path(manager.save_path)
+    last_model = folder / f"{manager.env_name}.zip"
+    steps = saved_steps(last_model) if last_model.is_file() else 0
+    return Run(folder, steps, wanted, interrupted, last_model, track)
+
+
+def _told(error: OSError | WorkerLost, result: Run, options: TrainOptions) -> Exception:
+    """Say what has ended a training, what is kept of it, and what to type."""
+    if result.steps > 0:
+        kept = f"kept: '{result.last_model}', {result.steps} of {result.wanted} timesteps"
+        more = f"go on with: {_going_on(options, result)}"
+    else:
+        kept, more = "nothing was kept yet", "start again"
+    if isinstance(error, WorkerLost):
+        return WorkerLost(f"{error}; {kept}; see above why, and {more}")
+    said = f"cannot write '{error.filename}': {error.strerror or error}"
+    return OutputNotWritable(f"{said}; {kept}; make room, or choose another place, and {more}")
 
 
 @contextlib.contextmanager
@@ -416,6 +389,8 @@ def _noted_interrupts() -> Iterator[list[int]]:
 
 def _closing_words(options: TrainOptions, result: Run) -> list[str]:
     """Say what there is now, and what to type next."""
+    if result.last_model is None:
+        return [f"the RL Zoo has searched; its reports: {result.folder / 'report_*.csv'}"]
     lines = [f"learned from {result.steps} of {result.wanted} decisions; folder: {result.folder}"]
     evaluated = result.best_model != result.last_model
     lines += [f"best model by evaluation: {result.best_model}"] if evaluated else []
@@ -423,15 +398,18 @@ def _closing_words(options: TrainOptions, result: Run) -> list[str]:
     if options.resume is not None:
         lines += [f"before that, which may be better still: {options.resume}"]
     if result.steps < result.wanted:
-        more = dataclasses.replace(
-            options, resume=result.last_model, timesteps=result.wanted - result.steps
-        )
-        lines += ["go on with:", f"  {_command(more)}"]
+        lines += ["go on with:", f"  {_going_on(options, result)}"]
     track = result.track[0] if isinstance(result.track, list) else result.track
     words = ["sb3-torcs", "evaluate", str(result.best_model), "--env", options.env]
     words += ["--track", track] if track else []
     lines += ["see what it learned:", f"  {shlex.join(words)}"]
     return lines
+
+
+def _going_on(options: TrainOptions, result: Run) -> str:
+    """Compose the command line that learns what is left."""
+    left = result.wanted - result.steps
+    return _command(dataclasses.replace(options, resume=result.last_model, timesteps=left))
 
 
 def _command(options: TrainOptions) -> str:

@@ -1,0 +1,124 @@
+"""What a training keeps while it learns: whole files, whatever ends it.
+
+Each file is written into a folder beside the others first, and moved when it is whole. So a kill, a
+power cut or a full disk leaves what was saved before.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_torcs.car import is_count
+from sb3_torcs.errors import InvalidOption
+
+__all__ = ["REPLAY_BUFFER", "STATISTICS", "KeepCallback", "WholeFiles"]
+
+UNFINISHED = ".unfinished"
+REPLAY_BUFFER, STATISTICS = "replay_buffer.pkl", "vecnormalize.pkl"
+
+
+class WholeFiles:
+    """
+    A folder whose files are there whole, or not at all.
+
+    Write into :attr:`aside`, and call :meth:`settle`.
+
+    :param folder: where the files are to be
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.aside = folder / UNFINISHED
+
+    def unfinished(self) -> list[Path]:
+        """Return the files that are not where they are to be, the first that was begun first."""
+        files = [file for file in self.aside.rglob("*") if file.is_file()]
+        return sorted(files, key=lambda file: file.stat().st_mtime_ns)
+
+    def settle(self) -> None:
+        """Move the files to where they are to be: all of them are whole."""
+        files = self.unfinished()
+        for file in files:
+            with file.open("rb") as content:
+                os.fsync(content.fileno())
+        for file in files:
+            file.replace(self.place(file))
+
+    def place(self, file: Path) -> Path:
+        """
+        Say where a file is to be.
+
+        :param file: in :attr:`aside`
+        :return: its path; the folder of it is made
+        """
+        target = self.folder / file.relative_to(self.aside)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        return target
+
+    def drop(self) -> None:
+        """Remove what was not finished."""
+        for file in self.unfinished():
+            file.unlink()
+
+    def close(self) -> None:
+        """Remove the folder aside."""
+        shutil.rmtree(self.aside, ignore_errors=True)
+
+
+class KeepCallback(BaseCallback):
+    """
+    Keep the last model while it learns, with all that a training goes on from.
+
+    That is the replay buffer of an off-policy algorithm, and the statistics of ``VecNormalize``.
+    What the callbacks before this one have written aside is moved to its place in each step.
+
+    :param files: folder of the run
+    :param name: of the model's file, without ``.zip``; and of the folder of the statistics
+    :param every: calls between two savings
+    :param verbose: as in ``BaseCallback``
+    """
+
+    def __init__(self, files: WholeFiles, name: str, every: int, verbose: int = 0) -> None:
+        super().__init__(verbose)
+        if not is_count(every):
+            raise InvalidOption(f"every is {every!r}; pass a whole number of at least 1 call")
+        self.files = files
+        self.name = name
+        self.every = every
+
+    def _init_callback(self) -> None:
+        (self.files.aside / self.name).mkdir(parents=True, exist_ok=True)
+
+    def _on_step(self) -> bool:
+        self.files.settle()
+        if self.n_calls % self.every == 0:
+            self.keep()
+        return True
+
+    def keep(self) -> None:
+        """
+        Save the model and what belongs to it; what was saved before is there until then.
+
+        The replay buffer comes last: it is large, and a disk may not take it.
+        """
+        self.files.drop()
+        aside = self.files.aside
+        with (aside / f"{self.name}.zip").open("wb") as file:
+            self.model.save(file)
+        statistics = self.model.get_vec_normalize_env()
+        if statistics is not None:
+            statistics.save(str(aside / self.name / STATISTICS))
+        self.files.settle()
+        if getattr(self.model, "replay_buffer", None) is not None:
+            with (aside / REPLAY_BUFFER).open("wb") as file:
+                self.model.save_replay_buffer(file)  # type: ignore[attr-defined]
+            self.files.settle()
+
+    def is_healthy(self) -> bool:
+        """Say whether all weights are numbers: a model that has diverged replaces none."""
+        return all(bool(th.isfinite(weights).all()) for weights in self.model.policy.parameters())

@@ -1,0 +1,281 @@
+"""What a training keeps, whatever ends it."""
+
+import argparse
+import concurrent.futures
+import errno
+import os
+import pickle
+import random
+import resource
+import shlex
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import yaml
+from rl_zoo3.exp_manager import ExperimentManager
+from stable_baselines3 import DDPG, PPO
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.save_util import load_from_pkl
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from toy import ToyRace
+
+from sb3_torcs import models, zoo_training
+from sb3_torcs.cli import main
+from sb3_torcs.errors import InvalidOption
+from sb3_torcs.keeping import REPLAY_BUFFER, STATISTICS, UNFINISHED, KeepCallback, WholeFiles
+
+ENTRY = {
+    "n_timesteps": 60, "policy": "MlpPolicy", "learning_starts": 20, "buffer_size": 1000,
+    "batch_size": 4, "policy_kwargs": {"net_arch": [4]},
+    "env_kwargs": {"track": "aalborg", "start": "random"},
+}  # fmt: skip
+
+
+def words_of(tmp_path, **changes):
+    """Words of a training with a tiny network."""
+    conf_file = tmp_path / "own.yml"
+    conf_file.write_text(yaml.safe_dump({"TorcsLite-v0": {**ENTRY, **changes}}))
+    folder = str(tmp_path / "logs")
+    return ["train", "--conf-file", str(conf_file), "--folder", folder, "--no-progress"]
+
+
+def run_folder(tmp_path, number=1):
+    return tmp_path / "logs" / "ddpg" / f"TorcsLite-v0_{number}"
+
+
+class RaisingCallback(BaseCallback):
+    """Meets an error."""
+
+    def __init__(self, at, error):
+        super().__init__()
+        self.at, self.error = at, error
+
+    def _on_step(self):
+        if self.num_timesteps == self.at:
+            raise eval(self.error)
+        return True
+
+
+# Files
+
+
+def test_a_file_is_at_its_place_when_it_is_whole(tmp_path):
+    files = WholeFiles(tmp_path)
+    (files.aside / "sub").mkdir(parents=True)
+    (tmp_path / "a").write_text("before")
+    (files.aside / "a").write_text("after")
+    (files.aside / "sub" / "b").write_text("b")
+    assert (tmp_path / "a").read_text() == "before"
+    files.settle()
+    assert ((tmp_path / "a").read_text(), (tmp_path / "sub" / "b").read_text()) == ("after", "b")
+    assert files.unfinished() == []
+
+
+def test_what_is_not_whole_never_comes_to_its_place(tmp_path):
+    files = WholeFiles(tmp_path)
+    files.aside.mkdir()
+    (files.aside / "a").write_text("ha")
+    assert [files.place(file) for file in files.unfinished()] == [tmp_path / "a"]
+    files.drop()
+    files.settle()
+    files.close()
+    assert list(tmp_path.iterdir()) == []
+
+
+# The callback
+
+
+def keeper(folder, every=5):
+    return KeepCallback(WholeFiles(folder), "last", every)
+
+
+def tiny(env=None, algorithm=DDPG, **kwargs):
+    env = env or ToyRace()
+    return algorithm("MlpPolicy", env, policy_kwargs={"net_arch": [4]}, device="cpu", **kwargs)
+
+
+def test_the_model_is_kept_with_its_replay_buffer(tmp_path):
+    model = tiny(buffer_size=50)
+    model.learn(12, callback=keeper(tmp_path))
+    assert models.saved_steps(tmp_path / "last.zip") == 10
+    kept = load_from_pkl(tmp_path / REPLAY_BUFFER)
+    assert kept.size() == 9  # SB3 stores a step after the callbacks
+    np.testing.assert_array_equal(kept.actions[:9], model.replay_buffer.actions[:9])
+
+
+def test_statistics_are_kept_where_the_zoo_looks_for_them(tmp_path):
+    env = VecNormalize(DummyVecEnv([ToyRace]))
+    tiny(env, PPO, n_steps=8, batch_size=8).learn(8, callback=keeper(tmp_path))
+    statistics = pickle.loads((tmp_path / "last" / STATISTICS).read_bytes())
+    assert statistics.obs_rms.count == pytest.approx(6.0001)  # the first reset and five steps
+    assert not (tmp_path / REPLAY_BUFFER).exists()
+
+
+def test_keeping_changes_nothing_of_what_is_learned(tmp_path):
+    learned = [
+        tiny(buffer_size=50, seed=1, learning_starts=4).learn(20, callback=callback)
+        for callback in (None, keeper(tmp_path))
+    ]
+    one, other = (model.policy.parameters() for model in learned)
+    assert all(mine.equal(theirs) for mine, theirs in zip(one, other, strict=True))
+
+
+def test_a_full_disk_leaves_the_files_of_before(tmp_path, monkeypatch):
+    model, callback = tiny(buffer_size=50), keeper(tmp_path)
+    model.learn(5, callback=callback)
+    before = (tmp_path / REPLAY_BUFFER).read_bytes()
+
+    def half(file):
+        file.write(before[:100])
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(model, "save_replay_buffer", half)
+    with pytest.raises(OSError, match="No space left"):
+        callback.keep()
+    assert (tmp_path / REPLAY_BUFFER).read_bytes() == before
+    assert [file.name for file in callback.files.unfinished()] == [REPLAY_BUFFER]
+    monkeypatch.undo()
+    callback.keep()
+    assert callback.files.unfinished() == []
+
+
+def test_a_model_that_has_diverged_is_not_healthy(tmp_path):
+    callback = keeper(tmp_path)
+    callback.init_callback(tiny(buffer_size=50))
+    assert callback.is_healthy()
+    next(callback.model.policy.parameters()).data[0, 0] = np.nan
+    assert not callback.is_healthy()
+
+
+@pytest.mark.parametrize("every", [0, -1, 1.5, True])
+def test_the_interval_is_a_number_of_calls(tmp_path, every):
+    with pytest.raises(InvalidOption, match="a whole number of at least 1 call"):
+        keeper(tmp_path, every)
+
+
+# The training
+
+
+def test_trainings_that_begin_at_once_get_folders_of_their_own(tmp_path):
+    def begin(_):
+        words = argparse.Namespace()
+        return zoo_training.Manager(words, "ddpg", "TorcsLite-v0", str(tmp_path)).save_path
+
+    with concurrent.futures.ThreadPoolExecutor(4) as pool:
+        assert len(set(pool.map(begin, range(4)))) == 4
+    assert len(list((tmp_path / "ddpg").iterdir())) == 4
+
+
+@pytest.mark.slow
+def test_a_file_that_cannot_be_written_is_named_and_the_training_goes_on_from_what_is_kept(
+    capsys, tmp_path
+):
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))  # the buffer has 250 kB
+        status = main([*words_of(tmp_path), "--eval-freq", "30"])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    folder, said = run_folder(tmp_path), capsys.readouterr().err
+    assert status == 2
+    assert said.startswith(f"sb3-torcs: cannot write '{folder / REPLAY_BUFFER}': File too large")
+    assert f"kept: '{folder / 'TorcsLite-v0.zip'}', 30 of 60 timesteps; make room" in said
+    assert said.count("\n") == 1
+    assert not (folder / REPLAY_BUFFER).exists()
+    assert not (folder / UNFINISHED).exists()
+    command = said.partition("go on with: ")[2]
+    assert main(shlex.split(command)[1:]) == 0
+    assert models.saved_steps(run_folder(tmp_path, 2) / "TorcsLite-v0.zip") == 30
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        ("OSError(28, 'No space left on device')", "cannot write '{folder}': No space left"),
+        ("EOFError()", "a process with a car of the training has ended; kept: "),
+        ("ConnectionResetError(104, 'reset')", "a process with a car of the training has ended"),
+    ],
+)
+def test_what_was_learned_until_an_error_is_kept(capsys, tmp_path, error, said):
+    callback = {f"{__name__}.RaisingCallback": {"at": 45, "error": error}}
+    status = main([*words_of(tmp_path, callback=[callback]), "--eval-freq", "30"])
+    folder, err = run_folder(tmp_path), capsys.readouterr().err
+    assert status == 2
+    assert said.format(folder=folder) in err
+    assert "45 of 60 timesteps" in err
+    assert models.saved_steps(folder / "TorcsLite-v0.zip") == 45
+    assert load_from_pkl(folder / REPLAY_BUFFER).size() == 44
+
+
+@pytest.mark.slow
+def test_a_training_without_evaluations_is_kept_too(tmp_path):
+    words = words_of(
+        tmp_path, callback=[{f"{__name__}.RaisingCallback": {"at": 9, "error": "1/0"}}]
+    )
+    with pytest.raises(ZeroDivisionError):
+        main([*words, "--eval-freq", "-1"])
+    assert models.saved_steps(run_folder(tmp_path) / "TorcsLite-v0.zip") == 9
+    assert not (run_folder(tmp_path) / "best_model.zip").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:Argument ``multivariate``")  # of the zoo's sampler
+def test_the_zoo_may_search_hyperparameters(capsys, tmp_path):
+    """That leaves reports and no model."""
+    search = ["-optimize", "--n-trials", "1", "--n-evaluations", "1", "--no-optim-plots"]
+    assert main([*words_of(tmp_path, n_timesteps=30), "--", *search]) == 0
+    (report,) = (tmp_path / "logs" / "ddpg").glob("report_*.csv")
+    assert f"its reports: {report.with_name('report_*.csv')}" in capsys.readouterr().out
+
+
+def test_a_search_that_was_ended_before_its_first_trial_is_told(monkeypatch, tmp_path):
+    def nothing(self):
+        raise ValueError("No trials are completed yet.")
+
+    monkeypatch.setattr(ExperimentManager, "hyperparameters_optimization", nothing)
+    words = argparse.Namespace()
+    manager = zoo_training.Manager(words, "ddpg", "TorcsLite-v0", str(tmp_path / "logs"))
+    with pytest.raises(InvalidOption, match="no trial of the search has come to its end"):
+        manager.hyperparameters_optimization()
+
+
+def whole(folder):
+    """Read all that a training leaves; a truncated file raises."""
+    steps = 0
+    for file in folder.glob("*.zip"):
+        DDPG.load(file)
+        steps = max(steps, models.saved_steps(file))
+    if (folder / REPLAY_BUFFER).is_file():
+        load_from_pkl(folder / REPLAY_BUFFER)
+    if (folder / "evaluations.npz").is_file():
+        with np.load(folder / "evaluations.npz") as evaluations:
+            assert len(evaluations["timesteps"]) > 0
+    return steps
+
+
+@pytest.mark.slow
+def test_a_training_that_was_killed_goes_on(tmp_path):
+    """At any moment, also while it saves: with a large buffer it does little else."""
+    rng, resumed = random.Random(0), []
+    for number in range(1, 4):
+        words = words_of(tmp_path, n_timesteps=10**6, buffer_size=200_000)
+        command = [sys.executable, "-m", "sb3_torcs.cli", *words, *resumed, "--eval-freq", "40"]
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+        folder = run_folder(tmp_path, number)
+        while not (folder / REPLAY_BUFFER).is_file():
+            assert process.poll() is None, process.stderr.read()
+            time.sleep(0.05)
+        time.sleep(rng.uniform(0.0, 1.0))
+        process.kill()
+        process.communicate()
+        assert process.returncode == -signal.SIGKILL
+        assert whole(folder) >= 40
+        resumed = ["--resume", str(folder)]
+    words = words_of(tmp_path, buffer_size=200_000)
+    assert main([*words, *resumed, "--timesteps", "30"]) == 0
+    assert models.saved_steps(run_folder(tmp_path, 4) / "TorcsLite-v0.zip") == 30
