@@ -34,25 +34,23 @@ GRACE = 5.0  # [s] for a game that hung up to be gone
 
 class GameView:
     """
-    Pictures of a race, from behind the agent. The game ends when this is closed.
+    Pictures of a race, with the agent in view. The game ends when this is closed.
 
     :param game: the installation
     :param race: who races where; the agent is ``("scr_server", 0)``
-    :param size: width and height [pixels]
-    :raises InvalidOption: if the game cannot draw this size
+    :param window: that the game would show: its size, its view, and whether it has boards
     :raises DisplayUnavailable: if there is no virtual display
     :raises GameIncomplete: if the game lacks its program, or a file that it needs for this
     :raises BackendUnavailable: if our libraries for the inside of the game were not built
     """
 
-    def __init__(self, game: Game, race: RaceSetup, size: tuple[int, int]) -> None:
-        window = Window(size, driver=AGENT)  # what is wrong with it is told before anything starts
+    def __init__(self, game: Game, race: RaceSetup, window: Window) -> None:
         with ExitStack() as stack:
-            display = stack.enter_context(VirtualDisplay(size))
+            display = stack.enter_context(VirtualDisplay(window.size))
             self._line, end = socket.socketpair()
             stack.enter_context(self._line)
             with end:
-                window = replace(window, display=display.name, frames=end.fileno())
+                window = replace(window, driver=AGENT, display=display.name, frames=end.fileno())
                 arguments = window_arguments(game, window)
                 arguments["files"][GRAPHICS] = _without_past(arguments["files"][GRAPHICS])
                 arguments["environment"] |= {

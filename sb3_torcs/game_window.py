@@ -43,6 +43,7 @@ BOARDS = {
     "debug info": 0,
     "map mode": 4,  # the whole track
 }
+NO_BOARDS = {**dict.fromkeys(BOARDS, 0), "map mode": 1}
 USER_VARIABLES = (  # that a program with a window and sound needs; the rest stays outside
     "XAUTHORITY",
     "XDG_RUNTIME_DIR",
@@ -63,6 +64,7 @@ class Window:
     :param frames: an open file for pictures, see :mod:`sb3_torcs.film`; ``None`` shows the race in
         real time
     :param fps: pictures per second of simulated time; ``None`` if it stands still
+    :param boards: whether lap times, instruments and a map are drawn over the picture
     :raises InvalidOption: if there is no such view, or the game cannot draw this
     """
 
@@ -72,10 +74,11 @@ class Window:
     driver: str | None = None
     frames: int | None = None
     fps: float | None = None
+    boards: bool = True
 
     def __post_init__(self) -> None:
-        if self.view not in VIEWS:
-            hint = near_miss(self.view, VIEWS)
+        if not isinstance(self.view, str) or self.view not in VIEWS:
+            hint = near_miss(str(self.view), VIEWS)
             raise InvalidOption(f"there is no view {self.view!r}{hint} it is {' or '.join(VIEWS)}")
         if not all(SMALLEST <= side <= LARGEST for side in self.size):
             raise InvalidOption(
@@ -149,7 +152,8 @@ def window_files(game: Game, window: Window) -> dict[str, str]:
     _set(screen, "Screen Properties", "attstr", "fullscreen", "no")
     graphics = _parse(game, GRAPHICS)
     camera_list, camera = VIEWS[window.view]
-    numbers = {"camera head list": camera_list, "camera": camera, **BOARDS}
+    numbers = {"camera head list": camera_list, "camera": camera}
+    numbers |= BOARDS if window.boards else NO_BOARDS
     for name, number in numbers.items():
         _set(graphics, "Display Mode/0", "attnum", name, str(number))
     if window.driver is not None:

@@ -56,7 +56,7 @@ def arguments(environment):
     said = dict(re.findall(r":param (\w+): (.*?)(?=\n\s*:|\Z)", environment.__doc__, re.DOTALL))
     rows = []
     for name, parameter in parameters.items():
-        if name == "self":
+        if name == "self" or parameter.kind is parameter.VAR_KEYWORD:
             continue
         default = parameter.default
         shown = json.dumps(default) if isinstance(default, str) else repr(default)

@@ -5,28 +5,35 @@ The pixels are those of one machine; what is compared here was drawn on the same
 
 from __future__ import annotations
 
+import inspect
 import os
 import pickle
 import signal
 import subprocess
 import sys
 import warnings
+from functools import partial
 from pathlib import Path
 from time import monotonic, sleep
 
 import gymnasium as gym
+import imageio_ffmpeg
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env as check_gymnasium
-from gymnasium.wrappers import RecordVideo
+from gymnasium.wrappers import AddRenderObservation, RecordVideo
 from processes import children
 from stable_baselines3.common.env_checker import check_env as check_sb3
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecVideoRecorder
 
-from sb3_torcs.envs.torcs_lite import TorcsLiteEnv
+from sb3_torcs.envs.torcs import TorcsEnv
+from sb3_torcs.envs.torcs_lite import OF_THE_GAME, TorcsLiteEnv
 from sb3_torcs.errors import DisplayUnavailable, EnvClosed, GameFailed, InvalidOption
+from sb3_torcs.game_window import VIEWS
 
 TORCS = "sb3_torcs:Torcs-v0"
 SIZE = (160, 120)
+GAME = {"render_mode": "rgb_array", "picture": "game", "render_size": SIZE}
 GAS = np.array([0.0, 1.0, 0.0], np.float32)
 CORNER = {"distance": 600.0, "speed": 20.0, "heading_error": 0.1}
 
@@ -34,7 +41,7 @@ pytestmark = pytest.mark.usefixtures("game")
 
 
 def make(**options):
-    return gym.make(TORCS, **{"render_mode": "game", "render_size": SIZE, **options}).unwrapped
+    return gym.make(TORCS, **{**GAME, **options}).unwrapped
 
 
 @pytest.fixture
@@ -91,15 +98,56 @@ def test_a_picture_follows_the_car(env):
     assert np.abs(shot(later) - shot(at_first)).mean() > 3.0
 
 
-def test_a_picture_shows_this_moment_and_nothing_before_it(env):
+@pytest.mark.parametrize("view", VIEWS)
+def test_a_picture_shows_this_moment_and_nothing_before_it(view):
     """Neither camera nor needles lag behind, and no smoke, marks or dents stay."""
+    env = make(view=view, opponents=("inferno",))  # a director would cut to it
     env.reset(options=CORNER)
     moment, before = env.backend.save(), env.render()
-    drive(env, 15)
+    later = [drive(env, 15) for _ in range(5)]
     env.reset(seed=1)  # on the grid
     env.render()
     env.backend.restore(moment)
-    np.testing.assert_array_equal(env.render(), before)
+    after = env.render()
+    env.close()
+    np.testing.assert_array_equal(after, before)
+    assert all((picture != before).any() for picture in later)
+
+
+def test_each_view_is_another_picture():
+    """Of one moment; the director's is that of the camera beside the track."""
+    pictures = {}
+    for view in VIEWS:
+        env = make(view=view)
+        env.reset(options=CORNER)
+        pictures[view] = env.render().tobytes()
+        env.close()
+    assert pictures.pop("tv") == pictures["track"]
+    assert len(set(pictures.values())) == len(VIEWS) - 1
+
+
+def test_without_boards_there_is_only_the_scene():
+    """The boards in three corners and below are gone; what is between them stays."""
+    pictures = {}
+    for boards in (True, False):
+        env = make(boards=boards, render_size=(320, 240))
+        env.reset(options=CORNER)
+        pictures[boards] = env.render()
+        env.close()
+    np.testing.assert_array_equal(pictures[True][100:180, 80:200], pictures[False][100:180, 80:200])
+    changed = (pictures[True] != pictures[False]).any(axis=2)
+    for corner in (changed[:60, :70], changed[20:70, 250:], changed[180:, 100:200]):
+        assert corner.mean() > 0.1
+
+
+def test_the_old_name_of_the_mode_gives_the_same_picture():
+    pictures = []
+    for options in ({"render_mode": "game", "picture": "above"}, {}):
+        env = make(**options)
+        env.reset(options=CORNER)
+        pictures.append(env.render())
+        env.close()
+    np.testing.assert_array_equal(*pictures)
 
 
 def test_a_start_elsewhere_is_drawn_there(env):
@@ -183,27 +231,103 @@ def test_both_checkers_find_nothing():
         warnings.simplefilter("error")
         warnings.filterwarnings("ignore", message="We recommend you to use a symmetric")
         for check in (check_gymnasium, check_sb3):
-            env = make()
-            check(env)
-            env.close()
+            for options in ({}, {"render_mode": "game", "picture": "above"}):
+                env = make(**options)
+                check(env)
+                env.close()
 
 
 def test_a_wrapper_records_it(tmp_path):
-    pytest.importorskip("moviepy")
-    env = RecordVideo(
-        gym.make(TORCS, render_mode="game", render_size=SIZE), str(tmp_path / "films")
-    )
+    """At the speed of the drive, also if there is less than one picture in a second."""
+    env = RecordVideo(gym.make(TORCS, **GAME, action_repeat=100), str(tmp_path / "films"))
     env.reset(seed=1)
-    for _ in range(5):
+    for _ in range(3):
         env.step(GAS)
     env.close()
-    (film,) = tmp_path.glob("films/*.mp4")
-    assert film.stat().st_size > 1000
+    film = str(*tmp_path.glob("films/*.mp4"))
+    assert imageio_ffmpeg.count_frames_and_secs(film) == (4, 8.0)
 
 
-def test_the_world_without_a_game_refuses():
-    with pytest.raises(InvalidOption, match="that is for Torcs-v0"):
-        TorcsLiteEnv(render_mode="game")
+def test_a_wrapper_observes_it():
+    env = AddRenderObservation(gym.make(TORCS, **GAME, boards=False), render_only=False)
+    observations = [env.reset(seed=1)[0], *(env.step(GAS)[0] for _ in range(3))]
+    pictures = [observation["pixels"] for observation in observations]
+    assert all(observation in env.observation_space for observation in observations)
+    assert {(picture.shape, str(picture.dtype)) for picture in pictures} == {
+        ((120, 160, 3), "uint8")
+    }
+    np.testing.assert_array_equal(pictures[-1], env.render())
+    assert (pictures[0] != pictures[-1]).any()
+    env.close()
+
+
+@pytest.mark.parametrize("vectorize", [DummyVecEnv, SubprocVecEnv])
+def test_stable_baselines3_records_it(vectorize, tmp_path):
+    before = children()
+    made = vectorize([partial(gym.make, TORCS, **GAME)] * 2)
+    env = VecVideoRecorder(made, str(tmp_path), lambda step: step == 0, video_length=4)
+    env.reset()
+    for _ in range(6):
+        env.step([GAS, GAS])
+    env.close()
+    film = str(*tmp_path.glob("*.mp4"))
+    # That of the reset, and one for each of four steps.
+    assert imageio_ffmpeg.count_frames_and_secs(film) == (5, 0.5)
+    assert next(imageio_ffmpeg.read_frames(film))["size"] == (160, 240)  # one above the other
+    assert children() == before
+
+
+def test_races_on_threads_draw_it():
+    envs = gym.make_vec(TORCS, 2, **GAME)
+    envs.reset(seed=1)
+    one, other = envs.render()
+    np.testing.assert_array_equal(one, other)
+    assert is_a_picture(one)
+    envs.close()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"render_mode": "game"}, "render_mode is 'game'.*that is for Torcs-v0"),
+        ({"picture": "game"}, "picture is 'game'.*that is for Torcs-v0"),
+        ({"picture": "abov"}, "picture is 'abov'; expected 'above'"),
+        ({"boards": False}, "boards is False, which needs the installed game"),
+    ],
+)
+def test_the_world_without_a_game_refuses(options, message):
+    with pytest.raises(InvalidOption, match=message):
+        TorcsLiteEnv(**options)
+
+
+def test_the_world_without_a_game_knows_what_is_for_the_other():
+    torcs, lite = (
+        {n for n, p in inspect.signature(env).parameters.items() if p.kind is p.KEYWORD_ONLY}
+        for env in (TorcsEnv, TorcsLiteEnv)
+    )
+    assert torcs - lite == set(OF_THE_GAME)
+    with pytest.raises(TypeError, match="unexpected keyword argument 'trak'"):
+        TorcsLiteEnv(trak="aalborg")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"picture": "gme"}, "picture is 'gme'; did you mean 'game'"),
+        ({"picture": None}, "picture is None; expected 'above' or 'game'"),
+        ({"view": "cokpit"}, "no view 'cokpit'; did you mean 'cockpit'"),
+        ({"view": 3}, "no view '?3"),
+        ({"boards": "no"}, "boards is 'no'; expected True or False"),
+        ({"picture": "above", "view": "tv"}, "view is 'tv'.*add picture='game'"),
+        ({"picture": "above", "boards": False}, "boards is False.*add picture='game'"),
+        ({"render_mode": "human"}, "`sb3-torcs watch` shows the game's own window"),
+        ({"backend": "scr"}, "`sb3-torcs serve --window`"),
+        ({"track": ["aalborg", "forza"]}, "picture 'game' is for one track"),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused_at_once(options, message):
+    with pytest.raises(InvalidOption, match=message):
+        make(**options)
 
 
 @pytest.mark.parametrize("size", [(640,), 640, ("a", "b"), (640.5, 480), (10, 480), (640, 10000)])
@@ -278,7 +402,8 @@ def test_a_game_that_dies_is_told_and_replaced(env):
 def test_a_killed_owner_leaves_nothing(tmp_path):
     code = (
         "import gymnasium as gym, os, signal\n"
-        "env = gym.make('sb3_torcs:Torcs-v0', render_mode='game').unwrapped\n"
+        "options = {'render_mode': 'rgb_array', 'picture': 'game'}\n"
+        "env = gym.make('sb3_torcs:Torcs-v0', **options).unwrapped\n"
         "env.reset(seed=1)\n"
         "env.render()\n"
         "children = open(f'/proc/{os.getpid()}/task/{os.getpid()}/children').read()\n"

@@ -80,7 +80,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
     :raises InvalidOption: if an option has a value that is not allowed
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": 10}  # noqa: RUF012
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": 10.0}  # noqa: RUF012
 
     def __init__(
         self,
@@ -108,7 +108,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         self.render_mode = render_mode
         self.metadata = {
             **self.metadata,
-            "render_fps": max(1, round(1.0 / (action_repeat * CONTROL_TICK))),
+            "render_fps": 1.0 / (action_repeat * CONTROL_TICK),
         }
         self.observation_space = spaces.Box(OBSERVATION_LOW, OBSERVATION_HIGH, dtype=np.float32)
         self.action_space = spaces.Box(

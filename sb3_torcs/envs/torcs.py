@@ -16,12 +16,14 @@ from sb3_torcs.backends.scr import ScrBackend
 from sb3_torcs.backends.several import SeveralTracks, is_several
 from sb3_torcs.car import is_count
 from sb3_torcs.envs.racing import RacingEnv
-from sb3_torcs.errors import EnvClosed, InvalidOption
+from sb3_torcs.errors import EnvClosed, InvalidOption, near_miss
 from sb3_torcs.game import find_game
+from sb3_torcs.game_window import Window
 
 __all__ = ["TorcsEnv"]
 
 BACKENDS = ("native", "scr")
+PICTURES = ("above", "game")
 
 
 class TorcsEnv(RacingEnv):
@@ -50,8 +52,14 @@ class TorcsEnv(RacingEnv):
     :param range_finders: ``"scr"``, ``"narrow"``, or 19 angles in degrees, left to right
     :param start: ``"grid"`` or ``"random"``
     :param laps: whole laps after which the episode is truncated; ``None`` drives on
-    :param render_mode: ``"rgb_array"`` or ``"human"``, from above; or ``"game"``, the game's own
-        picture from behind the car as an ``rgb_array``, which needs Xvfb
+    :param render_mode: ``"rgb_array"`` or ``"human"``; ``"game"`` is another name for
+        ``"rgb_array"`` with ``picture="game"``
+    :param picture: ``"above"``, the road and the car from above, or ``"game"``, the game's own 3D
+        picture, for ``"rgb_array"`` only; it needs Xvfb
+    :param view: of the game's picture: ``"behind"``, ``"close"``, ``"far"``, ``"front"``,
+        ``"cockpit"``, ``"hood"``, ``"road"``, ``"side"``, ``"above"``, ``"track"``,
+        ``"helicopter"`` or ``"tv"``
+    :param boards: whether the game's picture has lap times, instruments and a map drawn over it
     :param render_size: width and height of the game's picture [pixels]
     :param backend: ``"native"``, the game in this process, or ``"scr"``
     :param opponents: robots of the game, e.g. ``("inferno", "berniw:3")``
@@ -84,22 +92,29 @@ class TorcsEnv(RacingEnv):
         opponents: Sequence[str] = (),
         grid_place: int | None = None,
         sensor_noise: bool = False,
+        picture: str = "above",
+        view: str = "behind",
+        boards: bool = True,
         render_size: tuple[int, int] = (640, 480),
         host: str | None = None,
         port: int | None = None,
     ) -> None:
         if backend not in BACKENDS:
             raise InvalidOption(f"backend is {backend!r}; expected {' or '.join(BACKENDS)}")
-        if render_mode == "game" and backend != "native":
-            raise InvalidOption(
-                "render_mode 'game' is for backend 'native'; `sb3-torcs serve --window` shows "
-                "the game of backend 'scr'"
-            )
-        if render_mode == "game" and is_several(track):
-            raise InvalidOption("render_mode 'game' is for one track; give one, not a list")
         if backend != "native":
             self.metadata = RacingEnv.metadata
-        self.render_size = _size(render_size)
+        self.picture = _picture(picture, render_mode)
+        if picture == "game":
+            self.metadata = {**self.metadata, "render_modes": ["rgb_array", "game"]}
+        self._window = _window(render_size, view, boards, self.picture)
+        self.render_size = self._window.size
+        if self.picture == "game" and backend != "native":
+            raise InvalidOption(
+                "picture 'game' is for backend 'native'; `sb3-torcs serve --window` shows the "
+                "game of backend 'scr'"
+            )
+        if self.picture == "game" and is_several(track):
+            raise InvalidOption("picture 'game' is for one track; give one, not a list")
         super().__init__(
             _world(
                 backend,
@@ -123,12 +138,12 @@ class TorcsEnv(RacingEnv):
         """
         Draw the present moment: the road and the car from above, or the game's own picture.
 
-        :return: (height, width, 3) in the modes ``"rgb_array"`` and ``"game"``, else ``None``
+        :return: (height, width, 3) of red, green and blue; ``None`` in the mode ``"human"``
         :raises DisplayUnavailable: if the game has no display to draw at
         :raises GameFailed: if the game that draws has ended; the next picture starts another
         :raises GameTimeout: if it hangs; the same holds
         """
-        if self.render_mode != "game":
+        if self.picture != "game" or self.render_mode is None:
             return super().render()
         if self._closed or self.car is None:
             when = "after close" if self._closed else "before reset; call reset first"
@@ -138,7 +153,7 @@ class TorcsEnv(RacingEnv):
         if self._viewer is None:
             from sb3_torcs.game_view import GameView  # loaded only when somebody looks
 
-            self._viewer = GameView(find_game(), self.backend.race_setup(), self.render_size)
+            self._viewer = GameView(find_game(), self.backend.race_setup(), self._window)
         try:
             frame: npt.NDArray[np.uint8] = self._viewer.frame(appearance)
         except BaseException:  # also Ctrl-C: the picture that was asked for may still come
@@ -180,17 +195,49 @@ def _world(
     return SeveralTracks(map(make, track)) if is_several(track) else make(track)
 
 
-def _size(size: Any) -> tuple[int, int]:
+def _picture(picture: str, render_mode: str | None) -> str:
     """
-    Check the size of pictures.
+    Check what shall be drawn.
 
-    :param size: what was asked for
-    :return: width and height [pixels]
+    :param picture: as of :class:`TorcsEnv`
+    :param render_mode: as there
+    :return: one of :data:`PICTURES`
+    :raises InvalidOption: if there is no such picture, or not in this mode
     """
-    from sb3_torcs.game_window import Window
+    if picture not in PICTURES:
+        raise InvalidOption(
+            f"picture is {picture!r}{near_miss(str(picture), PICTURES)} "
+            f"expected {' or '.join(map(repr, PICTURES))}"
+        )
+    if picture == "game" and render_mode == "human":
+        raise InvalidOption(
+            "picture 'game' is for render_mode 'rgb_array'; `sb3-torcs watch` shows the game's "
+            "own window"
+        )
+    return "game" if render_mode == "game" else picture
 
+
+def _window(size: Any, view: Any, boards: Any, picture: str) -> Window:
+    """
+    Check how the game's picture shall look.
+
+    :param size: width and height [pixels]
+    :param view: where the camera is
+    :param boards: whether lap times and such are drawn over the picture
+    :param picture: that is drawn
+    :return: the window that the game would show
+    :raises InvalidOption: if the game cannot draw this, or is not asked to
+    """
     if isinstance(size, str) or np.shape(size) != (2,) or not all(map(is_count, size)):
         raise InvalidOption(
             f"render_size is {size!r}; expected width and height in pixels, e.g. (640, 480)"
         )
-    return Window((int(size[0]), int(size[1]))).size
+    if not isinstance(boards, (bool, np.bool_)):
+        raise InvalidOption(f"boards is {boards!r}; expected True or False")
+    window = Window((int(size[0]), int(size[1])), view, boards=bool(boards))
+    for name, given, usual in (("view", view, Window.view), ("boards", boards, Window.boards)):
+        if picture != "game" and given != usual:
+            raise InvalidOption(
+                f"{name} is {given!r}, which is for the game's picture; add picture='game'"
+            )
+    return window

@@ -14,7 +14,20 @@ from sb3_torcs.envs.racing import RacingEnv
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.tracks import Track
 
-__all__ = ["TorcsLiteEnv"]
+__all__ = ["OF_THE_GAME", "TorcsLiteEnv"]
+
+OF_THE_GAME = (
+    "backend",
+    "opponents",
+    "grid_place",
+    "sensor_noise",
+    "view",
+    "boards",
+    "render_size",
+    "host",
+    "port",
+)
+"""Options that only ``Torcs-v0`` has."""
 
 
 class TorcsLiteEnv(RacingEnv):
@@ -54,6 +67,8 @@ class TorcsLiteEnv(RacingEnv):
     :param start: ``"grid"`` or ``"random"``
     :param laps: whole laps after which the episode is truncated; ``None`` drives on
     :param render_mode: ``"rgb_array"`` or ``"human"``
+    :param picture: ``"above"``
+    :param of_the_game: options of ``Torcs-v0`` alone, which are refused by name
     """
 
     def __init__(
@@ -67,12 +82,18 @@ class TorcsLiteEnv(RacingEnv):
         start: str = "grid",
         laps: int | None = None,
         render_mode: str | None = None,
+        picture: str = "above",
+        **of_the_game: Any,
     ) -> None:
-        if render_mode == "game":
+        if "game" in (picture, render_mode):
+            name = "picture" if picture == "game" else "render_mode"
             raise InvalidOption(
-                "render_mode is 'game', which draws the game's own picture: that is for Torcs-v0; "
-                "expected None, 'rgb_array' or 'human'"
+                f"{name} is 'game', which the installed game draws: that is for Torcs-v0; "
+                "TorcsLite-v0 has render_mode 'rgb_array' or 'human' with picture 'above'"
             )
+        if picture != "above":
+            raise InvalidOption(f"picture is {picture!r}; expected 'above'")
+        _refuse(of_the_game)
         make: Callable[[Any], Backend] = partial(LiteBackend, car=car, range_finders=range_finders)
         super().__init__(
             SeveralTracks(map(make, track)) if is_several(track) else make(track),
@@ -81,4 +102,21 @@ class TorcsLiteEnv(RacingEnv):
             start=start,
             laps=laps,
             render_mode=render_mode,
+        )
+
+
+def _refuse(options: Mapping[str, Any]) -> None:
+    """
+    Say why options cannot be had.
+
+    :param options: that this world does not have
+    :raises InvalidOption: if one of them is for the real game
+    :raises TypeError: if one of them is for neither
+    """
+    for name, value in options.items():
+        if name not in OF_THE_GAME:
+            raise TypeError(f"TorcsLiteEnv.__init__() got an unexpected keyword argument {name!r}")
+        raise InvalidOption(
+            f"{name} is {value!r}, which needs the installed game: that is for Torcs-v0; leave it "
+            "out for TorcsLite-v0"
         )

@@ -7,8 +7,10 @@
 #include <algorithm>
 #include <cerrno>
 #include <cstdlib>
+#include <cstring>
 #include <poll.h>
 #include <string>
+#include <typeinfo>
 #include <vector>
 
 #include "../appearance.h"
@@ -22,11 +24,37 @@ using namespace torcs;
 constexpr int LOOK_AROUND = 500;    // [ms] between two looks after the owner
 constexpr int MANY_LAPS = 1 << 30;  // of a race without an end
 
-// Of the game's graphics, what remembers the picture before: the camera behind a car, and the
-// needles of its instruments.
+// Of the game's graphics, what remembers the picture before: some of the cameras, and the needles
+// of a car's instruments.
 struct Camera {
-    Unused<136> a_;
+    const std::type_info* const* methods;  // behind them: what kind of camera it is
+    Unused<36> a_;
+    float speed[3];  // [m/s]
+    float place[3];  // [m]
+    Unused<68> b_;
+};
+
+struct CameraBehind {
+    Camera camera;
     float heading;  // [rad] in the picture before
+};
+
+struct FlyingCamera {
+    Camera camera;
+    int car;            // that it flew with
+    float time_left;    // [s] until it changes its mind
+    float climb;        // [m]
+    float pull, damping;
+    float offset[3];    // [m] from the car, where it wants to be
+    double time;        // [s] of the picture before
+};
+
+struct DirectedCamera {
+    Camera camera;
+    Unused<32> a_;
+    double last_event, last_cut;  // [s]
+    Unused<4> b_;
+    int car;  // by its place in the race; -1 for the one that is looked at
 };
 
 struct Screen {
@@ -51,7 +79,10 @@ struct DrawnCar {
     Unused<32> b_;
 };
 
-static_assert(offsetof(Camera, heading) == 136 && offsetof(Screen, camera) == 192);
+static_assert(sizeof(Camera) == 136 && offsetof(Camera, place) == 56);
+static_assert(offsetof(CameraBehind, heading) == 136 && offsetof(Screen, camera) == 192);
+static_assert(offsetof(FlyingCamera, offset) == 156 && offsetof(FlyingCamera, time) == 168);
+static_assert(offsetof(DirectedCamera, last_event) == 168 && offsetof(DirectedCamera, car) == 188);
 static_assert(offsetof(Instrument, needle) == 56 && sizeof(Instrument) == 72);
 static_assert(sizeof(DrawnCar) == 728);
 
@@ -60,6 +91,11 @@ static_assert(sizeof(DrawnCar) == 728);
 constexpr float TURN_PER_PICTURE = 0.1f;
 constexpr float CAMERA_LAG = 0.15f;     // [s]
 constexpr float MAX_CAMERA_LAG = 0.5f;  // [rad] when the car spins
+
+// The helicopter stands where it would come to rest. It moves only if time has passed.
+constexpr float ABOVE_CAR[3] = {-15, -15, 30};  // [m]
+constexpr double JUST_BEFORE = 1.0 / 256;       // [s] never a whole number of physics steps
+constexpr float LONG = 10;                      // [s]
 
 int appearances_descriptor() {
     static const char* text = std::getenv("SB3_TORCS_APPEARANCES");
@@ -124,11 +160,42 @@ Thing& drawn(const char* name) {
     return *static_cast<Thing*>(dlsym(library, name));
 }
 
-// As if the pictures before had been of a drive that led to this moment.
-void pretend_a_past(const CarElement& car, Screen& screen) {
+bool is(const Camera& camera, const char* kind) {
+    return std::strcmp(camera.methods[-1]->name(), kind) == 0;
+}
+
+void turn(CameraBehind& behind, const CarElement& car) {
     const float lag =
         std::clamp(CAMERA_LAG * car.pub.local.vel.az, -MAX_CAMERA_LAG, MAX_CAMERA_LAG);
-    screen.camera->heading = car.pub.local.pos.az - lag / (1 - TURN_PER_PICTURE);
+    behind.heading = car.pub.local.pos.az - lag / (1 - TURN_PER_PICTURE);
+}
+
+void hover(FlyingCamera& helicopter, const CarElement& car, double time) {
+    const auto& pos = car.pub.local.pos;
+    const float at[3] = {pos.x, pos.y, pos.z};
+    for (int i = 0; i < 3; i++) {
+        helicopter.offset[i] = ABOVE_CAR[i];
+        helicopter.camera.place[i] = at[i] + ABOVE_CAR[i];
+        helicopter.camera.speed[i] = 0;
+    }
+    helicopter.car = car.index;
+    helicopter.time_left = LONG;
+    helicopter.pull = helicopter.damping = 1;
+    helicopter.time = time - JUST_BEFORE;
+}
+
+// The director would cut to another car.
+void stay(DirectedCamera& camera, double time) {
+    camera.last_event = camera.last_cut = time;
+    camera.car = -1;
+}
+
+// As if the pictures before had been of a drive that led to this moment.
+void pretend_a_past(const CarElement& car, Screen& screen, double time) {
+    Camera& camera = *screen.camera;
+    if (is(camera, "15cGrCarCamBehind")) turn(reinterpret_cast<CameraBehind&>(camera), car);
+    if (is(camera, "16cGrCarCamRoadFly")) hover(reinterpret_cast<FlyingCamera&>(camera), car, time);
+    if (is(camera, "20cGrCarCamRoadZoomTVD")) stay(reinterpret_cast<DirectedCamera&>(camera), time);
     for (Instrument& it : drawn<DrawnCar*>("grCarInfo")[car.index].instrument) {
         const float share = std::clamp((*it.shown - it.value) / it.range, 0.0f, 1.0f);
         it.needle = it.angle + share * it.angle_range;
@@ -159,7 +226,7 @@ void take_appearance() {
     // Shining lights are drawn turned at random.
     std::srand(1);
     Screen& screen = *drawn<Screen*>("grScreens");
-    pretend_a_past(*screen.car, screen);
+    pretend_a_past(*screen.car, screen, scene.time);
     // Without an end the board counts up to the lap that is driven.
     if (endless) situation.laps = std::max(situation.cars[0]->race.crossings, 1);
 }
