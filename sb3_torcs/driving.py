@@ -21,12 +21,20 @@ class Agent:
     :param model: what :func:`~sb3_torcs.models.load_driver` loads
     :param settings: of ``Torcs-v0`` with ``backend="scr"``: ``host``, ``port``, ``track`` and so on
     :param algo: of the model, if that cannot be found out
+    :param trust: run what is pickled in the model
     :raises ModelMismatch: if the model does not fit
+    :raises ModelNotTrusted: if it takes more than plain data
     """
 
-    def __init__(self, model: str, settings: Mapping[str, Any], algo: str | None = None) -> None:
+    def __init__(
+        self,
+        model: str,
+        settings: Mapping[str, Any],
+        algo: str | None = None,
+        trust: bool = False,
+    ) -> None:
         self.env = gym.make("sb3_torcs:Torcs-v0", backend="scr", max_episode_steps=-1, **settings)
-        self.driver = load_driver(model, self.env, algo)
+        self.driver = load_driver(model, self.env, algo, trust)
         # The first decision of all loads libraries, for which a race has no time.
         self.driver.predict(cast(spaces.Box, self.env.observation_space).high, deterministic=True)
         self.lap_times: list[float] = []

@@ -26,6 +26,7 @@ __all__ = [
     "LayoutMismatch",
     "MessageBroken",
     "ModelMismatch",
+    "ModelNotTrusted",
     "NoiseNotBound",
     "OutputNotWritable",
     "PortTaken",
@@ -151,6 +152,10 @@ class UnknownRobot(Sb3TorcsError, LookupError):
 
 class ModelMismatch(Sb3TorcsError, ValueError):
     """A saved model does not fit the environment it is asked to drive."""
+
+
+class ModelNotTrusted(Sb3TorcsError, ValueError):
+    """Loading a model would run code that is pickled in it, and nobody said that it may."""
 
 
 class NoiseNotBound(Sb3TorcsError, RuntimeError):

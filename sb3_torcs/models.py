@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
 import json
 import os
 import pickle
-import zipfile
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
-import yaml
 from gymnasium import spaces
 
 from sb3_torcs.drivers import SCRIPTED, ScriptedDriver
-from sb3_torcs.errors import InvalidOption, ModelMismatch, near_miss
+from sb3_torcs.errors import InvalidOption, ModelMismatch, ModelNotTrusted, near_miss
+from sb3_torcs.model_file import as_mismatch, check_finite, saved_data, saved_weights
+from sb3_torcs.model_policy import Spaces, build_policy, readable_policy, readable_space
+from sb3_torcs.model_record import TrainingRecord, record_beside, record_within
 from sb3_torcs.sensors import range_finder_angles
 
 __all__ = [
@@ -43,7 +41,10 @@ AGENTS = Path(__file__).parent / "agents"
 
 SAVED_AS = {"ddpg": "td3"}  # a model of one does not tell that it is not of the other
 
-NEEDED_KEYS = ("observation_space", "action_space", "num_timesteps")
+UNTRUSTED = (
+    "'{model}' cannot be driven from plain data alone: {why}. Loading the rest runs whatever code "
+    "is pickled in it; if you know who made it, add --trust (from Python: trust=True)"
+)
 
 # What only one family of algorithms saves; the first that is there names it. DDPG saves what TD3
 # does, and either class drives the other's models.
@@ -56,26 +57,6 @@ TELLING_KEYS = (
     ("target_policy_noise", "td3"),
     ("vf_coef", "a2c"),
 )
-
-
-@dataclass(frozen=True)
-class TrainingRecord:
-    """What the zoo wrote down beside a model; empty where it was not trained by the zoo."""
-
-    algo: str | None = None
-    env_id: str | None = None
-    env_kwargs: Mapping[str, Any] = field(default_factory=dict)
-    hyperparameters: Mapping[str, Any] = field(default_factory=dict)  # the entry, as it was read
-    statistics: Path | None = None  # of VecNormalize
-
-    def kept(self, names: Iterable[str]) -> dict[str, Any]:
-        """
-        Pick what another environment shall have in common with that of the training.
-
-        :param names: of keyword arguments
-        :return: those that the training's environment was given
-        """
-        return {name: self.env_kwargs[name] for name in names if name in self.env_kwargs}
 
 
 class Driver:
@@ -113,22 +94,6 @@ class Driver:
             observation, state, episode_start, deterministic
         )
         return answer
-
-
-class _PlainLoader(yaml.SafeLoader):
-    """Reads the zoo's records, which name Python classes, without building any but mappings."""
-
-
-def _plain(loader: _PlainLoader, tag: str, node: yaml.Node) -> Any:
-    if isinstance(node, yaml.SequenceNode):
-        items = loader.construct_sequence(node, deep=True)
-        return dict(items[0]) if tag.endswith("OrderedDict") and items else items
-    if isinstance(node, yaml.MappingNode):
-        return loader.construct_mapping(node, deep=True)
-    return None
-
-
-_PlainLoader.add_multi_constructor("tag:yaml.org,2002:python/", _plain)
 
 
 def find_model(path: str | Path, *, prefer_last: bool = False) -> Path:
@@ -177,63 +142,17 @@ def shipped_agents() -> list[str]:
 
 def training_record(model: Path) -> TrainingRecord:
     """
-    Read what the zoo wrote beside a model: ``config.yml``, ``args.yml``, ``vecnormalize.pkl``.
-
-    They lie in the model's folder, or in the one folder below it that has some.
+    Find out how a model was trained: by its own file, or by what the zoo laid beside it.
 
     :param model: the file
     :return: what is known
     :raises ModelMismatch: if something of it cannot be read
     """
-    own = _record(model.parent)
-    if own is not None:
-        return own
-    below = [_record(path) for path in model.parent.iterdir() if path.is_dir()]
-    records = [record for record in below if record is not None]
-    return records[0] if len(records) == 1 else TrainingRecord()
+    return _record(model, saved_data(model))
 
 
-def _record(folder: Path) -> TrainingRecord | None:
-    """Read what the zoo wrote in a folder."""
-    arguments, config = folder / "args.yml", folder / "config.yml"
-    statistics = folder / "vecnormalize.pkl"
-    if not any(file.is_file() for file in (arguments, config, statistics)):
-        return None
-    return TrainingRecord(
-        algo=_recorded(arguments, "algo", str),
-        env_id=_recorded(arguments, "env", str),
-        env_kwargs=_recorded(config, "env_kwargs", dict) or {},
-        hyperparameters=_read_plain(config),
-        statistics=statistics if statistics.is_file() else None,
-    )
-
-
-def _recorded(file: Path, key: str, kind: type) -> Any:
-    """Read one value of the zoo's records."""
-    value = _read_plain(file).get(key)
-    if not isinstance(value, kind | None):
-        raise ModelMismatch(
-            f"'{file}', the record of a training: {key} is {value!r}; repair or remove it"
-        )
-    return value
-
-
-def _read_plain(file: Path) -> dict[str, Any]:
-    """
-    Read one of the zoo's records, if it is there.
-
-    Without it a model would drive in another environment than the one it learned in, so what is
-    there and cannot be read is an error.
-    """
-    if not file.is_file():
-        return {}
-    try:
-        content = yaml.load(file.read_text(encoding="utf-8"), Loader=_PlainLoader)
-    except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ModelMismatch(
-            f"'{file}', the record of a training, cannot be read ({error}); repair or remove it"
-        ) from error
-    return content if isinstance(content, dict) else {}
+def _record(model: Path, data: dict[str, Any]) -> TrainingRecord:
+    return record_within(model, data) or record_beside(model) or TrainingRecord()
 
 
 def driver_record(driver: str | Path) -> TrainingRecord:
@@ -262,21 +181,6 @@ def one_track(track: Any) -> Any:
     return track
 
 
-def _saved_data(model: Path) -> dict[str, Any]:
-    """Read the readable part of a saved model, without unpickling anything."""
-    try:
-        with zipfile.ZipFile(model) as archive:
-            data: dict[str, Any] = dict(json.loads(archive.read("data")))
-        for name in NEEDED_KEYS:
-            data[name]
-    except (OSError, KeyError, TypeError, ValueError, zipfile.BadZipFile) as error:
-        raise ModelMismatch(
-            f"'{model}' is not a model that Stable-Baselines3 saved ({error}); give the .zip that "
-            "a training saved"
-        ) from error
-    return data
-
-
 def saved_steps(model: Path) -> int:
     """
     Return how many decisions the last training of a model had.
@@ -284,28 +188,38 @@ def saved_steps(model: Path) -> int:
     :param model: the file
     :return: ``num_timesteps``
     """
-    return int(_saved_data(model)["num_timesteps"])
+    return int(saved_data(model)["num_timesteps"])
 
 
-def saved_spaces(model: Path) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
+def saved_spaces(model: Path, *, trust: bool = False) -> Spaces:
     """
     Return what a model sees and does.
 
     :param model: the file
+    :param trust: unpickle it, if it cannot be read otherwise
     :return: the observation space and the action space
+    :raises ModelNotTrusted: if it cannot be read otherwise
     """
+    data = saved_data(model)
+    known = _record(model, data).spaces
+    if known is not None:
+        return known
+    wanted = {name: data[name] for name in ("observation_space", "action_space")}
+    seen, does = (readable_space(item) for item in wanted.values())
+    if seen is not None and does is not None:
+        return seen, does
+    if not trust:
+        raise ModelNotTrusted(UNTRUSTED.format(model=model, why="its spaces are pickled"))
     from stable_baselines3.common.save_util import json_to_data
 
-    data = _saved_data(model)
-    wanted = {name: data[name] for name in ("observation_space", "action_space")}
-    with _as_mismatch(f"'{model}' does not tell what it sees and does", "give"):
+    with as_mismatch(f"'{model}' does not tell what it sees and does", "give"):
         loaded = json_to_data(json.dumps(wanted))
-    return loaded["observation_space"], loaded["action_space"]
+        return loaded["observation_space"], loaded["action_space"]
 
 
 def check_spaces(
     model: Path,
-    saved: tuple[spaces.Space[Any], spaces.Space[Any]],
+    saved: Spaces,
     env: gym.Env[Any, Any],
 ) -> None:
     """
@@ -330,7 +244,9 @@ def check_spaces(
         )
 
 
-def check_resumable(model: Path, env: gym.Env[Any, Any], algo: str, n_envs: int) -> bool:
+def check_resumable(
+    model: Path, env: gym.Env[Any, Any], algo: str, n_envs: int, *, trust: bool = False
+) -> bool:
     """
     Make sure that a training can go on from a model.
 
@@ -338,17 +254,28 @@ def check_resumable(model: Path, env: gym.Env[Any, Any], algo: str, n_envs: int)
     :param env: that the training is to go on in
     :param algo: that is to learn, as the zoo calls it
     :param n_envs: number of environments in which it is to learn
+    :param trust: whether the model need not tell how it was trained
     :return: whether there is a memory to go on with
     :raises ModelMismatch: if they do not belong together
+    :raises ModelNotTrusted: if nothing tells that a training made it
     """
     from stable_baselines3.common.save_util import load_from_pkl
 
-    data = _saved_data(model)
-    check_spaces(model, saved_spaces(model), env)
+    data = saved_data(model)
     record = training_record(model)
-    saved = record.algo or _told_algorithm(data)
-    if saved is not None and SAVED_AS.get(saved, saved) != SAVED_AS.get(algo, algo):
-        raise ModelMismatch(f"'{model}' is a model of {saved}, not of {algo}; give --algo {saved}")
+    if record.driver_only:
+        raise ModelMismatch(
+            f"'{model}' holds what drives and not what learns: its critics and optimizers were "
+            "left out; train anew, with the hyperparameters in the config.yml beside it"
+        )
+    if not record.known and not trust:
+        raise ModelNotTrusted(
+            f"'{model}' does not tell that `sb3-torcs train` or the RL Zoo made it. To go on from "
+            "a model runs whatever code is pickled in it and in the replay buffer beside it; if "
+            "you know who made them, add --trust"
+        )
+    check_spaces(model, saved_spaces(model, trust=True), env)
+    _check_same(model, record.algo or _told_algorithm(data), algo)
     seen, angles = record.env_kwargs.get("range_finders", "scr"), "range_finder_angles"
     sees = env.get_wrapper_attr(angles) if env.has_wrapper_attr(angles) else None
     if record.env_id and sees is not None and not np.allclose(range_finder_angles(seen), sees):
@@ -360,11 +287,17 @@ def check_resumable(model: Path, env: gym.Env[Any, Any], algo: str, n_envs: int)
     if not memory.is_file():
         return False
     said = f"'{memory}' is no memory that can be gone on with"
-    with _as_mismatch(said, "remove it, or give"), memory.open("rb") as file:
+    with as_mismatch(said, "remove it, or give"), memory.open("rb") as file:
         buffer = load_from_pkl(file)
         if buffer.n_envs != n_envs:
             raise ValueError(f"of {buffer.n_envs} cars at once, not {n_envs}")
     return True
+
+
+def _check_same(model: Path, saved: str | None, algo: str) -> None:
+    """Make sure that a model is one of this algorithm."""
+    if saved is not None and SAVED_AS.get(saved, saved) != SAVED_AS.get(algo, algo):
+        raise ModelMismatch(f"'{model}' is a model of {saved}, not of {algo}; give --algo {saved}")
 
 
 def _layout(space: spaces.Space[Any]) -> str:
@@ -375,39 +308,76 @@ def _layout(space: spaces.Space[Any]) -> str:
     return str(space)
 
 
-def load_driver(path: str | Path, env: gym.Env[Any, Any], algo: str | None = None) -> Any:
+def load_driver(
+    path: str | Path, env: gym.Env[Any, Any], algo: str | None = None, trust: bool = False
+) -> Any:
     """
-    Load what is to drive.
+    Load what is to drive. Nothing that the file holds is run, unless it is trusted.
 
     :param path: of a saved model or its run's folder, or ``"scripted"``
     :param env: that it is to drive
     :param algo: as the zoo calls it; ``None`` finds out
-    :return: something with ``predict(observation, deterministic=...)``
+    :param trust: load the model as SB3 does, which runs whatever is pickled in it
+    :return: something with SB3's ``predict``
     :raises InvalidOption: if there is no such file or algorithm
     :raises ModelMismatch: if the file is no model, or one for another environment
+    :raises ModelNotTrusted: if the model takes more than plain data and known classes
     """
     if str(path) == SCRIPTED:
         return _scripted(env)
+    file = find_model(path)
+    data = saved_data(file)
+    record = _record(file, data)
+    seen = saved_spaces(file, trust=trust)
+    check_spaces(file, seen, env)
+    model = _as_sb3_does(file, algo or record.algo) if trust else _policy(file, record, algo, seen)
+    return Driver(model, _statistics(file, record, trust))
+
+
+def _policy(file: Path, record: TrainingRecord, algo: str | None, seen: Spaces) -> Any:
+    """Build a policy from plain data, with its weights."""
+    data = saved_data(file)
+    if algo is not None:
+        _algorithm(algo, data, file)
+        _check_same(file, record.algo or _told_algorithm(data), algo)
+    weights = saved_weights(file)
+    with as_mismatch(f"'{file}' does not load", "give"):
+        try:
+            policy = build_policy(record.policy or readable_policy(data), seen)
+        except ModelNotTrusted as error:
+            raise ModelNotTrusted(UNTRUSTED.format(model=file, why=error)) from None
+        policy.load_state_dict(weights)
+        return policy
+
+
+def _as_sb3_does(file: Path, algo: str | None) -> Any:
+    """Load a model with all that is pickled in it."""
+    name, algorithm = _algorithm(algo, saved_data(file), file)
+    # On the CPU: for one timestep at a time it is the fastest, and it is always there. The
+    # schedules are of no use to a driver, and the saved ones may be from another version.
+    # Nor is a replay buffer: SB3 warns of the class that it chose itself for returns over several
+    # steps.
+    kwargs = {"device": "cpu", "buffer_size": 1, "replay_buffer_class": None}
+    with as_mismatch(f"'{file}' does not load as {name}", "give an --algo that fits, or"):
+        model = algorithm.load(io.BytesIO(file.read_bytes()), **kwargs)
+        check_finite(file, model.policy.state_dict())
+        return model
+
+
+def _statistics(file: Path, record: TrainingRecord, trust: bool) -> Any:
+    """Find the statistics that a model learned with, if it learned from normalized observations."""
     from stable_baselines3.common.vec_env import VecNormalize
 
-    model_file = find_model(path)
-    data = _saved_data(model_file)
-    check_spaces(model_file, saved_spaces(model_file), env)
-    record = training_record(model_file)
-    name, algorithm = _algorithm(algo or record.algo, data, model_file)
-    # On the CPU: for one decision at a time it is the fastest, and it is always there. The
-    # schedules are of no use to a driver, and the saved ones may be from another version.
-    # Nor is a memory: SB3 warns of the class that it chose itself for returns over several steps.
-    kwargs = {"device": "cpu", "buffer_size": 1, "replay_buffer_class": None}
-    with _as_mismatch(f"'{model_file}' does not load as {name}", "give an --algo that fits, or"):
-        model = algorithm.load(io.BytesIO(model_file.read_bytes()), **kwargs)
-    if record.statistics is None:
-        return Driver(model)
-    with _as_mismatch(f"'{record.statistics}' holds no statistics of VecNormalize", "give"):
-        statistics = pickle.loads(record.statistics.read_bytes())
+    if record.statistics is not None or record.statistics_file is None:
+        return record.statistics
+    if not trust:
+        why = f"its statistics, '{record.statistics_file}', are pickled"
+        raise ModelNotTrusted(UNTRUSTED.format(model=file, why=why))
+    with as_mismatch(f"'{record.statistics_file}' holds no statistics of VecNormalize", "give"):
+        statistics = pickle.loads(record.statistics_file.read_bytes())
         if not isinstance(statistics, VecNormalize):
             raise TypeError(f"a {type(statistics).__name__}")
-    return Driver(model, statistics)
+        return statistics
 
 
 def _scripted(env: gym.Env[Any, Any]) -> Any:
@@ -419,17 +389,6 @@ def _scripted(env: gym.Env[Any, Any]) -> Any:
             f"{np.degrees(angles).round(3).tolist()}; leave --range-finders out"
         )
     return ScriptedDriver()
-
-
-@contextlib.contextmanager
-def _as_mismatch(what: str, hint: str) -> Iterator[None]:
-    """Tell a file that is not what it should be: SB3 and pickle raise whatever comes of it."""
-    try:
-        yield
-    except Exception as error:
-        raise ModelMismatch(
-            f"{what} ({type(error).__name__}: {error}); {hint} a model that is whole"
-        ) from error
 
 
 def _told_algorithm(data: dict[str, Any]) -> str | None:

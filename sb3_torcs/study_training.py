@@ -28,6 +28,7 @@ import sb3_torcs  # noqa: F401  registers the environments, in a worker too
 from sb3_torcs.errors import StudyError
 from sb3_torcs.evaluation import Episode, Merit, evaluate, merit, race_environment
 from sb3_torcs.ladder import rung
+from sb3_torcs.model_writing import recipe, write_record
 from sb3_torcs.models import BEST_MODEL, Driver, load_driver
 from sb3_torcs.study_file import FIELDS, Trial, track_name
 
@@ -193,6 +194,8 @@ class Training:
         return episode
 
     def _save_model(self, file: Path | io.BytesIO) -> None:
+        trial = self.trial
+        write_record(self.model, recipe(trial.algo, trial.env_id, trial.entry))
         # A class of memory that SB3 chose itself would be taken for the user's when it is loaded.
         chosen = "replay_buffer_class" not in self.trial.entry
         self.model.save(file, exclude=["replay_buffer_class"] if chosen else None)

@@ -43,6 +43,7 @@ class Show:
     :param settings: of the agent's environment: ``car``, ``action_repeat``, ``range_finders``
     :param opponents: robots' names and indices, who start behind
     :param laps: to drive
+    :param trust: run what is pickled in the model
     """
 
     game: Game
@@ -52,6 +53,7 @@ class Show:
     settings: Mapping[str, Any] = field(default_factory=dict)
     opponents: Sequence[tuple[str, int]] = ()
     laps: int = 1
+    trust: bool = False
     agent: Agent | None = None
     results: list[RobotResult] = field(default_factory=list)
 
@@ -84,7 +86,7 @@ class Show:
             sockets[0].close()
         try:
             settings = {"track": self.track, "host": "127.0.0.1", "port": port, **self.settings}
-            self.agent = Agent(self.model, settings)
+            self.agent = Agent(self.model, settings, trust=self.trust)
         except BaseException:
             process.stop()
             raise

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import fcntl
 import os
 import sys
@@ -19,6 +20,7 @@ from stable_baselines3.common.callbacks import CheckpointCallback, EvalCallback
 
 from sb3_torcs.errors import InvalidOption, WorkerLost
 from sb3_torcs.keeping import KeepCallback, WholeFiles
+from sb3_torcs.model_writing import RecordCallback, recipe
 
 __all__ = ["Manager", "train"]
 
@@ -44,8 +46,25 @@ class Manager(ExperimentManager):
         if self.optimize_hyperparameters:
             self.tensorboard_log = None  # a search writes none, and would warn of it
 
+    def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """
+        Read what the training is asked for, and keep it for the model's record.
+
+        :return: the same twice, the first to be changed
+        """
+        hyperparameters, said = super().read_hyperparameters()
+        self._asked = copy.deepcopy(dict(said))
+        return hyperparameters, said
+
     def create_callbacks(self) -> None:
-        """Let the zoo's callbacks write aside, and add the one that keeps what was learned."""
+        """
+        Let the zoo's callbacks write aside, between the two of ours.
+
+        One writes the model's record, before anything saves the model; the other keeps what was
+        learned.
+        """
+        asked = {**self._asked, "env_kwargs": self.env_kwargs, "n_timesteps": self.n_timesteps}
+        self.callbacks.append(RecordCallback(recipe(self.algo, self.env_name.gym_id, asked)))
         super().create_callbacks()
         if self.optimize_hyperparameters:
             return

@@ -16,7 +16,7 @@ from fake_game import write_game
 from stable_baselines3 import DDPG
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_torcs import bench, evaluation, game_process, models
+from sb3_torcs import bench, evaluation, game_process, model_record, models
 from sb3_torcs.cli import VERBS, common, doctor, evaluate, main, recording, train
 from sb3_torcs.cli.train import TrainOptions
 from sb3_torcs.errors import BackendUnavailable, InvalidOption
@@ -242,10 +242,11 @@ def test_who_does_not_say_where_it_was_trained_drives_in_the_game(capsys, plain)
     for name, track in (("scripted", "a-speedway"), (plain, "aalborg")):
         world, said = driven(capsys, name, "--track", track)
         assert world == "Torcs-v0"
-        assert said == (
+        assert said.endswith(
             f"driving Torcs-v0: '{name}' does not say where it was trained, and the game is "
             "installed; --env TorcsLite-v0 drives it without the game\n"
         )
+        assert (f"'{name}' has no record of its training: track, car," in said) == (name == plain)
 
 
 @pytest.mark.usefixtures("no_game")
@@ -487,8 +488,13 @@ def test_a_training_leaves_models_and_logs(capsys, tmp_path):
     assert models.saved_steps(folder / "TorcsLite-v0.zip") == 60
     assert (folder / "rl_model_30_steps.zip").is_file()
     assert list((tmp_path / "logs" / "tensorboard").rglob("events.*")) != []
-    record = models.training_record(folder / "best_model.zip")
-    assert record.env_kwargs == {**ENTRY["env_kwargs"], "track": "alpine-1"}
+    for name in ("best_model.zip", "TorcsLite-v0.zip", "rl_model_30_steps.zip"):
+        elsewhere = (folder / name).rename(tmp_path / name)  # a file tells by itself
+        record = models.training_record(elsewhere)
+        elsewhere.rename(folder / name)
+        assert (record.algo, record.env_id) == ("ddpg", "TorcsLite-v0")
+        assert record.env_kwargs == {**ENTRY["env_kwargs"], "track": "alpine-1"}
+        assert record.hyperparameters["batch_size"] == ENTRY["batch_size"]
     (command,) = [line for line in out.splitlines() if "sb3-torcs evaluate" in line]
     status, out, _ = run(capsys, *shlex.split(command)[1:], "--json")
     assert status == 0
@@ -520,7 +526,7 @@ def test_an_interrupted_training_keeps_what_it_learned_and_says_how_to_go_on(cap
     status, out, _ = run(capsys, *shlex.split(command)[1:])
     folder = last_model.parent.with_name("TorcsLite-v0_2")
     assert (status, "learned from 20 of 20" in out) == (0, True)
-    config = models._read_plain(folder / "TorcsLite-v0" / "config.yml")
+    config = model_record._read_plain(folder / "TorcsLite-v0" / "config.yml")
     assert config["learning_starts"] == 0  # it has its memory, so it needs no new warm-up
     assert signal.getsignal(signal.SIGINT) is handler
 

@@ -1,5 +1,4 @@
 import pickle
-import shutil
 import zipfile
 
 import gymnasium as gym
@@ -11,9 +10,9 @@ from stable_baselines3 import DDPG, PPO, SAC
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import sb3_torcs  # noqa: F401  registers the environments
-from sb3_torcs import models
+from sb3_torcs import model_record, models
 from sb3_torcs.drivers import ScriptedDriver
-from sb3_torcs.errors import InvalidOption, ModelMismatch
+from sb3_torcs.errors import InvalidOption, ModelMismatch, ModelNotTrusted
 
 SMALL = {"device": "cpu", "seed": 0}
 
@@ -63,16 +62,21 @@ def test_the_record_of_the_zoo_names_the_algorithm_and_the_environment(saved, en
     assert (record.algo, record.env_id) == ("ddpg", "TorcsLite-v0")
     assert record.env_kwargs == {"track": "alpine-1", "range_finders": "narrow"}
     assert record.hyperparameters == {"env_kwargs": record.env_kwargs, "gamma": 0.98}
-    assert isinstance(models.load_driver(path, env).model, DDPG)
 
 
-def test_a_record_below_belongs_to_the_model_only_if_it_is_the_only_one(saved):
-    """The zoo puts it into a folder beside the model; beside several runs, nobody knows whose."""
+def test_only_the_folder_that_the_zoo_lays_beside_a_model_tells_of_it(saved):
+    """A neighbour, and a folder of any other name, are of another model."""
     _, path = saved
     zoo_record(path.parent, track="alpine-1")
-    assert models.training_record(path).env_kwargs == {"track": "alpine-1"}
-    shutil.copytree(path.parent / "TorcsLite-v0", path.parent / "TorcsLite-v0_2")
-    assert models.training_record(path) == models.TrainingRecord()
+    for name in ("TorcsLite-v0.zip", "best_model.zip", "rl_model_500_steps.zip"):
+        copy = path.rename(path.with_name(name))
+        assert models.training_record(copy).env_kwargs == {"track": "alpine-1"}, name
+        path = copy
+    other = path.rename(path.with_name("downloaded.zip"))
+    assert not models.training_record(other).known
+    best = other.rename(path.with_name("best_model.zip"))
+    (path.parent / "TorcsLite-v0").rename(path.parent / "other-run")
+    assert not models.training_record(best).known
 
 
 @pytest.mark.parametrize(("name", "text", "message"), [
@@ -94,7 +98,7 @@ def test_a_record_builds_no_objects(tmp_path):
     marker = tmp_path / "ran"
     text = f"a: !!python/object/apply:os.mkdir ['{marker}']"
     (tmp_path / "config.yml").write_text(text)
-    models.training_record(tmp_path / "m.zip")
+    model_record.record_beside(tmp_path / "m.zip")
     assert not marker.exists()
 
 
@@ -163,8 +167,9 @@ def rewritten(path, **changes):
     ({"data": b"[1]"}, "is not a model that Stable-Baselines3 saved"),
     ({"data": b"{}"}, "is not a model that Stable-Baselines3 saved"),
     ({"data": None}, "is not a model that Stable-Baselines3 saved"),
-    ({"policy_pth": None}, "does not load as ddpg"),
-    ({"policy_pth": b"PK half of it"}, "does not load as ddpg"),
+    ({"data": b'{"a":' * 200_000 + b"1" + b"}" * 200_000}, "its data nests too deep"),
+    ({"policy_pth": None}, "has no weights that can be read"),
+    ({"policy_pth": b"PK half of it"}, "has no weights that can be read"),
 ])  # fmt: skip
 def test_a_damaged_model_is_refused(saved, env, changes, message):
     rewritten(saved[1], **changes)
@@ -174,7 +179,7 @@ def test_a_damaged_model_is_refused(saved, env, changes, message):
 
 @pytest.mark.parametrize("algo", ["sac", "ppo", "dqn"])
 def test_a_model_of_another_algorithm_is_refused(saved, env, algo):
-    with pytest.raises(ModelMismatch, match=f"does not load as {algo} .*give an --algo that fits"):
+    with pytest.raises(ModelMismatch, match=f"a model of td3, not of {algo}; give --algo td3"):
         models.load_driver(saved[1], env, algo=algo)
 
 
@@ -183,7 +188,7 @@ def test_statistics_that_are_none_are_refused(saved, env, content):
     _, path = saved
     (path.parent / "vecnormalize.pkl").write_bytes(content)
     with pytest.raises(ModelMismatch, match="holds no statistics of VecNormalize"):
-        models.load_driver(path, env)
+        models.load_driver(path, env, trust=True)
 
 
 @pytest.fixture
@@ -252,7 +257,9 @@ def test_the_statistics_beside_a_model_are_applied(saved, env):
     wrapped = VecNormalize(DummyVecEnv([lambda: gym.make("TorcsLite-v0")]))
     wrapped.obs_rms.mean = np.full(29, 0.25)
     wrapped.save(path.parent / "TorcsLite-v0" / "vecnormalize.pkl")
-    driver = models.load_driver(path, env)
+    with pytest.raises(ModelNotTrusted, match=r"vecnormalize.pkl', are pickled.*--trust"):
+        models.load_driver(path, env)
+    driver = models.load_driver(path, env, trust=True)
     normalized = wrapped.normalize_obs(observation(env))
     expected = model.predict(normalized, deterministic=True)[0]
     np.testing.assert_array_equal(driver.predict(observation(env), deterministic=True)[0], expected)

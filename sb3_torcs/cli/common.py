@@ -11,23 +11,50 @@ import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sb3_torcs.errors import OutputNotWritable
 
+if TYPE_CHECKING:
+    from sb3_torcs.models import TrainingRecord
+
 __all__ = [
     "MODEL_HELP",
+    "TRUST_HELP",
     "natural",
     "positive",
     "print_json",
     "quiet_output",
     "seed",
     "table",
+    "told_record",
     "writable_file",
     "writable_folder",
 ]
 
 MODEL_HELP = "a saved .zip, a run's folder, a shipped agent, or 'scripted'"
+
+TRUST_HELP = "run the code that is pickled in the model: only if you know who made it"
+
+
+def told_record(driver: str) -> TrainingRecord:
+    """
+    Read how a driver was trained, and tell on standard error if nothing is known.
+
+    :param driver: as typed
+    :return: what is known
+    """
+    from sb3_torcs.drivers import SCRIPTED
+    from sb3_torcs.models import driver_record
+
+    record = driver_record(driver)
+    if not record.known and driver != SCRIPTED:
+        print(
+            f"sb3-torcs: '{driver}' has no record of its training: track, car, action repeat and "
+            "range finders are the defaults where you do not give them",
+            file=sys.stderr,
+        )
+    return record
 
 
 def positive(text: str) -> int:

@@ -5,7 +5,14 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from sb3_torcs.cli.common import MODEL_HELP, positive, print_json, quiet_output
+from sb3_torcs.cli.common import (
+    MODEL_HELP,
+    TRUST_HELP,
+    positive,
+    print_json,
+    quiet_output,
+    told_record,
+)
 
 if TYPE_CHECKING:
     from sb3_torcs.driving import Agent
@@ -42,6 +49,7 @@ def add_parser(subparsers: Any) -> None:
     add("--track", metavar="T", help="that runs there; default: that of the training, or aalborg")
     add("--car", metavar="C", help="that one drives there; default: that of the training")
     add("--algo", help="the model's algorithm, if it cannot be found out")
+    add("--trust", action="store_true", help=TRUST_HELP)
     add("--json", action="store_true", help="print one JSON object and nothing else")
     parser.set_defaults(run=run)
 
@@ -52,15 +60,15 @@ def run(args: argparse.Namespace) -> int:
     :return: the exit status
     """
     from sb3_torcs.driving import Agent
-    from sb3_torcs.models import driver_record, one_track
+    from sb3_torcs.models import one_track
 
-    record = driver_record(args.model)
+    record = told_record(args.model)
     settings = record.kept(KEPT)
     given = {"track": args.track, "car": args.car, "host": args.host, "port": args.port}
     settings |= {name: value for name, value in given.items() if value is not None}
     one_track(settings.get("track"))
     with quiet_output(args.json):
-        agent = Agent(args.model, settings, args.algo)
+        agent = Agent(args.model, settings, args.algo, args.trust)
     try:
         with quiet_output(args.json):
             agent.drive()

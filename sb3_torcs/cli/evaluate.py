@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 from sb3_torcs.cli.common import (
     MODEL_HELP,
+    TRUST_HELP,
     positive,
     print_json,
     quiet_output,
     seed,
     table,
+    told_record,
     writable_file,
 )
 
@@ -59,6 +61,7 @@ def add_parser(subparsers: Any) -> None:
     add("--action-repeat", type=positive, metavar="N", help="control ticks of 0.02 s per decision")
     add("--range-finders", metavar="SET", help="scr or narrow")
     add("--algo", help="the model's algorithm, if it cannot be found out")
+    add("--trust", action="store_true", help=TRUST_HELP)
     add("--json", action="store_true", help="print one JSON object and nothing else")
     add("--video", metavar="FILE.mp4", help="film the best lap from above")
     add("--line", metavar="FILE.png", help="draw the line of the best lap, coloured by speed")
@@ -95,10 +98,10 @@ def _drive(args: argparse.Namespace) -> tuple[list[Episode], Any]:
     """Build the environment, load the driver, drive."""
     from sb3_torcs.cli.recording import Recorder
     from sb3_torcs.evaluation import choose_world, evaluate, time_limit
-    from sb3_torcs.models import driver_record, load_driver
+    from sb3_torcs.models import load_driver
     from sb3_torcs.zoo import check_racing
 
-    record = driver_record(args.model)
+    record = told_record(args.model)
     env_id = args.env
     if env_id is None:
         env_id, reason = choose_world(args.model, record.env_id, args.track)
@@ -106,7 +109,7 @@ def _drive(args: argparse.Namespace) -> tuple[list[Episode], Any]:
     check_racing(env_id)
     kwargs = environment_kwargs(args, record)
     recorder = Recorder(env_id, kwargs, time_limit(kwargs))
-    driver = load_driver(args.model, recorder, args.algo)
+    driver = load_driver(args.model, recorder, args.algo, args.trust)
     result = evaluate(recorder, driver, episodes=args.episodes, seed=args.seed)
     return result, recorder
 

@@ -58,6 +58,7 @@ class TrainOptions:
         training, and at least 1000 where it has as many
     :param eval_episodes: per evaluation
     :param resume: a saved model (.zip) or a run's folder to go on from
+    :param trust: go on from a model even if nothing tells that a training of ours made it
     :param progress: show a progress bar
     :param zoo_args: further words for the RL Zoo; they win
     """
@@ -74,6 +75,7 @@ class TrainOptions:
     eval_freq: int | None = None
     eval_episodes: int = 1
     resume: str | Path | None = None
+    trust: bool = False
     progress: bool = True
     zoo_args: tuple[str, ...] = ()
 
@@ -128,8 +130,10 @@ def add_parser(subparsers: Any) -> None:
     add(
         "--resume",
         metavar="MODEL",
-        help="go on from a saved model (.zip) or a run's folder, with its --algo and --env",
+        help="go on from a saved model (.zip) or a run's folder, with its --algo and --env; this "
+        "runs what is pickled in model and replay buffer: only if you know who made them",
     )
+    add("--trust", action="store_true", help="resume also a model without a record")
     add("--progress", action=argparse.BooleanOptionalAction, default=True, help="progress bar")
     parser.set_defaults(run=run)
 
@@ -267,7 +271,7 @@ def _resumed(options: TrainOptions, entry: dict[str, Any], env: Any, n_envs: int
     from sb3_torcs.models import check_resumable, find_model
 
     path = find_model(options.resume, prefer_last=True)
-    memory = check_resumable(path, env, options.algo, n_envs)
+    memory = check_resumable(path, env, options.algo, n_envs, trust=options.trust)
     if "learning_starts" in entry and memory:
         entry["learning_starts"] = 0
     if "n_steps" in entry:

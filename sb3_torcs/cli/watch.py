@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from sb3_torcs.cli.common import MODEL_HELP, positive, writable_file
+from sb3_torcs.cli.common import MODEL_HELP, TRUST_HELP, positive, told_record, writable_file
 from sb3_torcs.cli.results import show_results
 
 if TYPE_CHECKING:
@@ -52,6 +52,7 @@ def add_parser(subparsers: Any) -> None:
     add("--size", type=_size, default=(1280, 720), metavar="WxH", help="default: 1280x720")
     add("--film", metavar="FILE.mp4", help="film it")
     add("--fps", type=float, metavar="N", help="of the film; default: 30")
+    add("--trust", action="store_true", help=TRUST_HELP)
     add("--beside", metavar="MODEL|ROBOT", help="film this one, too, to the right")
     parser.set_defaults(run=run)
 
@@ -126,7 +127,9 @@ def _shows(game: Game, names: Sequence[str], args: argparse.Namespace) -> list[S
     opponents = [game.parse_robot(word) for word in words]
     own = {} if args.car is None else {"car": args.car}
     return [
-        Show(game, track, robot, name, {**record.kept(KEPT), **own}, opponents, args.laps)
+        Show(
+            game, track, robot, name, {**record.kept(KEPT), **own}, opponents, args.laps, args.trust
+        )
         for name, robot, record in zip(names, robots, records, strict=True)
     ]
 
@@ -139,10 +142,9 @@ def _record(game: Game, name: str) -> TrainingRecord:
     :param name: as typed
     """
     from sb3_torcs.errors import InvalidOption, near_miss
-    from sb3_torcs.models import driver_record
 
     try:
-        return driver_record(name)
+        return told_record(name)
     except InvalidOption as error:
         hint = near_miss(name, game.robots()).rstrip(";")
         raise InvalidOption(f"{error}; nor is there a robot '{name}'{hint}") from None

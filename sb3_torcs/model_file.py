@@ -1,0 +1,189 @@
+"""The file of a model: what Stable-Baselines3 zipped, read as plain data, so that nothing runs.
+
+A part of such a file is pickled, and a pickle can run anything. Here only its JSON and its weights
+are read, and neither can fill the computer's memory.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import pickletools
+import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sb3_torcs.errors import ModelMismatch, ModelNotTrusted
+
+if TYPE_CHECKING:
+    import torch as th
+
+__all__ = ["as_mismatch", "check_finite", "referenced_class", "saved_data", "saved_weights"]
+
+NEEDED_KEYS = ("observation_space", "action_space", "num_timesteps")
+
+MIB = 2**20  # [bytes]
+MAX_DATA = 16 * MIB  # of JSON; a policy's own is some 25 kB
+MAX_WEIGHTS = 256 * MIB
+MAX_INDEX = MIB  # of the names and shapes of all weights
+MAX_PARTS = 10_000
+MAX_WORDS = 400  # of what a library says [characters]
+COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+
+PLAIN_GLOBALS = ("torch._utils _rebuild_tensor_v2", "collections OrderedDict")
+"""What the index of weights names, beside types of storage; PyTorch itself would allow more."""
+
+IDLE = ("critic.", "critic_target.", "actor_target.", "critic_batch_norm")
+"""Networks of a policy that only learning needs."""
+
+BROKEN = (
+    OSError, KeyError, TypeError, ValueError, AttributeError, EOFError, RuntimeError, MemoryError,
+    zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
+"""What reading a damaged file raises; a RecursionError is a RuntimeError."""
+
+
+@contextmanager
+def as_mismatch(what: str, hint: str) -> Iterator[None]:
+    """
+    Tell a file that is not what it should be: SB3 and pickle raise whatever comes of it.
+
+    :param what: it is not
+    :param hint: what to do; "a model that is whole" follows
+    """
+    try:
+        yield
+    except (ModelMismatch, ModelNotTrusted):
+        raise
+    except Exception as error:
+        why = " ".join(str(error).split())[:MAX_WORDS]
+        raise ModelMismatch(
+            f"{what} ({type(error).__name__}: {why}); {hint} a model that is whole"
+        ) from error
+
+
+def saved_data(model: Path) -> dict[str, Any]:
+    """
+    Read the readable part of a saved model.
+
+    :param model: the file
+    :return: the algorithm's attributes; those that SB3 pickled are still texts
+    :raises ModelMismatch: if the file is no model
+    """
+    try:
+        with zipfile.ZipFile(model) as archive:
+            data: dict[str, Any] = dict(json.loads(_part(archive, "data", MAX_DATA)))
+        for name in NEEDED_KEYS:
+            data[name]
+    except BROKEN as error:
+        raise ModelMismatch(
+            f"'{model}' is not a model that Stable-Baselines3 saved ({_words(error)}); give the "
+            ".zip that a training saved"
+        ) from error
+    return data
+
+
+def saved_weights(model: Path) -> dict[str, th.Tensor]:
+    """
+    Read the weights of a saved policy.
+
+    :param model: the file
+    :return: tensors by name, on the CPU
+    :raises ModelMismatch: if they cannot be read, or if one that drives is not finite
+    """
+    import torch as th
+
+    what = f"'{model}' has no weights that can be read"
+    with as_mismatch(what, "give"):
+        with zipfile.ZipFile(model) as archive:
+            content = _part(archive, "policy.pth", MAX_WEIGHTS)
+        _check_weights(content)
+        weights = th.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+        named = isinstance(weights, dict) and all(isinstance(name, str) for name in weights)
+        if not named or not all(isinstance(part, th.Tensor) for part in weights.values()):
+            raise ValueError("expected tensors by name")
+    check_finite(model, weights)
+    return dict(weights)
+
+
+def check_finite(model: Path, weights: dict[str, th.Tensor]) -> None:
+    """
+    Make sure that what drives is made of numbers.
+
+    :param model: the file, for the message
+    :param weights: tensors by name
+    :raises ModelMismatch: if a network that drives has NaN or an infinity
+    """
+    import torch as th
+
+    for name, tensor in weights.items():
+        if not name.startswith(IDLE) and not bool(th.isfinite(tensor).all()):
+            raise ModelMismatch(
+                f"the weights '{name}' of '{model}' are not finite: its training has diverged; "
+                "give a model that was saved before, e.g. best_model.zip of the same run"
+            )
+
+
+def referenced_class(item: Any) -> str:
+    """
+    Read which class a pickle stands for, without unpickling it.
+
+    :param item: of :func:`saved_data`
+    :return: its dotted path; empty if the pickle is more than a name
+    """
+    try:
+        found = list(pickletools.genops(base64.b64decode(item[":serialized:"])))
+    except BROKEN:
+        return ""
+    plain = [(op.name, argument) for op, argument, _ in found if op.name not in ("FRAME", "PROTO")]
+    if [name for name, _ in plain if name != "MEMOIZE"] != [
+        "SHORT_BINUNICODE", "SHORT_BINUNICODE", "STACK_GLOBAL", "STOP",
+    ]:  # fmt: skip
+        return ""
+    return ".".join(str(argument) for name, argument in plain if name == "SHORT_BINUNICODE")
+
+
+def _part(archive: zipfile.ZipFile, name: str, limit: int) -> bytes:
+    """Unpack a part of a zip, if it is not too large for that."""
+    if len(archive.infolist()) > MAX_PARTS:
+        raise ValueError(f"{len(archive.infolist())} parts")
+    info = archive.getinfo(name)
+    if info.file_size > limit or info.compress_type not in COMPRESSIONS:
+        raise ValueError(f"its part '{name}' unpacks to more than {limit // MIB} MiB, or oddly")
+    return archive.read(info)
+
+
+def _check_weights(content: bytes) -> None:
+    """
+    Make sure that weights are what ``torch.save`` makes of tensors by name.
+
+    :param content: a zip of its own
+    :raises ValueError: if they are more than that
+    """
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        parts = archive.infolist()
+        names = [info.filename for info in parts]
+        if len(parts) > MAX_PARTS or len(set(names)) < len(names):
+            raise ValueError("too many parts")
+        # PyTorch stores, so what is there is no larger than the file.
+        if any(info.compress_type != zipfile.ZIP_STORED for info in parts):
+            raise ValueError("compressed weights within the zip")
+        (index,) = [name for name in names if name.endswith("data.pkl")]
+        for op, argument, _ in pickletools.genops(_part(archive, index, MAX_INDEX)):
+            if op.name in ("STACK_GLOBAL", "INST") or (
+                op.name == "GLOBAL"
+                and argument not in PLAIN_GLOBALS
+                and not str(argument).endswith("Storage")
+            ):
+                raise ValueError(f"its weights name '{argument}'")
+
+
+def _words(error: BaseException) -> str:
+    """Say what went wrong, also where Python has no words for it."""
+    if isinstance(error, RecursionError):
+        return "its data nests too deep"
+    return str(error) or type(error).__name__

@@ -1,0 +1,315 @@
+"""What a model's own file tells, and that reading it runs nothing and takes no more than it has."""
+
+from __future__ import annotations
+
+import io
+import json
+import pickle
+import zipfile
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from sb3_contrib import ARS, QRDQN, TQC, TRPO, CrossQ, RecurrentPPO
+from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
+from stable_baselines3.common.callbacks import CheckpointCallback
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.save_util import load_from_zip_file
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from torch import nn
+
+import sb3_torcs  # noqa: F401  (registers the environments)
+from sb3_torcs import model_file, model_policy, models
+from sb3_torcs.errors import ModelMismatch, ModelNotTrusted
+from sb3_torcs.model_writing import RecordCallback, recipe
+from sb3_torcs.policies import SplitHeadPolicy
+
+OBSERVATIONS = np.linspace(-0.5, 0.5, 4 * 29, dtype=np.float32).reshape(4, 29)
+SPLIT = {"net_arch": [8, 8], "ema_decay": 0.9, "symmetric": True}
+OFF_POLICY = {"buffer_size": 100, "learning_starts": 2, "batch_size": 2}
+
+
+@pytest.fixture(scope="module")
+def env():
+    with gym.make("TorcsLite-v0") as made:
+        yield made
+
+
+@pytest.fixture
+def no_pickle(monkeypatch):
+    """A driver is made of plain data; whoever unpickles on the way fails."""
+
+    def refuse(*args, **kwargs):
+        raise AssertionError("something was unpickled")
+
+    for function in ("pickle.loads", "pickle.load", "cloudpickle.loads", "cloudpickle.load"):
+        monkeypatch.setattr(function, refuse)
+
+
+def trained(algorithm, policy, where, steps=6, **kwargs):
+    """Train a little with the record, and save."""
+    model = algorithm(policy, where, device="cpu", seed=0, **kwargs)
+    return model.learn(steps, callback=RecordCallback())
+
+
+def rewritten(path, **changes):
+    """Change parts of a saved model: data by key, ``policy.pth`` by the whole."""
+    with zipfile.ZipFile(path) as archive:
+        parts = {name: archive.read(name) for name in archive.namelist()}
+    if "policy_pth" in changes:
+        parts["policy.pth"] = changes.pop("policy_pth")
+    parts["data"] = json.dumps({**json.loads(parts["data"]), **changes}).encode()
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in parts.items():
+            archive.writestr(name, content)
+
+
+def saved_state(weights):
+    """What ``torch.save`` makes of something."""
+    buffer = io.BytesIO()
+    th.save(weights, buffer)
+    return buffer.getvalue()
+
+
+def data_of(path):
+    with zipfile.ZipFile(path) as archive:
+        return json.loads(archive.read("data"))
+
+
+@pytest.mark.parametrize(("algorithm", "policy", "kwargs"), [
+    (DDPG, SplitHeadPolicy, {**OFF_POLICY, "policy_kwargs": SPLIT}),
+    (TD3, "MlpPolicy", {**OFF_POLICY, "policy_kwargs": {"activation_fn": nn.ELU}}),
+    (SAC, "MlpPolicy", {**OFF_POLICY, "use_sde": True}),
+    (PPO, "MlpPolicy", {"n_steps": 4, "batch_size": 2, "policy_kwargs": {"net_arch": [8]}}),
+    (A2C, "MlpPolicy", {}),
+    (TQC, "MlpPolicy", OFF_POLICY),
+    (TRPO, "MlpPolicy", {"n_steps": 4, "batch_size": 2}),
+    (CrossQ, "MlpPolicy", OFF_POLICY),
+    (ARS, "LinearPolicy", {"n_delta": 1}),
+    (RecurrentPPO, "MlpLstmPolicy", {"n_steps": 4, "batch_size": 2}),
+])  # fmt: skip
+@pytest.mark.parametrize("recorded", [True, False])
+@pytest.mark.usefixtures("no_pickle")
+def test_a_model_drives_to_the_bit_without_unpickling(
+    env, tmp_path, algorithm, policy, kwargs, recorded
+):
+    """Every stock algorithm for our actions; also what somebody saved without our record."""
+    with gym.make("TorcsLite-v0", max_episode_steps=3) as short:
+        model = trained(algorithm, policy, short, **kwargs)
+        if not recorded:
+            del model.sb3_torcs
+        model.save(tmp_path / "m.zip")
+    driver = models.load_driver(tmp_path / "m.zip", env)
+    state = expected_state = None
+    for observation in OBSERVATIONS:
+        found, state = driver.predict(observation, state, deterministic=True)
+        expected, expected_state = model.predict(observation, expected_state, deterministic=True)
+        np.testing.assert_array_equal(found, expected)
+
+
+def test_each_file_of_a_training_tells_of_it(tmp_path):
+    """Also a checkpoint, with the statistics of that moment, and under any name anywhere."""
+    with gym.make("TorcsLite-v0", track="alpine-1", range_finders="narrow") as env:
+        normalized = VecNormalize(DummyVecEnv([lambda: env]), clip_obs=3.0)
+        model = DDPG("MlpPolicy", normalized, device="cpu", seed=0, **OFF_POLICY)
+        checkpoints = CheckpointCallback(3, tmp_path, "part")
+        entry = {"env_kwargs": {"track": "alpine-1"}, "frame_stack": 1, "train_freq": (1, "step")}
+        asked = recipe("ddpg", "TorcsLite-v0", entry)
+        model.learn(6, callback=[RecordCallback(asked), checkpoints])
+        model.save(tmp_path / "last.zip")
+        early, last = (
+            models.training_record(tmp_path / name) for name in ("part_3_steps.zip", "last.zip")
+        )
+        assert (last.algo, last.env_id) == ("ddpg", "TorcsLite-v0")
+        assert last.env_kwargs == {"track": "alpine-1"}
+        assert last.hyperparameters == {**entry, "train_freq": [1, "step"]}
+        assert early.statistics.mean != last.statistics.mean
+        driver = models.load_driver(tmp_path / "last.zip", env)
+        for observation in 4.0 * OBSERVATIONS:
+            expected, _ = model.predict(normalized.normalize_obs(observation), deterministic=True)
+            np.testing.assert_array_equal(driver.predict(observation)[0], expected)
+        normalized.close()
+
+
+def test_without_a_recipe_the_environment_tells(tmp_path):
+    with gym.make("sb3_torcs:TorcsLite-v0", track="alpine-1", action_repeat=10) as env:
+        trained(DDPG, "MlpPolicy", env, **OFF_POLICY).save(tmp_path / "m.zip")
+    record = models.training_record(tmp_path / "m.zip")
+    assert (record.algo, record.env_id) == ("ddpg", "TorcsLite-v0")
+    assert record.kept(("track", "action_repeat")) == {"track": "alpine-1", "action_repeat": 10}
+
+
+def test_stock_sb3_reads_the_file_as_before_and_a_later_training_makes_the_record_void(tmp_path):
+    with gym.make("TorcsLite-v0", track="alpine-1") as env:
+        trained(DDPG, "MlpPolicy", env, **OFF_POLICY).save(tmp_path / "m.zip")
+    with gym.make("TorcsLite-v0", track="corkscrew") as env:
+        model = DDPG.load(tmp_path / "m.zip", env, device="cpu")
+        model.save(tmp_path / "again.zip")
+        model.learn(6).save(tmp_path / "elsewhere.zip")
+    tracks = [
+        models.training_record(tmp_path / f"{name}.zip").env_kwargs.get("track")
+        for name in ("m", "again", "elsewhere")
+    ]
+    assert tracks == ["alpine-1", "alpine-1", None]
+
+
+@pytest.fixture
+def file(env, tmp_path):
+    trained(DDPG, "MlpPolicy", env, **OFF_POLICY, policy_kwargs={"net_arch": [8]}).save(
+        tmp_path / "m.zip"
+    )
+    return tmp_path / "m.zip"
+
+
+class Bomb:
+    """Makes a folder when it is unpickled."""
+
+    def __init__(self, marker):
+        self.marker = str(marker)
+
+    def __reduce__(self):
+        return __import__("os").mkdir, (self.marker,)
+
+
+def test_nothing_in_a_model_runs(env, file, tmp_path):
+    marker = tmp_path / "ran"
+    payload = {
+        ":type:": "<class 'abc.ABCMeta'>",
+        ":serialized:": "gASVHgAAAAAAAACMAm9zlIwFbWtkaXI=",
+    }
+    for key in data_of(file):
+        rewritten(file, **{key: payload} if key not in ("sb3_torcs", "num_timesteps") else {})
+    rewritten(file, start_time=data_of(file)["sb3_torcs"]["start_time"])
+    models.load_driver(file, env)
+    rewritten(file, policy_pth=saved_state({"actor.mu.0.weight": Bomb(marker)}))
+    with pytest.raises(ModelMismatch, match="has no weights that can be read"):
+        models.load_driver(file, env)
+    (tmp_path / "vecnormalize.pkl").write_bytes(pickle.dumps(Bomb(marker)))
+    with pytest.raises(ModelMismatch):
+        models.load_driver(file, env)
+    assert not marker.exists()
+
+
+def forged(file, **changes):
+    """Change the record in a file."""
+    rewritten(file, sb3_torcs={**data_of(file)["sb3_torcs"], **changes})
+
+
+class OwnPolicy(ActorCriticPolicy):
+    """Somebody's own."""
+
+
+def test_what_takes_more_than_plain_data_asks_for_trust(env, tmp_path):
+    trained(PPO, OwnPolicy, env, n_steps=4, batch_size=2).save(tmp_path / "m.zip")
+    with pytest.raises(ModelNotTrusted, match=r"OwnPolicy' is none of SB3's.*add --trust"):
+        models.load_driver(tmp_path / "m.zip", env)
+    assert isinstance(models.load_driver(tmp_path / "m.zip", env, trust=True).model, PPO)
+
+
+@pytest.mark.parametrize("path", [
+    "os.mkdir", "subprocess.Popen", "sb3_torcs.policies.os", "sb3_torcs.cli.main", "DDPG", "",
+    "stable_baselines3.common.policies.nn", "torch.nn.modules.activation.torch",
+])  # fmt: skip
+@pytest.mark.parametrize("where", ["policy", "activation_fn"])
+def test_a_record_names_known_classes_only(env, file, path, where):
+    said = data_of(file)["sb3_torcs"]["policy"]
+    kwargs = {**said["kwargs"], "activation_fn": {"class": path}}
+    forged(
+        file, policy={**said, "class": path} if where == "policy" else {**said, "kwargs": kwargs}
+    )
+    with pytest.raises(ModelNotTrusted, match="--trust"):
+        models.load_driver(file, env)
+
+
+@pytest.mark.parametrize(("changes", "message"), [
+    ({"version": 2}, "upgrade sb3_torcs"),
+    ({"version": None}, "the record in .* cannot be read"),
+    ({"env_kwargs": ["track"]}, "env_kwargs is a list"),
+    ({"action_space": {"kind": "Box", "shape": [2**40], "low": 0, "high": 1, "dtype": "f4"}},
+     "the record in"),
+    ({"action_space": {"kind": "Text"}}, "the record in"),
+    ({"statistics": {"mean": [float("nan")], "var": [1.0], "epsilon": 0.0, "clip_obs": 1.0}},
+     "statistics of VecNormalize are not finite"),
+])  # fmt: skip
+def test_a_broken_record_is_told(env, file, changes, message):
+    """Without it the model would drive in another environment than the one it learned in."""
+    forged(file, **changes)
+    with pytest.raises(ModelMismatch, match=message):
+        models.load_driver(file, env)
+
+
+def test_a_network_that_fills_the_memory_is_not_built(env, file):
+    said = data_of(file)["sb3_torcs"]["policy"]
+    for kwargs in ({"net_arch": [10**9]}, {"net_arch": [9000, 9000]}, {"n_critics": 10**6}):
+        forged(file, policy={**said, "kwargs": kwargs})
+        with pytest.raises(ModelNotTrusted, match=r"more than \d+ numbers"):
+            models.load_driver(file, env)
+
+
+def test_a_zip_that_unpacks_to_too_much_is_refused(env, file, monkeypatch):
+    """Within limits that no real model comes near; the test lowers them."""
+    monkeypatch.setattr(model_file, "MAX_WEIGHTS", 100)
+    with pytest.raises(ModelMismatch, match=r"policy.pth' unpacks to more than"):
+        models.load_driver(file, env)
+    monkeypatch.setattr(model_file, "MAX_DATA", 100)
+    with pytest.raises(ModelMismatch, match="'data' unpacks to more than"):
+        models.load_driver(file, env)
+
+
+def test_weights_are_tensors_by_name_and_nothing_else(env, file):
+    deflated = io.BytesIO()
+    with zipfile.ZipFile(deflated, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("archive/data.pkl", bytes(10**6))
+    for content in (
+        saved_state([th.zeros(3)]),
+        saved_state({"a": 1}),
+        saved_state({"a": nn.Parameter(th.zeros(3))}),
+        saved_state({"a": bytearray(3)}),
+        deflated.getvalue(),
+        pickle.dumps({}),
+    ):
+        rewritten(file, policy_pth=content)
+        with pytest.raises(ModelMismatch, match="has no weights that can be read"):
+            models.load_driver(file, env)
+
+
+def test_weights_that_are_no_numbers_are_told_by_name(env, file):
+    """Those that drive; a critic is not asked."""
+    weights = load_from_zip_file(file, device="cpu")[1]["policy"]
+    for name in ("critic.qf0.0.weight", "actor.mu.0.weight"):
+        weights[name][0, 0] = float("nan")
+        rewritten(file, policy_pth=saved_state(weights))
+        for trust in (False, True):
+            if name.startswith("critic"):
+                models.load_driver(file, env, trust=trust)
+                continue
+            with pytest.raises(ModelMismatch, match=r"'actor.mu.0.weight' of .* are not finite"):
+                models.load_driver(file, env, trust=trust)
+
+
+@pytest.mark.parametrize("space", [
+    spaces.Box(-1.0, 1.0, (29,), np.float32),
+    spaces.Box(np.float32([-1.0, 0.1, -np.inf]), np.float32([1.0, 1 / 3, np.inf])),
+    spaces.Box(0, 255, (2, 3, 3), np.uint8),
+    spaces.Discrete(5, start=2),
+])  # fmt: skip
+def test_a_space_comes_back_from_plain_data(space):
+    said = json.loads(json.dumps(model_policy.plain_space(space)))
+    assert model_policy.restored_space(said) == space
+
+
+def test_a_model_of_discrete_actions_keeps_its_spaces(tmp_path):
+    class Steer(gym.ActionWrapper):
+        def __init__(self, env):
+            super().__init__(env)
+            self.action_space = spaces.Discrete(3)
+
+        def action(self, action):
+            return np.array([action - 1.0, 0.5, 0.0], np.float32)
+
+    with Steer(gym.make("TorcsLite-v0")) as env:
+        trained(QRDQN, "MlpPolicy", env, **OFF_POLICY).save(tmp_path / "m.zip")
+        driver = models.load_driver(tmp_path / "m.zip", env)
+        assert driver.predict(OBSERVATIONS[0])[0] in (0, 1, 2)
