@@ -7,10 +7,11 @@ import contextlib
 import os
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from signal import SIGHUP, SIGTERM
 from types import FrameType
 
+from sb3_torcs import __version__
 from sb3_torcs.cli import (
     bench,
     compete,
@@ -25,6 +26,8 @@ from sb3_torcs.cli import (
     train,
     watch,
 )
+from sb3_torcs.cli.parser import Parser
+from sb3_torcs.cli.plain import any_terminal
 from sb3_torcs.errors import Sb3TorcsError
 from sb3_torcs.signals import answered
 
@@ -47,12 +50,29 @@ def main(argv: Sequence[str] | None = None) -> int:
     :return: the exit status: 0, 2 for a mistake in what was asked, 130 after Ctrl-C
     """
     words = list(sys.argv[1:] if argv is None else argv)
+    with any_terminal():
+        args = _parsed(words)
+        return 0 if args is None else _run(args)
+
+
+def _parsed(words: list[str]) -> argparse.Namespace | None:
+    """Read the command line; without a verb, which has nothing to be run, say what there is."""
     split = words.index("--") if "--" in words else len(words)
-    parser = _parser()
+    parser, verbs = _parser()
+    if split > 0:
+        parser.check_verb(words[0], verbs)
     args = parser.parse_args(words[:split])
     args.zoo_args = words[split + 1 :]
+    if args.verb is None:
+        parser.print_help()
+        return None
     if args.zoo_args and args.verb != "train":
         parser.error(f"{args.verb} passes nothing on; leave out '--' and what follows it")
+    return args
+
+
+def _run(args: argparse.Namespace) -> int:
+    """Run a verb, and tell what stops it in one line."""
     try:
         # nohup ignores the latter.
         ends = [n for n in (SIGTERM, SIGHUP) if signal.getsignal(n) == signal.SIG_DFL]
@@ -89,11 +109,13 @@ def _drop_output() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+def _parser() -> tuple[Parser, Iterable[str]]:
+    """Build the parser; return it and the verbs that it knows."""
+    parser = Parser(
         prog="sb3-torcs", description="Train, watch and measure cars that learn to race."
     )
-    subparsers = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
+    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
+    subparsers = parser.add_subparsers(dest="verb", metavar="VERB")
     for verb in VERBS:
         verb.add_parser(subparsers)
-    return parser
+    return parser, subparsers.choices

@@ -1,0 +1,45 @@
+"""The command line's parser: a mistake is answered with the word that was probably meant."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable
+from typing import Any, NoReturn
+
+from sb3_torcs.errors import near_miss
+
+__all__ = ["Parser"]
+
+
+class Parser(argparse.ArgumentParser):
+    """Knows near misses of verbs and options, and refuses an unknown option by its verb's usage."""
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """
+        :param args: words of the command line
+        :param namespace: to be filled
+        :return: the namespace, and no words: what is unknown is an error
+        """
+        found, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            self._refuse(unknown)
+        return found, unknown
+
+    def check_verb(self, word: str, verbs: Iterable[str]) -> None:
+        """
+        Make sure that a verb exists.
+
+        :param word: the first of the command line
+        :param verbs: those that exist
+        """
+        known = list(verbs)
+        if not word.startswith("-") and word not in known:
+            hint = near_miss(word, known)
+            self.error(f"there is no verb '{word}'{hint} choose from {', '.join(known)}")
+
+    def _refuse(self, unknown: list[str]) -> NoReturn:
+        """Say which words are unknown; the first option among them is perhaps a near miss."""
+        options = [option for action in self._actions for option in action.option_strings]
+        wrong = next((word for word in unknown if word.startswith("-")), unknown[0])
+        hint = near_miss(wrong.partition("=")[0], options).removesuffix(";")
+        self.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
