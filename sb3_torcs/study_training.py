@@ -31,6 +31,7 @@ from sb3_torcs.ladder import rung
 from sb3_torcs.model_writing import recipe, write_record
 from sb3_torcs.models import BEST_MODEL, Driver, load_driver
 from sb3_torcs.study_file import FIELDS, Trial, track_name
+from sb3_torcs.zoo_training import command_as_text
 
 __all__ = ["Row", "Training", "final_row"]
 
@@ -307,7 +308,8 @@ def _build(trial: Trial) -> tuple[Any, list[BaseCallback], dict[str, bytes]]:
             words, trial.algo, trial.env_id, scratch, eval_freq=-1, seed=trial.seed, verbose=0,
             device="cpu", config=str(conf_file),
         )  # fmt: skip
-        model, _ = manager.setup_experiment()
+        with command_as_text():
+            model, _ = manager.setup_experiment()
         folder = Path(manager.params_path)
         records = {name: (folder / name).read_bytes() for name in RECORDS}
     return model, manager.callbacks, records

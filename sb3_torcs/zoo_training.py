@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import fcntl
+import locale
 import os
 import sys
 import types
@@ -22,7 +23,7 @@ from sb3_torcs.errors import InvalidOption, WorkerLost
 from sb3_torcs.keeping import KeepCallback, WholeFiles
 from sb3_torcs.model_writing import RecordCallback, recipe
 
-__all__ = ["Manager", "train"]
+__all__ = ["Manager", "command_as_text", "train"]
 
 SAVINGS = 40  # of a training without evaluations
 
@@ -183,6 +184,19 @@ def train(words: list[str], managers: list[Manager]) -> None:
     before = sys.argv
     sys.argv = ["rl_zoo3.train", *words]
     try:
-        zoo_train()
+        with command_as_text():
+            zoo_train()
     finally:
         sys.argv = before
+
+
+@contextlib.contextmanager
+def command_as_text() -> Iterator[None]:
+    """Let the zoo write the process's command line into a file, also if a path in it is no text."""
+    before = sys.orig_argv
+    encoding = locale.getpreferredencoding(False)
+    sys.orig_argv = [word.encode(encoding, "backslashreplace").decode(encoding) for word in before]
+    try:
+        yield
+    finally:
+        sys.orig_argv = before

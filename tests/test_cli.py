@@ -16,7 +16,7 @@ from fake_game import write_game
 from stable_baselines3 import DDPG
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_torcs import bench, evaluation, game_process, model_record, models
+from sb3_torcs import __version__, bench, evaluation, game_process, model_record, models
 from sb3_torcs.cli import VERBS, common, doctor, evaluate, main, recording, train
 from sb3_torcs.cli.train import TrainOptions
 from sb3_torcs.errors import BackendUnavailable, InvalidOption
@@ -102,11 +102,106 @@ def test_listing_tracks_does_not_load_torch():
     assert "torch" not in loaded_by("tracks")
 
 
-def test_an_unknown_verb_is_a_usage_error(capsys):
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["xyz"], "sb3-torcs: error: there is no verb 'xyz'; choose from doctor, install-torcs"),
+        (["trian"], "there is no verb 'trian'; did you mean 'train'?"),
+        (["--verison"], "unrecognized arguments: --verison; did you mean '--version'?\n"),
+        (["train", "--trak", "x"], "unrecognized arguments: --trak x; did you mean '--track'?\n"),
+        (
+            ["tracks", "--jsn=1"],
+            "sb3-torcs tracks: error: unrecognized arguments: --jsn=1; did you",
+        ),
+        (["evaluate", "a", "b"], "sb3-torcs evaluate: error: unrecognized arguments: b\n"),
+    ],
+)
+def test_an_unknown_word_is_a_usage_error_with_its_near_miss(capsys, words, said):
     with pytest.raises(SystemExit) as caught:
-        main(["drive"])
+        main(words)
     assert caught.value.code == 2
-    assert "'drive'" in capsys.readouterr().err
+    assert said in capsys.readouterr().err
+
+
+def test_the_bare_command_says_what_there_is(capsys):
+    status, out, err = run(capsys)
+    assert (status, err) == (0, "")
+    assert out.startswith("usage: sb3-torcs")
+    assert all(name in out for name in NAMES)
+
+
+def test_the_command_knows_its_version(capsys):
+    with pytest.raises(SystemExit) as caught:
+        main(["--version"])
+    assert (caught.value.code, capsys.readouterr().out) == (0, f"sb3-torcs {__version__}\n")
+
+
+def said_with(encoding, text):
+    """What a terminal of this encoding gets."""
+    code = (
+        "import sys\nfrom sb3_torcs.cli.plain import any_terminal\n"
+        f"with any_terminal(): print({text!r})"
+    )
+    environment = {**os.environ, "PYTHONIOENCODING": encoding}
+    call = [sys.executable, "-c", code]
+    return subprocess.run(call, capture_output=True, check=True, env=environment).stdout
+
+
+@pytest.mark.parametrize(
+    ("encoding", "text", "expected"),
+    [
+        ("utf-8", "90° m² → é", "90° m² → é".encode()),
+        ("ascii", "90° m² → é … 赤", b"90 deg m2 -> e ... \\u8d64"),
+        ("latin-1", "90° →", b"90\xb0 ->"),
+        ("utf-8", "a\udcffb", b"a\xffb"),
+        ("ascii", "a\udcffb", b"a\xffb"),
+    ],
+)
+def test_any_terminal_takes_any_text(encoding, text, expected):
+    """What its encoding lacks in plain letters, and a path as the bytes that it is."""
+    assert said_with(encoding, text) == expected + b"\n"
+
+
+def test_a_help_text_fits_any_terminal():
+    """That of robots names a list with an ellipsis."""
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    call = [sys.executable, "-m", "sb3_torcs.cli", "robots", "--help"]
+    done = subprocess.run(call, capture_output=True, check=True, env=environment)
+    assert b"NAME:I,..." in done.stdout
+
+
+NOT_UTF8 = os.fsdecode(b"caf\xe9")
+
+
+def test_a_path_need_not_be_utf8(capfd, tmp_path):
+    folder = tmp_path / NOT_UTF8
+    folder.mkdir()
+    status, _, err = run(capfd, "evaluate", str(folder / "none.zip"))
+    assert status == 2
+    assert err.startswith("sb3-torcs: there is no model")
+    assert run(capfd, "tracks", "aalborg", "--plot", str(folder / "a.png"))[0] == 0
+    assert (folder / "a.png").read_bytes()[:4] == PNG
+
+
+def test_the_game_loads_a_track_whose_path_is_not_utf8(capfd, game, tmp_path):
+    track = tmp_path / f"{NOT_UTF8}.xml"
+    track.write_bytes(game.tracks()["road/g-track-1"].read_bytes())
+    words = ["evaluate", "scripted", "--env", "Torcs-v0", "--track", str(track), "--laps", "1"]
+    status, out, _ = run(capfd, *words, "--json")
+    assert status == 0
+    assert json.loads(out)["episodes"][0]["laps"] == 1
+
+
+def test_a_training_in_a_folder_that_is_not_utf8(capfd, tmp_path):
+    """TensorBoard takes none, and says so in a traceback."""
+    folder = str(tmp_path / NOT_UTF8)
+    words = ["train", "--conf-file", write_config(tmp_path), "--folder", folder, "--no-progress"]
+    status, _, err = run(capfd, *words)
+    assert status == 2
+    assert "whose name is not UTF-8; give another folder: --tensorboard DIR" in err
+    command = [sys.executable, "-m", "sb3_torcs.cli", *words, "--tensorboard", str(tmp_path / "t")]
+    assert subprocess.run(command, capture_output=True).returncode == 0
+    assert models.find_model(f"{folder}/ddpg/TorcsLite-v0_1").name == "best_model.zip"
 
 
 def test_a_mistake_is_told_in_one_line_without_a_traceback(capsys):

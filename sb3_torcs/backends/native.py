@@ -79,11 +79,11 @@ def make_engine(
             game.find_robot(name, index)
     path = track_path(game, track)
     load_track(path)  # a broken file is told here, before the game's own loader stumbles on it
-    engine: Engine = native.Engine(
-        data=str(game.data),
-        libraries=str(game.libraries),
-        plib=str(game.extra_libraries or ""),
-        track=str(path),
+    engine: Engine = native.Engine(  # paths as bytes: not every one is a text
+        data=os.fsencode(game.data),
+        libraries=os.fsencode(game.libraries),
+        plib=os.fsencode(game.extra_libraries or ""),
+        track=os.fsencode(path),
         session=SESSIONS[session],
         car=car,
         entries=list(entries),

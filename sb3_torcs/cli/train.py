@@ -200,7 +200,7 @@ def train_run(options: TrainOptions) -> Run:
     with contextlib.closing(gym.make(options.env, **changed["env_kwargs"])) as env:
         resume = _resumed(options, entry, env, changed.get("n_envs", 1))
     folder = writable_folder(options.folder)
-    tensorboard = writable_folder(options.tensorboard or folder / "tensorboard")
+    tensorboard = _for_tensorboard(options.tensorboard or folder / "tensorboard")
     wanted = options.timesteps or zoo.decisions(changed)
     if any(word.endswith("subproc") for word in options.zoo_args):
         wrappers = entry.get("env_wrapper") or []
@@ -215,6 +215,19 @@ def train_run(options: TrainOptions) -> Run:
         words += ["--trained-agent", str(resume)] if resume else []
         track = changed["env_kwargs"].get("track")
         return _run_zoo(options, [*words, *options.zoo_args], wanted, track)
+
+
+def _for_tensorboard(folder: str | Path) -> Path:
+    """Make a folder that TensorBoard can write to, whose own code takes UTF-8 only."""
+    path = writable_folder(folder)
+    try:
+        str(path.absolute()).encode()
+    except UnicodeEncodeError as error:
+        raise OutputNotWritable(
+            f"TensorBoard cannot write to '{path}', whose name is not UTF-8; give another folder: "
+            "--tensorboard DIR"
+        ) from error
+    return path
 
 
 def _entry(options: TrainOptions) -> tuple[dict[str, Any], dict[str, Any]]:

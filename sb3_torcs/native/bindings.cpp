@@ -186,7 +186,9 @@ PYBIND11_MODULE(_engine, module) {
         } catch (const Error& error) {
             const py::object type =
                 py::module_::import("sb3_torcs.errors").attr(error.python_class);
-            PyErr_SetString(type.ptr(), error.what());
+            // A path in it need not be a text.
+            PyErr_SetObject(type.ptr(), py::reinterpret_steal<py::object>(
+                                            PyUnicode_DecodeFSDefault(error.what())).ptr());
         }
     });
 
