@@ -22,7 +22,7 @@ from sb3_torcs.errors import ModelMismatch, ModelNotTrusted
 if TYPE_CHECKING:
     import torch as th
 
-__all__ = ["as_mismatch", "check_finite", "referenced_class", "saved_data", "saved_weights"]
+__all__ = ["IDLE", "as_mismatch", "check_finite", "referenced_class", "saved_data", "saved_weights"]
 
 NEEDED_KEYS = ("observation_space", "action_space", "num_timesteps")
 

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import io
+import json
+import zipfile
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -14,15 +18,25 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_torcs import __version__
-from sb3_torcs.model_policy import plain, plain_policy, plain_space
-from sb3_torcs.model_record import RECORD, VERSION
+from sb3_torcs.errors import ModelNotTrusted
+from sb3_torcs.model_file import IDLE, saved_data, saved_weights
+from sb3_torcs.model_policy import (
+    plain,
+    plain_policy,
+    plain_space,
+    readable_policy,
+    readable_space,
+)
+from sb3_torcs.model_record import RECORD, VERSION, TrainingRecord, record_beside, record_within
 
-__all__ = ["RecordCallback", "recipe", "write_record"]
+__all__ = ["RecordCallback", "recipe", "write_driver", "write_record"]
 
 Recipe = Mapping[str, Any]
 
 
-def recipe(algo: str, env_id: str | None, hyperparameters: Mapping[str, Any]) -> dict[str, Any]:
+def recipe(
+    algo: str | None, env_id: str | None, hyperparameters: Mapping[str, Any]
+) -> dict[str, Any]:
     """
     Compose what a training was asked for.
 
@@ -85,6 +99,64 @@ def write_record(model: BaseAlgorithm, asked: Recipe) -> None:
         },
     }
     setattr(model, RECORD, record)
+
+
+def write_driver(model: Path, driver: Path) -> None:
+    """
+    Write a small file of what drives of a model, with its record.
+
+    What only learning needs is left out: weights of the critics and of targets are NaN, and the
+    optimizers are empty, which a zip makes small. Stock SB3 still loads the file and predicts the
+    same to the bit; a training that goes on from it fails with the first update.
+
+    :param model: the file of the whole
+    :param driver: the file to write
+    :raises ModelMismatch: if the model cannot be read
+    """
+    data, weights = saved_data(model), saved_weights(model)
+    data[RECORD] = {**_record_in(model, data), "driver_only": True}
+    for name, tensor in weights.items():
+        if name.startswith(IDLE) and tensor.is_floating_point():
+            tensor.fill_(float("nan"))
+    with zipfile.ZipFile(model) as source, zipfile.ZipFile(driver, "w") as target:
+        for name in source.namelist():
+            content = source.read(name)
+            if name == "data":
+                content = json.dumps(data).encode()
+            elif name == "policy.pth":
+                content = _torch_file(weights)
+            elif name.endswith("optimizer.pth"):
+                state = th.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+                content = _torch_file({**state, "state": {}})
+            # No date: the same model makes the same file.
+            target.writestr(zipfile.ZipInfo(name), content, zipfile.ZIP_DEFLATED, 9)
+
+
+def _torch_file(value: Any) -> bytes:
+    """Return what ``torch.save`` writes."""
+    file = io.BytesIO()
+    th.save(value, file)
+    return file.getvalue()
+
+
+def _record_in(model: Path, data: Mapping[str, Any]) -> Recipe:
+    """Take the record of a saved model, or compose it from what lies beside the model."""
+    if record_within(model, data) is not None:
+        written: Recipe = data[RECORD]
+        return written
+    record = record_beside(model) or TrainingRecord()
+    seen, does = (readable_space(data[name]) for name in ("observation_space", "action_space"))
+    if seen is None or does is None or record.statistics_file is not None:
+        raise ModelNotTrusted(f"'{model}' has pickled spaces or statistics; train it anew")
+    return {
+        "version": VERSION,
+        **recipe(record.algo, record.env_id, record.hyperparameters),
+        "observation_space": plain_space(seen),
+        "action_space": plain_space(does),
+        "policy": readable_policy(data),
+        "statistics": None,
+        "start_time": data.get("start_time"),
+    }
 
 
 def _recipe_of_environment(model: BaseAlgorithm) -> Recipe:

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from sb3_torcs import models
+from sb3_torcs import model_record, models
 from sb3_torcs.cli import main
 from sb3_torcs.ladder import REFERENCE_FILE
 
-MAX_SIZE = 8_000_000  # [bytes]
+MAX_SIZE = 400_000  # [bytes]
 SECTIONS = ("## How it was made", "## What it drives", "## Limits")
 AGENTS = models.shipped_agents()
 DRIVE = re.compile(r"\n(sb3-torcs evaluate .*)\n```\n\nLaps: ([\d., ]*) s\.")  # in a card
@@ -50,6 +50,18 @@ def test_stock_sb3_loads_it(name):
     command = [sys.executable, "-W", "error", "-c", code, str(file)]
     run = subprocess.run(command, check=True, capture_output=True, text=True)
     assert run.stdout == "(3,)\n"
+
+
+@pytest.mark.parametrize("name", AGENTS)
+def test_it_holds_only_what_drives_and_says_so(name, capsys):
+    """Its own file tells how it was trained, also under another name elsewhere."""
+    record = models.training_record(models.AGENTS / name / "best_model.zip")
+    beside = model_record.record_beside(models.AGENTS / name / "best_model.zip")
+    assert record.driver_only
+    for field in ("algo", "env_id", "env_kwargs", "hyperparameters"):
+        assert getattr(record, field) == getattr(beside, field)
+    assert main(["train", "--resume", name, "--timesteps", "1"]) == 2
+    assert "holds what drives and not what learns" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("game")

@@ -22,8 +22,8 @@ from torch import nn
 
 import sb3_torcs  # noqa: F401  (registers the environments)
 from sb3_torcs import model_file, model_policy, models
-from sb3_torcs.errors import ModelMismatch, ModelNotTrusted
-from sb3_torcs.model_writing import RecordCallback, recipe
+from sb3_torcs.errors import InvalidAction, ModelMismatch, ModelNotTrusted
+from sb3_torcs.model_writing import RecordCallback, recipe, write_driver
 from sb3_torcs.policies import SplitHeadPolicy
 
 OBSERVATIONS = np.linspace(-0.5, 0.5, 4 * 29, dtype=np.float32).reshape(4, 29)
@@ -37,15 +37,16 @@ def env():
         yield made
 
 
-@pytest.fixture
-def no_pickle(monkeypatch):
-    """A driver is made of plain data; whoever unpickles on the way fails."""
+def load_plainly(file, env, monkeypatch):
+    """Load a driver; whoever unpickles on the way fails."""
 
     def refuse(*args, **kwargs):
         raise AssertionError("something was unpickled")
 
-    for function in ("pickle.loads", "pickle.load", "cloudpickle.loads", "cloudpickle.load"):
-        monkeypatch.setattr(function, refuse)
+    with monkeypatch.context() as patch:
+        for function in ("pickle.loads", "pickle.load", "cloudpickle.loads", "cloudpickle.load"):
+            patch.setattr(function, refuse)
+        return models.load_driver(file, env)
 
 
 def trained(algorithm, policy, where, steps=6, **kwargs):
@@ -91,9 +92,8 @@ def data_of(path):
     (RecurrentPPO, "MlpLstmPolicy", {"n_steps": 4, "batch_size": 2}),
 ])  # fmt: skip
 @pytest.mark.parametrize("recorded", [True, False])
-@pytest.mark.usefixtures("no_pickle")
 def test_a_model_drives_to_the_bit_without_unpickling(
-    env, tmp_path, algorithm, policy, kwargs, recorded
+    env, tmp_path, monkeypatch, algorithm, policy, kwargs, recorded
 ):
     """Every stock algorithm for our actions; also what somebody saved without our record."""
     with gym.make("TorcsLite-v0", max_episode_steps=3) as short:
@@ -101,7 +101,7 @@ def test_a_model_drives_to_the_bit_without_unpickling(
         if not recorded:
             del model.sb3_torcs
         model.save(tmp_path / "m.zip")
-    driver = models.load_driver(tmp_path / "m.zip", env)
+    driver = load_plainly(tmp_path / "m.zip", env, monkeypatch)
     state = expected_state = None
     for observation in OBSERVATIONS:
         found, state = driver.predict(observation, state, deterministic=True)
@@ -313,3 +313,21 @@ def test_a_model_of_discrete_actions_keeps_its_spaces(tmp_path):
         trained(QRDQN, "MlpPolicy", env, **OFF_POLICY).save(tmp_path / "m.zip")
         driver = models.load_driver(tmp_path / "m.zip", env)
         assert driver.predict(OBSERVATIONS[0])[0] in (0, 1, 2)
+
+
+@pytest.mark.parametrize("recorded", [True, False])
+def test_a_driver_alone_drives_the_same_and_learns_nothing(env, tmp_path, recorded):
+    """In stock SB3, too; a training that goes on from it has no silent start from nothing."""
+    options = {**OFF_POLICY, "learning_starts": 0}
+    model = trained(DDPG, SplitHeadPolicy, env, **options, policy_kwargs=SPLIT)
+    if not recorded:
+        del model.sb3_torcs
+    model.save(tmp_path / "whole.zip")
+    write_driver(tmp_path / "whole.zip", tmp_path / "driver.zip")
+    assert models.training_record(tmp_path / "driver.zip").driver_only
+    stock = DDPG.load(tmp_path / "driver.zip", env, device="cpu")
+    expected, _ = model.predict(OBSERVATIONS, deterministic=True)
+    for driver in (stock, models.load_driver(tmp_path / "driver.zip", env)):
+        np.testing.assert_array_equal(driver.predict(OBSERVATIONS, deterministic=True)[0], expected)
+    with pytest.raises(InvalidAction, match="nan"):
+        stock.learn(20)
