@@ -29,6 +29,7 @@ __all__ = [
     "ModelNotTrusted",
     "NoiseNotBound",
     "OutputNotWritable",
+    "PackageMissing",
     "PortTaken",
     "RayUnavailable",
     "RobotUnavailable",
@@ -176,6 +177,10 @@ class RayUnavailable(Sb3TorcsError, RuntimeError):
 
 class WorkerLost(Sb3TorcsError, RuntimeError):
     """A process that drives cars of a training has ended."""
+
+
+class PackageMissing(Sb3TorcsError, ImportError):
+    """Something needs a package that is not installed; the message says what to type."""
 
 
 class ZooConfigError(Sb3TorcsError, ValueError):

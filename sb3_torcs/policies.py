@@ -8,8 +8,6 @@ file can name ``sb3_torcs.policies.SplitHeadPolicy`` without an import.
 
 from __future__ import annotations
 
-import os
-import warnings
 from collections.abc import Sequence
 from typing import Any, cast
 
@@ -22,12 +20,12 @@ from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.td3.policies import Actor, TD3Policy
-from torch import nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from sb3_torcs import fast_matmul as matmul
 from sb3_torcs.actions import ACTION_HIGH
-from sb3_torcs.errors import InvalidOption, ModelMismatch, OutputNotWritable
+from sb3_torcs.errors import InvalidOption
+from sb3_torcs.export import export_actor
 from sb3_torcs.networks import HEAD_GAINS, ExactDriver, LateActionCritic, SplitHeadActor
 from sb3_torcs.optimizers import LeanAdam, with_lr_scale
 from sb3_torcs.sensors import OBSERVATION_SIZE
@@ -265,64 +263,6 @@ def _fast_optimizer(kwargs: dict[str, Any]) -> dict[str, Any]:
         options["fused"] = True
         optimizer_class = LeanAdam if optimizer_class is th.optim.Adam else optimizer_class
     return {**kwargs, "optimizer_class": optimizer_class, "optimizer_kwargs": options}
-
-
-class _EnvUnitDriver(nn.Module):
-    """Raw observations to actions in the environment's own units, for export."""
-
-    low: th.Tensor
-    span: th.Tensor
-
-    def __init__(self, driver: ExactDriver, action_space: spaces.Box) -> None:
-        super().__init__()
-        self.driver = driver
-        low = th.as_tensor(action_space.low)
-        self.register_buffer("low", low)
-        self.register_buffer("span", th.as_tensor(action_space.high) - low)
-
-    def forward(self, observation: th.Tensor) -> th.Tensor:
-        # The order of operations is that of BasePolicy.unscale_action: same bits.
-        return self.low + 0.5 * (self.driver(observation) + 1.0) * self.span
-
-
-def export_actor(
-    model: BaseAlgorithm, path: str | os.PathLike[str] | None = None
-) -> th.jit.ScriptModule:
-    """
-    Export the driver as TorchScript, which runs without SB3 and without this package.
-
-    It equals ``model.predict(observation, deterministic=True)``; a model trained behind
-    ``VecNormalize`` expects normalised observations from both.
-
-    :param model: a trained ``DDPG`` or ``TD3``
-    :param path: file to save it in, if it shall be saved
-    :return: a module from observations (n, 29) float32 to actions (n, 3) in the environment's
-        units: steering in [-1, 1], throttle and brake in [0, 1]
-    """
-    policy = model.policy
-    actor = getattr(policy, "actor", None)
-    if not isinstance(actor, Actor):
-        raise ModelMismatch(
-            f"{type(model).__name__} with {type(model.policy).__name__} has no deterministic "
-            "actor to export; pass a DDPG or TD3 model"
-        )
-    driver = policy.exact_driver() if isinstance(policy, SplitHeadPolicy) else ExactDriver(actor)
-    assert isinstance(model.action_space, spaces.Box)
-    module = _EnvUnitDriver(driver, model.action_space).cpu().eval().requires_grad_(False)
-    example = th.as_tensor(model.observation_space.sample())[None]
-    with th.no_grad(), warnings.catch_warnings():
-        # PyTorch deprecates TorchScript, and has nothing else yet that C++ alone can run.
-        warnings.filterwarnings("ignore", "`torch.jit", FutureWarning)
-        script = th.jit.trace(module, example)
-    if path is not None:
-        try:
-            script.save(os.fspath(path))
-        except RuntimeError as error:
-            raise OutputNotWritable(
-                f"{os.fspath(path)!r} cannot be written; pass a file in an existing folder that "
-                "you may write to"
-            ) from error
-    return script
 
 
 def _register(*algorithms: type[BaseAlgorithm]) -> None:

@@ -36,7 +36,7 @@ VOCABULARY = {"car", "tracks", "sensors", "actions", "rewards", "scr_protocol"}
 STEP_AND_RESET = VOCABULARY | {"backends", "envs", "track_random"}
 LEARNING = {
     "policies", "networks", "optimizers", "fast_matmul", "noise", "callbacks", "driving_metrics",
-    "mirror", "progress", "keeping",
+    "mirror", "progress", "export", "keeping",
 }  # fmt: skip
 GRAPHICS = {"highway", "scenery", "hud", "rendering", "film", "game_view", "watching"}
 STARTS_PROGRAMS = {"game_process.py", "display.py", "text_mode.py", "cli/install_torcs.py"}

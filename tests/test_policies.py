@@ -18,10 +18,10 @@ from toy import ToyRace
 
 from sb3_torcs import fast_matmul
 from sb3_torcs.bench_policy import PlainSplitHeadPolicy, measure, updater
-from sb3_torcs.errors import InvalidOption, ModelMismatch, OutputNotWritable
+from sb3_torcs.errors import InvalidOption
 from sb3_torcs.mirror import mirror_actions, mirror_observations
 from sb3_torcs.optimizers import LeanAdam
-from sb3_torcs.policies import SplitHeadPolicy, export_actor
+from sb3_torcs.policies import SplitHeadPolicy
 
 SMALL = [16, 24]
 OBSERVATIONS = np.random.default_rng(0).uniform(-1, 1, (5, 29)).astype(np.float32)
@@ -401,43 +401,6 @@ def test_the_alias_belongs_to_ddpg_and_td3_only():
     assert DDPG.policy_aliases["SplitHeadPolicy"] is SplitHeadPolicy
     assert TD3.policy_aliases["SplitHeadPolicy"] is SplitHeadPolicy
     assert "SplitHeadPolicy" not in PPO.policy_aliases
-
-
-@pytest.mark.parametrize("symmetric", [False, True])
-@pytest.mark.parametrize("algorithm", [DDPG, TD3])
-def test_the_export_is_the_driver(tmp_path, algorithm, symmetric):
-    """From raw observations to environment units, equal to predict; any number of rows."""
-    kwargs = {"layer_norm": True, "ema_decay": 0.9, "symmetric": symmetric}
-    model = make_model(algorithm, init_std=0.5, **kwargs)
-    model.learn(20)
-    script = export_actor(model, tmp_path / "driver.pt")
-    code = "import sys, torch; print(torch.jit.load(sys.argv[1])(torch.zeros(2, 29)).tolist())"
-    output = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", code, str(tmp_path / "driver.pt")],
-        check=True, capture_output=True, text=True,
-    )  # fmt: skip
-    zeros = np.zeros((2, 29), np.float32)
-    for observations in (OBSERVATIONS, OBSERVATIONS[:1], zeros):
-        expected, _ = model.predict(observations, deterministic=True)
-        np.testing.assert_array_equal(script(th.as_tensor(observations)).numpy(), expected)
-    assert output.stdout.strip() == str(expected.tolist())
-
-
-def test_the_export_is_a_copy():
-    """Further training must not change a driver that was handed out."""
-    model = make_model()
-    script = export_actor(model)
-    before = script(th.as_tensor(OBSERVATIONS))
-    model.learn(30)
-    assert th.equal(script(th.as_tensor(OBSERVATIONS)), before)
-
-
-def test_an_export_that_cannot_be_is_an_error(tmp_path):
-    """A folder that is not there, and a model without a deterministic actor."""
-    with pytest.raises(OutputNotWritable, match="existing folder"):
-        export_actor(make_model(), tmp_path / "nowhere" / "driver.pt")
-    with pytest.raises(ModelMismatch, match="pass a DDPG or TD3 model"):
-        export_actor(PPO("MlpPolicy", DummyVecEnv([ToyRace]), device="cpu"))
 
 
 # ------------------------------------------------------------------------- other kernels
