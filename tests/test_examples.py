@@ -5,6 +5,7 @@ import json
 import re
 import runpy
 import shlex
+import subprocess
 import sys
 from pathlib import Path
 
@@ -48,6 +49,14 @@ def test_the_scripted_driver_laps_a_track(monkeypatch, capsys):
     out = capsys.readouterr().out
     assert out.startswith("g-track-1: ")
     assert out.endswith("ended by laps\n")
+
+
+def test_the_soak_of_robots_finds_nothing():
+    words = "--robots inferno,bt --tracks alpine-1,dirt-1 --starts 3 --seconds 2 --together"
+    program = [sys.executable, EXAMPLES / "soak_robots.py", *words.split(), "--processes", "1"]
+    soaked = subprocess.run(program, capture_output=True, text=True, check=False)
+    assert soaked.returncode == 0, soaked.stdout
+    assert soaked.stdout.startswith("6 starts: 0 crashed")
 
 
 @pytest.mark.parametrize(

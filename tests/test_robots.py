@@ -10,6 +10,8 @@ import itertools
 
 import pytest
 
+from sb3_torcs.backends.native import AGENT, make_engine
+from sb3_torcs.car import CONTROL_TICK
 from sb3_torcs.errors import InvalidOption, OutputNotWritable, TrackNotFound, UnknownRobot
 from sb3_torcs.robots import MAX_ROBOTS, TELEMETRY_FIELDS, race
 from sb3_torcs.text_mode import run as run_game
@@ -129,6 +131,33 @@ class TestTelemetry:
     def test_a_folder_that_is_not_there(self, game, tmp_path):
         with pytest.raises(OutputNotWritable, match="choose another file"):
             race([("bt", 3)], "dirt-1", 1, telemetry=tmp_path / "nowhere" / "drive.csv")
+
+
+class TestStartsElsewhere:
+    @pytest.mark.parametrize("robot", ROBOTS)
+    @pytest.mark.parametrize("track", ["aalborg", "michigan"])
+    def test_robots_drive_on_from_there(self, game, robot, track):
+        """They look on the whole road for their place when a race begins, and later only nearby."""
+        engine = make_engine(game, track, [game.parse_robot(robot), AGENT], session="race")
+        length = engine.track_summary()["length"]
+        engine.start()
+        while not engine.laps(0):
+            engine.step(0.0, 0.0, 1.0, None, 50)
+        ((lap, _),) = engine.laps(0)
+        for share in (0.4, 0.9):
+            engine.start_at(share * length, 0.0, 0.0, 0.0)
+            engine.step(0.0, 0.0, 1.0, None, int(lap / CONTROL_TICK))
+            assert engine.read(0).distance_raced > 0.9 * length
+
+    def test_every_start_is_the_same_race(self, game):
+        field = [("inferno", 3), ("inferno", 4), ("berniw", 3), ("bt", 2), AGENT]
+        engine = make_engine(game, "alpine-1", field, session="race")
+        drives = []
+        for start in [(900.0, 0.0, 0.0, 20.0), (4000.0, 0.0, 0.0, 0.0), (900.0, 0.0, 0.0, 20.0)]:
+            engine.start_at(*start)
+            engine.step(0.0, 0.5, 0.0, None, 200)
+            drives.append([engine.read(car).x for car in range(len(field))])
+        assert drives[0] == drives[2] != drives[1]
 
 
 class TestRefusals:

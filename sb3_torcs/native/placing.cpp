@@ -75,7 +75,7 @@ void settle(const Field& field, Situation& situation, int steps, bool in_gear) {
     for (int i = 0; i < steps; i++) field.simulation->update(&situation, PHYSICS_STEP, -1);
 }
 
-std::vector<double> put_down(const Field& field, Situation& situation, const Start& start,
+std::vector<double> put_down(const Field& field, const Start& start,
                              const std::vector<float>& rest_heights) {
     const TrackData& track = *field.manager->track;
     const double from = distance_from_start(field.cars[field.agent]);
@@ -95,9 +95,12 @@ std::vector<double> put_down(const Field& field, Situation& situation, const Sta
               rest_heights[static_cast<std::size_t>(i)]);
         car.control.gear = gear_for(field, car, start.speed);  // engages while the car settles
     }
+    return distances;
+}
+
+void come_to_rest(const Field& field, Situation& situation) {
     field.simulation->update(&situation, PHYSICS_STEP, -1);
     settle(field, situation, SETTLING_STEPS, true);
-    return distances;
 }
 
 // The collision library finds no way out of what was never apart: not a number comes of it.

@@ -43,11 +43,14 @@ float height_over_road(const Field& field, const CarElement& car);  // [m] of th
 // All stand on the brake for some steps, in neutral or in the gear that was put in before.
 void settle(const Field& field, Situation& situation, int steps, bool in_gear);
 
-// Puts down cars that are on the grid, each at the height at which it stands, and lets them come to
-// rest in the gear for the speed. Returns where each is on the road [m], without rounds taken off:
-// it can be before the start line, or a lap further.
-std::vector<double> put_down(const Field& field, Situation& situation, const Start& start,
+// Puts down cars that are on the grid, each at the height at which it stands, in the gear for the
+// speed. Returns where each is on the road [m], without rounds taken off: it can be before the start
+// line, or a lap further. Drivers are to be told of the race then, and not before.
+std::vector<double> put_down(const Field& field, const Start& start,
                              const std::vector<float>& rest_heights);
+
+// Lets cars that were put down come to rest.
+void come_to_rest(const Field& field, Situation& situation);
 
 // The first car that stands in a wall or in another car; none if all can drive off.
 const CarElement* stuck_car(const Field& field);

@@ -401,13 +401,19 @@ void Race::assign_pits() {
 
 // ---- The start ----------------------------------------------------------------------------------
 
-void Race::prepare() {
-    Hosted hosted(host_);
+// Robots look here where on the road they are, and later only around where they have been: the cars
+// must stand where the race begins, and a robot that was told of one race bears no second one.
+void Race::announce() {
     for (int i = 0; i < cars_number(); i++) {
         CarElement& car = world_->cars[i];
         car.robot->new_race(car.robot->index, &car, &world_->situation);
     }
-    ready_ = save();
+}
+
+void Race::prepare() {
+    Hosted hosted(host_);
+    unannounced_ = save();
+    announce();
     simulation_.update(&world_->situation, PHYSICS_STEP, -1);
     for (int i = 0; i < cars_number(); i++) world_->records[i].previous = world_->cars[i].pub.track;
     settle(field(), world_->situation, SETTLING_STEPS, false);
@@ -429,7 +435,7 @@ void Race::prepare() {
 void Race::start() { restore(on_grid_); }
 
 void Race::start(const Start& start) {
-    restore(ready_);
+    restore(unannounced_);
     try {
         start_elsewhere(start);
     } catch (...) {
@@ -441,7 +447,12 @@ void Race::start(const Start& start) {
 void Race::start_elsewhere(const Start& start) {
     Hosted hosted(host_);
     Situation& situation = world_->situation;
-    const std::vector<double> distances = put_down(field(), situation, start, rest_heights_);
+    const std::vector<double> distances = put_down(field(), start, rest_heights_);
+    {
+        std::lock_guard<std::mutex> lock(game_.mutex);  // robots may read files, as when loaded
+        announce();
+    }
+    come_to_rest(field(), situation);
     if (const CarElement* car = stuck_car(field()))
         throw Error("InvalidOption", std::string(car->info.name) +
                                          " would stand in a wall or in another car; start "

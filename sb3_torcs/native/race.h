@@ -161,6 +161,7 @@ private:
     void place_on_grid(CarElement& car);
     Field field() const;
     void assign_pits();
+    void announce();
     void prepare();
     void start_elsewhere(const Start& start);
 
@@ -207,7 +208,7 @@ private:
     int agent_ = -1;
     int set_up_ = 0;  // drivers that know the track
     std::vector<float> rest_heights_;  // [m] of each car's mass centre over the road, standing
-    Snapshot ready_, on_grid_;
+    Snapshot unannounced_, on_grid_;
 };
 
 }  // namespace torcs

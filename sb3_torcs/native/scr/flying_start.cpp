@@ -30,20 +30,27 @@ FlyingStart& flying_start() {
     return start;
 }
 
-void FlyingStart::put_down(const Simulation& simulation, Situation& situation) {
+void FlyingStart::put_down(const Simulation& simulation, int cars, bool once_more) {
     simulation_ = simulation;
     simulated_ = simulated_cars(simulation);
-    stands_ = flying_ = again_ = false;
-    field_ = {ReInfo->cars, situation.cars_number, 0,         ReInfo,
-              &simulation_, simulated_,            to_global, road_height};
-    wanted_ = find_start();
-    const bool known = track_ == ReInfo->track &&
-                       rest_heights_.size() == static_cast<std::size_t>(field_.number);
-    if (!known) rest_heights_.clear();
-    if (!wanted_ || !known) return;
-    distances_ = torcs::put_down(field_, situation, start_, rest_heights_);
+    field_ = {ReInfo->cars, cars, field_.agent, ReInfo, &simulation_, simulated_, to_global,
+              road_height};
+    stands_ = once_more && wanted_;
+    flying_ = again_ = false;
+    if (stands_) distances_ = torcs::put_down(field_, start_, rest_heights_);
+}
+
+void FlyingStart::come_to_rest(Situation& situation) {
+    if (!stands_) {
+        const bool known = track_ == ReInfo->track &&
+                           rest_heights_.size() == static_cast<std::size_t>(field_.number);
+        if (!known) rest_heights_.clear();
+        wanted_ = find_start();
+        again_ = wanted_ && known;
+        return;
+    }
+    torcs::come_to_rest(field_, situation);
     if (stuck_car(field_)) return refuse("somebody would stand in a wall or in another car");
-    stands_ = true;
     controls_.clear();
     for (int i = 0; i < field_.number; i++) controls_.push_back(field_.cars[i].control);
 }
@@ -62,6 +69,7 @@ bool FlyingStart::find_start() {
 
 void FlyingStart::refuse(const char* reason) {
     refused_ = again_ = true;
+    wanted_ = stands_ = false;
     std::printf("scr_server: no start at %g m, %g across, %g rad, %g m/s: %s; begins on the grid\n",
                 start_.distance, start_.track_position, start_.heading_error, start_.speed, reason);
     std::fflush(stdout);

@@ -1,7 +1,9 @@
 // A race that begins where a client asks for, not on the grid: as Race::start does it.
 //
-// The engine puts the cars on the grid, lets them settle and counts down. The field is moved
-// instead of the settling, and drives off instead of the countdown.
+// The engine puts the cars on the grid, tells the drivers of the race, lets the cars settle and
+// counts down. What a client asks for is known when its driver is told; but all drivers have to be
+// told where they stand. So the race is begun once more, with the field moved before they are told,
+// and drives off instead of the countdown.
 #pragma once
 
 #include <vector>
@@ -12,14 +14,18 @@ namespace torcs::scr {
 
 class FlyingStart {
 public:
-    // Moves the field, if a client asks for it; for cars on the grid that have not settled yet.
-    void put_down(const Simulation& simulation, Situation& situation);
+    // For cars that the engine has just put on the grid: moves them, if the race is begun once more
+    // for that.
+    void put_down(const Simulation& simulation, int cars, bool once_more);
+
+    // Instead of the engine's first step of settling, where the field stands elsewhere.
+    void come_to_rest(Situation& situation);
 
     // Whether the field was moved and waits to drive off.
     bool stands() const { return stands_; }
 
-    // Whether the cars are not where the race shall begin, and must be put on the grid once more.
-    // To be asked when they have settled: it also learns how high they stand.
+    // Whether the cars are not where the race shall begin, so that it has to be begun once more. To
+    // be asked when they have settled: it also learns how high they stand.
     bool misses_grid();
 
     void drive_off(Situation& situation);

@@ -26,12 +26,19 @@ void restart(Leaving reason) {
     why = Leaving::FOR_GOOD;
 }
 
+void put_on_grid(CarElement* car, RaceManager* race) {
+    simulation.config(car, race);
+    const int cars = race->situation->cars_number;
+    if (car == &race->cars[cars - 1])
+        flying_start().put_down(simulation, cars, why == Leaving::UNNOTICED);
+}
+
 void step(Situation* situation, double duration, int telemetry) {
     static int steps = 0;
     if (++steps % WATCH_STEPS == 0) watch_owner();
     FlyingStart& start = flying_start();
     if (situation->state == SETTLING) {
-        if (settling) start.put_down(simulation, *situation);
+        if (settling) start.come_to_rest(*situation);
         settling = false;
         if (!start.stands()) simulation.update(situation, duration, telemetry);
         return;
@@ -53,6 +60,7 @@ void enter_loop() {
     if (ReInfo->simulation.update == step) return;
     settling = true;
     simulation = ReInfo->simulation;
+    ReInfo->simulation.config = put_on_grid;
     ReInfo->simulation.update = step;
 }
 

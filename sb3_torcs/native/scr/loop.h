@@ -1,13 +1,14 @@
 // A place of ours in the race engine's loop, from which a race can begin anew or elsewhere.
 //
-// The engine calls its simulation through a pointer that it exports. Ours stands in its place, is
-// called at every step after the drivers were, and passes the step on. Instead of that it can do
-// what the game's own "Restart Race" does; the engine then goes on as after any start.
+// The engine calls its simulation through pointers that it exports, in whose place ours stand. The
+// one for steps is called at every step after the drivers were, and passes the step on. Instead of
+// that it can do what the game's own "Restart Race" does; the engine then goes on as after any start.
 #pragma once
 
 namespace torcs::scr {
 
-// To be called whenever a race begins: the engine gets its simulation anew for each.
+// To be called whenever a race is loaded, before its cars are put on the grid: the engine gets its
+// simulation anew for each.
 void enter_loop();
 
 // At the next step. Until then nobody is asked any more.

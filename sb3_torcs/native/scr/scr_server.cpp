@@ -15,11 +15,11 @@ Driver& driver(int index) { return drivers()[static_cast<std::size_t>(index)]; }
 // No set-up of our own: the car is as its maker left it.
 void new_track(int index, TrackData* track, void*, void** setup, Situation*) {
     *setup = nullptr;
+    enter_loop();
     driver(index).new_track(index, track);
 }
 
 void new_race(int index, CarElement* car, Situation* situation) {
-    enter_loop();
     driver(index).new_race(car, situation);
 }
 
