@@ -216,11 +216,13 @@ def _ray(place: StudyFolder, jobs: int | None, address: str | None) -> Iterator[
 
 def _remove_scratch(session: Path) -> None:
     """Remove a run's temporary files, and nothing else, whatever the file that names them says."""
-    if session.is_file():
+    if not session.is_file():
+        return
+    with contextlib.suppress(OSError, ValueError):  # damaged, or naming what cannot be
         folder = Path(session.read_text(encoding="utf-8"))
         if (folder / MARK).is_file():
             shutil.rmtree(folder, ignore_errors=True)
-        session.unlink()
+    session.unlink()
 
 
 def _tune(trials: list[Trial], place: StudyFolder, scratch: Path, progress: Progress) -> None:

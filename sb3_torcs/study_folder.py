@@ -248,11 +248,33 @@ def _rows(file: Path) -> list[dict[str, Any]]:
     return rows
 
 
+NUMBER, MAYBE = (int, float), (int, float, type(None))
+KINDS: dict[str, tuple[type, ...]] = {
+    **dict.fromkeys(("study", "variant", "phase", "track", "end", "ladder"), (str,)),
+    **dict.fromkeys(("seed", "decisions", "episodes", "laps"), (int,)),
+    **dict.fromkeys(("wall_s", "cpu_s", "distance_m", "damage", "return"), NUMBER),
+    **dict.fromkeys(("best_flying_lap_s", "race_time_s"), MAYBE),
+    **dict.fromkeys(("completes", "kept"), (bool,)),
+    "lap_times_s": (list,),
+}
+"""What the values of a row are."""
+
+
 def _table(text: str) -> list[dict[str, Any]]:
     rows: Any = json.loads(text)
     if not isinstance(rows, list) or any(set(FIELDS) - set(row) for row in rows):
         raise ValueError(f"expected a list of rows with {', '.join(FIELDS)}")
+    for number, row in enumerate(rows):
+        for field in FIELDS:
+            if not isinstance(row[field], KINDS[field]):
+                raise ValueError(f"row {number}: {field} is {_short(row[field])}")
     return rows
+
+
+def _short(value: Any) -> str:
+    """Show a value, or the beginning of a long one."""
+    text = repr(value)
+    return text if len(text) <= 40 else f"{text[:40]}…"
 
 
 def _recipe(text: str) -> dict[str, Any]:
@@ -288,7 +310,7 @@ def _parsed(file: Path, parse: Callable[[str], Any]) -> Any:
     """Read a file that was written here."""
     try:
         return parse(file.read_text(encoding="utf-8"))
-    except (OSError, TypeError, ValueError, yaml.YAMLError) as error:
+    except (OSError, TypeError, ValueError, RecursionError, yaml.YAMLError) as error:
         why = " ".join(str(error).split())
         raise StudyError(
             f"'{file}' cannot be read ({why}); repair it, or remove '{file.parent}' to begin "

@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from sb3_torcs import study as study_module
 from sb3_torcs.cli import main
 from sb3_torcs.cli.study import Board
 from sb3_torcs.errors import RayUnavailable, StudyError
@@ -71,8 +72,10 @@ def test_the_table_has_every_evaluation_of_every_trial(undisturbed):
 
 def evaluated(trial):
     """A row of its first evaluation."""
-    row = dict.fromkeys(FIELDS, 0)
-    return {**row, "variant": trial.variant, "seed": trial.seed, "phase": "train", "decisions": 240}
+    words = {"study": "tiny", "variant": trial.variant, "phase": "train", "track": "aalborg"}
+    rest = {"completes": False, "kept": False, "lap_times_s": [], "end": "stuck", "ladder": ""}
+    row = {**dict.fromkeys(FIELDS, 0), **words, **rest}
+    return {**row, "seed": trial.seed, "decisions": 240}
 
 
 @pytest.fixture
@@ -127,6 +130,8 @@ def test_a_full_disk_is_told_and_leaves_everything_as_it_was(begun, tmp_path, mo
         ("rows.json", b'{"a": 1}'),
         ("rows.json", b"[1]"),
         ("rows.json", b"[{}]"),
+        ("rows.json", b"[" * 200_000),
+        ("recipe.yml", b"[" * 20_000),
         ("recipe.yml", b"{\xff"),
         ("recipe.yml", b""),
     ],
@@ -138,6 +143,40 @@ def test_a_damaged_folder_is_told(begun, capsys, name, content):
     err = capsys.readouterr().err
     assert f"small-nets-seed0/{name}' cannot be read (" in err
     assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("decisions", "240"),
+        ("decisions", None),
+        ("phase", 1),
+        ("completes", "yes"),
+        ("lap_times_s", 90.0),
+        ("distance_m", [1]),
+        ("best_flying_lap_s", "fast"),
+        ("track", {"a": 1}),
+    ],
+)
+def test_a_row_with_a_wrong_value_is_told(begun, capsys, field, value):
+    study, place = begun
+    rows = place.of(study.trials[0]) / "rows.json"
+    damaged = json.loads(rows.read_text())
+    damaged[0][field] = value
+    rows.write_text(json.dumps(damaged))
+    assert main(["study", str(study.path), "--folder", str(place.path)]) == 2
+    err = capsys.readouterr().err
+    assert f"rows.json' cannot be read (row 0: {field} is {value!r}); repair it, or remove" in err
+    assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize("content", [b"\xff", b"a\0b", b"/" + b"x" * 5000, b"", b"/tmp"])
+def test_a_damaged_record_of_temporary_files_removes_nothing(tmp_path, content):
+    session = tmp_path / SESSION
+    session.write_bytes(content)
+    study_module._remove_scratch(session)
+    assert not session.exists()
+    assert Path("/tmp").is_dir()
 
 
 def test_what_was_lost_of_a_folder_is_told(begun, capsys):
