@@ -25,7 +25,6 @@ from sb3_torcs.errors import (
 )
 
 __all__ = [
-    "BUILD",
     "HOME_VARIABLE",
     "Game",
     "RobotEntry",
@@ -38,8 +37,6 @@ __all__ = [
 
 HOME_VARIABLE = "SB3_TORCS_HOME"
 INSTALL = "`sb3-torcs install-torcs`"
-BUILD = "make native (in a clone), or: pip install --force-reinstall --no-deps sb3-torcs"
-"""What to type for the extension that drives the game."""
 
 SYSTEM_ROOTS = (Path("/usr"), Path("/usr/local"))
 PREFIXES = ("", "usr", "usr/local")  # inside a root, e.g. that of an unpacked package

@@ -17,8 +17,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from sb3_torcs.building import build_command
 from sb3_torcs.errors import BackendUnavailable, GameFailed, GameIncomplete, GameTimeout
-from sb3_torcs.game import BUILD, Game
+from sb3_torcs.game import Game
 from sb3_torcs.race_file import RACE_FILE, SCR_SERVER, RaceSetup, write_race
 from sb3_torcs.tracks import load_track
 
@@ -171,7 +172,7 @@ def compiled_library(name: str) -> Path:
     """
     file = Path(__file__).parent / f"{name}{sysconfig.get_config_var('EXT_SUFFIX')}"
     if not file.is_file():
-        raise BackendUnavailable(f"there is no {file}; build it with a C++17 compiler: {BUILD}")
+        raise BackendUnavailable(f"there is no {file}; build it: {build_command()}")
     return file
 
 

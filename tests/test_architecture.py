@@ -21,7 +21,7 @@ LONGER_FILES = {
 
 # Lower floors know nothing of higher ones. A name stands for the module or the folder.
 FLOORS = (
-    {"errors", "car"},
+    {"errors", "car", "building"},
     {
         "game", "tracks", "torcs_params", "track_file", "track_xml", "track_random", "track_plot",
         "race_file", "race_results", "game_process", "game_results", "game_window", "display",

@@ -16,7 +16,7 @@ from fake_game import write_game
 from stable_baselines3 import DDPG
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_torcs import __version__, bench, evaluation, game_process, model_record, models
+from sb3_torcs import __version__, bench, building, evaluation, game_process, model_record, models
 from sb3_torcs.cli import VERBS, common, doctor, evaluate, main, recording, train
 from sb3_torcs.cli.train import TrainOptions
 from sb3_torcs.errors import BackendUnavailable, InvalidOption
@@ -719,7 +719,7 @@ def test_the_doctor_names_each_missing_part(capsys, monkeypatch, tmp_path):
     assert found["compiler"]["found"] == "none of no-such-compiler"
     assert found["extension"] == {
         "name": "extension", "ok": False, "found": "sb3_torcs._engine is not built",
-        "fix": doctor.BUILD,
+        "fix": building.build_command(),
     }  # fmt: skip
     assert found["game"]["ok"]
     assert "mud-1.xml: there are no track segments" in found["tracks"]["found"]
@@ -740,7 +740,7 @@ def test_the_doctor_misses_what_only_the_games_own_program_needs(
     assert "`watch --film` and render_mode 'game'" in found["film"]["found"]
     assert "no display; only for `watch`" in found["window"]["found"]
     assert "_scr_server" in found["game libraries"]["found"]
-    assert doctor.BUILD in found["game libraries"]["found"]
+    assert building.build_command() in found["game libraries"]["found"]
 
 
 def test_the_doctor_compares_the_layout(capsys, monkeypatch, game):

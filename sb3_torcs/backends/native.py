@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sb3_torcs.building import build_command
 from sb3_torcs.car import MANY_LAPS, CarState, Controls, FloatArray, Start, checked_laps, is_count
 from sb3_torcs.errors import BackendUnavailable, InvalidOption
-from sb3_torcs.game import BUILD, Game, find_game
+from sb3_torcs.game import Game, find_game
 from sb3_torcs.race_file import SCR_SERVER, SESSIONS, RaceSetup
 from sb3_torcs.sensors import range_finder_angles
 from sb3_torcs.tracks import Track, load_track
@@ -346,7 +347,7 @@ def _extension() -> Any:
         from sb3_torcs import _engine
     except ImportError as error:
         raise BackendUnavailable(
-            f"the extension sb3_torcs._engine does not load ({error}); build it with a C++17 "
-            f"compiler: {BUILD}. The same contract without it is gym.make('sb3_torcs:TorcsLite-v0')"
+            f"the extension sb3_torcs._engine does not load ({error}); TorcsLite-v0 has the same "
+            f"contract without it, and this builds it: {build_command()}"
         ) from error
     return _engine

@@ -13,9 +13,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from sb3_torcs.building import build_command
 from sb3_torcs.cli.common import print_json, quiet_output
 from sb3_torcs.errors import BackendUnavailable, Sb3TorcsError
-from sb3_torcs.game import BUILD, find_game, linker_knows
+from sb3_torcs.game import find_game, linker_knows
 
 __all__ = ["Check", "add_parser", "checks", "run"]
 
@@ -204,9 +205,9 @@ def _extension() -> Check:
     try:
         module = importlib.import_module(EXTENSION)
     except ModuleNotFoundError:
-        return Check("extension", False, f"{EXTENSION} is not built", BUILD)
+        return Check("extension", False, f"{EXTENSION} is not built", build_command())
     except ImportError as error:
-        return Check("extension", False, f"{EXTENSION} does not load: {error}", BUILD)
+        return Check("extension", False, f"{EXTENSION} does not load: {error}", build_command())
     return Check("extension", True, str(module.__file__), None)
 
 
