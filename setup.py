@@ -1,7 +1,6 @@
 """The one thing that setup.cfg cannot say: the engine, which is left out only if one says so."""
 
 import os
-import sys
 from glob import glob
 
 from pybind11.setup_helpers import Pybind11Extension, build_ext
@@ -46,8 +45,7 @@ class BuildEngine(build_ext):
         try:
             super().run()
         except (BaseError, CCompilerError) as error:
-            print(error, file=sys.stderr)
-            raise SystemExit(FAILED) from None
+            raise SystemExit(f"{error}\n{FAILED}") from None
 
 
 def game_library(name: str, *sources: str) -> Extension:

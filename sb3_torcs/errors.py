@@ -195,5 +195,5 @@ def near_miss(name: str, known: Iterable[str]) -> str:
     :param known: the names that exist
     :return: ``"; did you mean 'x'?"``, or ``";"`` when nothing is close; the sentence goes on
     """
-    close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.6)
+    close = difflib.get_close_matches(name, map(str, known), n=1, cutoff=0.6)
     return f"; did you mean '{close[0]}'?" if close else ";"

@@ -139,6 +139,8 @@ def read_config(path: Path) -> dict[str, Entry]:
     if not isinstance(entries, dict) or not entries:
         raise ZooConfigError(f"{path}: expected entries 'ENV-ID: {{key: value}}'")
     for name, entry in entries.items():
+        if not isinstance(name, str):
+            raise ZooConfigError(f"{path}: an entry is called {name!r}; expected a word")
         if not isinstance(entry, dict):
             raise ZooConfigError(f"{Place(path, name)}: expected a mapping, got {entry!r}")
     return entries

@@ -195,6 +195,21 @@ def test_an_argument_of_the_normalization_that_it_does_not_have_is_unknown(tmp_p
     accepted({"normalize": True})
 
 
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("null: {a: 1}", "an entry is called None; expected a word"),
+        ("1.5: {a: 1}", "an entry is called 1.5; expected a word"),
+        ("[" * 20_000, "not YAML"),
+    ],
+)
+def test_a_damaged_file_is_told(tmp_path, text, said):
+    file = tmp_path / "x.yml"
+    file.write_text(text)
+    with pytest.raises(ZooConfigError, match=said):
+        zoo.read_entry(file, "Torcs-v0")
+
+
 @pytest.mark.parametrize("steps", ["abc", 0, -5, True, None, float("inf")])
 def test_the_budget_must_be_a_number(tmp_path, steps):
     said = complaint(tmp_path, {"n_timesteps": steps})
