@@ -34,6 +34,7 @@ __all__ = [
     "RayUnavailable",
     "RobotUnavailable",
     "Sb3TorcsError",
+    "SceneryMissing",
     "ServerLost",
     "ServerNotFound",
     "StudyError",
@@ -57,6 +58,10 @@ class TrackNotFound(Sb3TorcsError, LookupError):
 
 class TrackFileError(Sb3TorcsError, ValueError):
     """A track file cannot be read; the message names the file and the line."""
+
+
+class SceneryMissing(Sb3TorcsError, LookupError):
+    """The game's window cannot draw a track; the message names the file that it would need."""
 
 
 class InvalidOption(Sb3TorcsError, ValueError):

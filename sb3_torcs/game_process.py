@@ -20,6 +20,7 @@ from pathlib import Path
 from sb3_torcs.building import build_command
 from sb3_torcs.errors import BackendUnavailable, GameFailed, GameIncomplete, GameTimeout
 from sb3_torcs.game import Game
+from sb3_torcs.game_scenery import Scenery, find_scenery
 from sb3_torcs.race_file import RACE_FILE, SCR_SERVER, RaceSetup, write_race
 from sb3_torcs.tracks import load_track
 
@@ -46,6 +47,7 @@ class GameProcess:
     :param files: texts for the private folder, by their place in it
     :raises TrackNotFound: if the game has no such track
     :raises TrackFileError: if the track's file is broken
+    :raises SceneryMissing: if there is a window, and the game cannot draw the track
     :raises UnknownRobot: if the game has no such robot
     :raises UnknownCar: if the game has not the car of a driver
     :raises GameIncomplete: if the game lacks its program, or a file that a race needs
@@ -73,9 +75,14 @@ class GameProcess:
                 game.find_car(race.car)
             else:
                 game.find_robot(name, index)
+        self._own_scenery: Path | None = None
         self.folder = Path(tempfile.mkdtemp(prefix=PREFIX))
         try:
-            data, race = _data(game, self.folder, race)
+            track = _track_file(game, race)
+            scenery = None if preload is None else find_scenery(game, track)
+            if scenery is not None and _is_own(race):
+                self._own_scenery = scenery.folder
+            data, race = _data(game, self.folder, race, track, scenery)
             libraries = _libraries(game, self.folder, race)
             self.race_name = write_race(game, self.folder, race)
             for file, text in (files or {}).items():
@@ -140,7 +147,10 @@ class GameProcess:
         how = f"exit status {status}"
         if status is not None and status < 0:
             how = signal.Signals(-status).name
-        return f"the game ended with {how}; it last said: {self.last_words()}"
+        hint = ""
+        if status == -signal.SIGSEGV and self._own_scenery is not None:
+            hint = f"; perhaps a file of the track's scenery in {self._own_scenery} is broken"
+        return f"the game ended with {how}; it last said: {self.last_words()}{hint}"
 
     def last_words(self) -> str:
         """Return the last lines that the game printed, as one."""
@@ -193,29 +203,59 @@ def game_environment(game: Game, folder: Path) -> dict[str, str]:
     }
 
 
-def _data(game: Game, folder: Path, race: RaceSetup) -> tuple[Path, RaceSetup]:
+def _is_own(race: RaceSetup) -> bool:
+    """
+    Say whether the track is a file of the user's, not one of the game's.
+
+    :param race: with the track
+    """
+    return os.fspath(race.track).lower().endswith(".xml")
+
+
+def _track_file(game: Game, race: RaceSetup) -> Path:
+    """
+    Find the file of the track.
+
+    :param game: the installation
+    :param race: with the track
+    :return: its path, absolute
+    """
+    if not _is_own(race):
+        return game.tracks()[game.find_track(os.fspath(race.track))].absolute()
+    file = Path(os.path.expanduser(race.track)).absolute()
+    load_track(file)  # the game would end without a word
+    return file
+
+
+def _data(
+    game: Game, folder: Path, race: RaceSetup, file: Path, scenery: Scenery | None
+) -> tuple[Path, RaceSetup]:
     """
     Say where the game finds the track: in its own data, or in a folder that also has a user's.
 
     :param game: the installation
     :param folder: private to the game
     :param race: who races where
+    :param file: of the track
+    :param scenery: of the track, if it is drawn
     :return: the folder of data, and the race with its track as ``category/name``
     """
-    track = os.fspath(race.track)
-    if not track.lower().endswith(".xml"):
-        return game.data, replace(race, track=game.find_track(track))
-    file = Path(os.path.expanduser(track)).absolute()
-    load_track(file)  # the game would end without a word
-    data = folder / "data"
-    (data / "tracks").mkdir(parents=True)
-    _link_all(game.data, data, besides="tracks")
-    _link_all(game.data / "tracks", data / "tracks")
-    own = data / "tracks" / OWN_TRACKS / file.stem
+    name = f"{OWN_TRACKS}/{file.stem}" if _is_own(race) else game.find_track(os.fspath(race.track))
+    place = name if scenery is None else scenery.place
+    if place == name and not _is_own(race):
+        return game.data, replace(race, track=place)
+    data, category = folder / "data", Path(place).parent.name
+    own = data / "tracks" / place
     own.mkdir(parents=True)
-    _link_all(file.parent, own, besides=file.name)
+    _link_all(game.data, data, besides="tracks")
+    _link_all(game.data / "tracks", data / "tracks", besides=category)
+    if (game.data / "tracks" / category).is_dir():
+        _link_all(game.data / "tracks" / category, own.parent, besides=file.stem)
     (own / f"{file.stem}.xml").symlink_to(file)  # however its suffix is written
-    return data, replace(race, track=f"{OWN_TRACKS}/{file.stem}")
+    _link_all(file.parent, own, besides=file.name)
+    if scenery is not None and scenery.folder != file.parent:
+        _link_all(scenery.folder, own, besides=f"{scenery.folder.name}.xml")
+    return data, replace(race, track=place)
 
 
 def _libraries(game: Game, folder: Path, race: RaceSetup) -> Path:
@@ -243,11 +283,11 @@ def _link_all(source: Path, target: Path, besides: str = "") -> None:
     Link to everything in a folder.
 
     :param source: the folder
-    :param target: where the links are put
+    :param target: where the links are put; what is there stays
     :param besides: a name to leave out
     """
     for path in source.iterdir():
-        if path.name != besides:
+        if path.name != besides and not os.path.lexists(target / path.name):
             (target / path.name).symlink_to(path)
 
 

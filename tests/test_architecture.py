@@ -24,7 +24,8 @@ FLOORS = (
     {"errors", "car", "building"},
     {
         "game", "tracks", "torcs_params", "track_file", "track_xml", "track_random", "track_plot",
-        "race_file", "race_results", "game_process", "game_results", "game_window", "display",
+        "race_file", "race_results", "game_process", "game_results", "game_window",
+        "game_scenery", "display",
     },
     {"sensors", "actions", "rewards", "scr_protocol"},
     {"scr_client", "scr_game"},

@@ -11,13 +11,14 @@ import numpy as np
 import numpy.typing as npt
 
 from sb3_torcs.backends.base import Backend
-from sb3_torcs.backends.native import NativeBackend
+from sb3_torcs.backends.native import NativeBackend, track_path
 from sb3_torcs.backends.scr import ScrBackend
 from sb3_torcs.backends.several import SeveralTracks, is_several
 from sb3_torcs.car import is_count
 from sb3_torcs.envs.racing import RacingEnv
 from sb3_torcs.errors import EnvClosed, InvalidOption, near_miss
 from sb3_torcs.game import find_game
+from sb3_torcs.game_scenery import find_scenery
 from sb3_torcs.game_window import Window
 
 __all__ = ["TorcsEnv"]
@@ -70,6 +71,7 @@ class TorcsEnv(RacingEnv):
         elsewhere than on the grid; ``None`` starts a game where ``"scr"`` needs one
     :param port: of the driver there; ``None`` is 3001, the first one
     :raises BackendUnavailable: if the game or the extension is missing, or not as expected
+    :raises SceneryMissing: if the game shall draw a track, and cannot
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012
@@ -115,6 +117,9 @@ class TorcsEnv(RacingEnv):
             )
         if self.picture == "game" and is_several(track):
             raise InvalidOption("picture 'game' is for one track; give one, not a list")
+        if self.picture == "game":
+            one: Any = track
+            find_scenery(find_game(), track_path(find_game(), one))
         super().__init__(
             _world(
                 backend,

@@ -91,6 +91,7 @@ torcs::Owner& owner() {
 // The program calls this one after it has opened its window.
 INSTEAD void TorcsEntry() {
     std::signal(SIGPIPE, SIG_IGN);
+    std::setvbuf(stdout, nullptr, _IOLBF, 0);  // a crash shall not swallow what was said
     window::owner();  // made before what is called at the exit, and so there for it
     // Without its display the program ends at once.
     std::atexit([] { window::owner().await_end(std::chrono::milliseconds(500)); });
