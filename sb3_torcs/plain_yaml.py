@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import yaml
 
 __all__ = ["read_yaml"]
 
-MAX_LENGTH = 2**17  # [characters] some two seconds of reading
+MAX_LENGTH = 2**16  # [characters] a second of reading
+MAX_BRACKETS = 100  # that are open at once: PyYAML takes their number squared
 MAX_NODES = 100_000  # with each alias written out
 
 
@@ -23,6 +25,9 @@ def read_yaml(text: str, loader_class: type[yaml.SafeLoader] = yaml.SafeLoader) 
     """
     if len(text) > MAX_LENGTH:
         raise yaml.YAMLError(f"{len(text)} characters; at most {MAX_LENGTH} are read")
+    steps = ((char in "[{") - (char in "]}") for char in text)
+    if max(itertools.accumulate(steps), default=0) > MAX_BRACKETS:
+        raise yaml.YAMLError("it nests too deep")
     loader = loader_class(text)
     try:
         node = loader.get_single_node()

@@ -19,7 +19,9 @@ import yaml
 
 from sb3_torcs import zoo
 from sb3_torcs.errors import StudyError, near_miss
+from sb3_torcs.plain_yaml import read_yaml
 from sb3_torcs.tracks import available_tracks, load_track
+from sb3_torcs.zoo_data import as_data
 
 __all__ = ["FIELDS", "Study", "Trial", "merged", "read_study", "track_name"]
 
@@ -186,18 +188,18 @@ def _read(file: Path) -> dict[str, Any]:
     try:
         if not file.is_file():
             raise StudyError(f"there is no study file '{file}'; give a .yml file")
-        said = yaml.load(file.read_text(encoding="utf-8"), Loader=_Once)
+        said = read_yaml(file.read_text(encoding="utf-8"), _Once)
     except OSError as error:
         raise StudyError(f"{file} cannot be read: {error.strerror or error}") from error
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         line = f", line {mark.line + 1}" if mark else ""
         raise StudyError(f"{file}{line}: not YAML: {error.problem or error.context}") from error
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
         why = " ".join(str(error).split())
         raise StudyError(f"{file}: not YAML: {why}") from error
     if not isinstance(said, dict):
-        raise StudyError(f"{file}: expected 'key: value' lines, got {said!r}")
+        raise StudyError(f"{file}: expected 'key: value' lines, got {said!r:.80}")
     return said
 
 
@@ -237,6 +239,7 @@ def _trials(
         entry = merged(entry, {key: value for key, value in changes.items() if key not in SOURCE})
     except StudyError as error:
         raise StudyError(f"{place}: {error}") from None
+    entry = as_data(entry)
     zoo.check_entry(entry, algo, env_id, place)
     entry["n_timesteps"] = zoo.decisions(entry)
     _check_evaluable(entry, place)

@@ -28,6 +28,7 @@ import yaml
 
 from sb3_torcs.errors import OutputNotWritable, StudyError
 from sb3_torcs.models import BEST_MODEL
+from sb3_torcs.plain_yaml import read_yaml
 from sb3_torcs.study_file import FIELDS, Study, Trial, track_name
 
 __all__ = ["RECIPE", "RESULTS", "ROWS", "Files", "StudyFolder", "write_whole"]
@@ -278,7 +279,7 @@ def _short(value: Any) -> str:
 
 
 def _recipe(text: str) -> dict[str, Any]:
-    recipe: Any = yaml.safe_load(text)
+    recipe: Any = read_yaml(text)
     if not isinstance(recipe, dict) or "study" not in recipe:
         raise ValueError("expected 'key: value' lines, study among them")
     return recipe

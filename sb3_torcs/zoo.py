@@ -6,7 +6,6 @@ entry is read by the same rules, and what nothing would read is an error that na
 
 from __future__ import annotations
 
-import copy
 import importlib
 import importlib.util
 import inspect
@@ -23,7 +22,9 @@ import yaml
 
 from sb3_torcs.car import is_count, is_number
 from sb3_torcs.errors import ZooConfigError, near_miss
+from sb3_torcs.plain_yaml import read_yaml
 from sb3_torcs.sensors import look_both_ways, range_finder_angles
+from sb3_torcs.zoo_data import as_data, check_class, check_data
 
 __all__ = [
     "TIME_LIMIT",
@@ -130,8 +131,8 @@ def read_config(path: Path) -> dict[str, Entry]:
     :raises ZooConfigError: if it is not a mapping of mappings
     """
     try:
-        entries = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+        entries = read_yaml(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
         mark = getattr(error, "problem_mark", None)
         line = f", line {mark.line + 1}" if mark else ""
         problem = getattr(error, "problem", None) or error
@@ -142,7 +143,7 @@ def read_config(path: Path) -> dict[str, Entry]:
         if not isinstance(name, str):
             raise ZooConfigError(f"{path}: an entry is called {name!r}; expected a word")
         if not isinstance(entry, dict):
-            raise ZooConfigError(f"{Place(path, name)}: expected a mapping, got {entry!r}")
+            raise ZooConfigError(f"{Place(path, name)}: expected a mapping, got {entry!r:.80}")
     return entries
 
 
@@ -162,10 +163,10 @@ def read_entry(path: Path, name: str) -> Entry:
         raise ZooConfigError(
             f"{path} has no entry '{name}'{near_miss(name, entries)} it has: {', '.join(entries)}"
         )
-    return copy.deepcopy(entries[name])
+    return as_data(entries[name])
 
 
-def check_entry(entry: Entry, algo: str, env_id: str, place: Place) -> None:
+def check_entry(entry: Entry, algo: str, env_id: str, place: Place, *, trust: bool = False) -> None:
     """
     Make sure that everything in an entry will be read by something.
 
@@ -173,10 +174,13 @@ def check_entry(entry: Entry, algo: str, env_id: str, place: Place) -> None:
     :param algo: as the zoo calls it
     :param env_id: a registered environment
     :param place: where the entry stands
+    :param trust: let the zoo evaluate strings as Python
     :raises ZooConfigError: for the first thing that nothing would read
     """
     from rl_zoo3.utils import ALGOS
 
+    if not trust:
+        check_data(entry, str(place))
     if algo not in ALGOS:
         raise ZooConfigError(
             f"the RL Zoo has no algorithm '{algo}'{near_miss(algo, ALGOS)} it has: "
@@ -398,7 +402,9 @@ def _imported(path: str, key: str, place: Place) -> Callable[..., Any]:
             f"{place}: {key} '{path}': {module_name} has no '{name}'"
             f"{near_miss(name, vars(module))} correct the dotted path"
         )
-    return getattr(module, name)
+    found = getattr(module, name)
+    check_class(found, path, key, str(place))
+    return found
 
 
 def _arguments(function: Callable[..., Any]) -> set[str] | None:

@@ -58,7 +58,7 @@ class TrainOptions:
         training, and at least 1000 where it has as many
     :param eval_episodes: per evaluation
     :param resume: a saved model (.zip) or a run's folder to go on from
-    :param trust: go on from a model even if nothing tells that a training of ours made it
+    :param trust: go on from a model without a record; evaluate strings of the hyperparameter file
     :param progress: show a progress bar
     :param zoo_args: further words for the RL Zoo; they win
     """
@@ -133,7 +133,12 @@ def add_parser(subparsers: Any) -> None:
         help="go on from a saved model (.zip) or a run's folder, with its --algo and --env; this "
         "runs what is pickled in model and replay buffer: only if you know who made them",
     )
-    add("--trust", action="store_true", help="resume also a model without a record")
+    add(
+        "--trust",
+        action="store_true",
+        help="go on from a model without a record, too; evaluate Python in the "
+        "strings of the hyperparameter file: only if you know who made them",
+    )
     add("--progress", action=argparse.BooleanOptionalAction, default=True, help="progress bar")
     parser.set_defaults(run=run)
 
@@ -246,7 +251,7 @@ def _entry(options: TrainOptions) -> tuple[dict[str, Any], dict[str, Any]]:
     if options.track is not None:
         entry["env_kwargs"] = {**(entry.get("env_kwargs") or {}), "track": options.track}
     changed = {**entry, **_changes(options.zoo_args)}
-    zoo.check_entry(changed, options.algo, options.env, zoo.Place(path, name))
+    zoo.check_entry(changed, options.algo, options.env, zoo.Place(path, name), trust=options.trust)
     return entry, {**changed, "env_kwargs": changed.get("env_kwargs") or {}}
 
 

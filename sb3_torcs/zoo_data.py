@@ -1,0 +1,109 @@
+"""Hyperparameter files as data: nothing in one is evaluated, nor called if it is not of a kind."""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import copy
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import gymnasium as gym
+
+from sb3_torcs.errors import ZooConfigError
+
+__all__ = ["EVALUATED", "as_data", "check_class", "check_data", "plain_python"]
+
+EVALUATED = (
+    "monitor_kwargs", "normalize", "policy_kwargs", "replay_buffer_class", "replay_buffer_kwargs",
+)  # fmt: skip
+"""What the zoo evaluates as Python where it is a string."""
+
+TOO_MUCH = (RecursionError, MemoryError, SyntaxError, TypeError)
+"""What Python's parser raises for a text that is no expression, or nests too deep."""
+
+
+def as_data(entry: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    Turn the strings that the zoo would evaluate into what they stand for, where that is plain.
+
+    :param entry: of a hyperparameter file
+    :return: a copy; strings that are more than data are still there
+    """
+    result = copy.deepcopy(dict(entry))
+    for key in EVALUATED:
+        if isinstance(result.get(key), str):
+            with contextlib.suppress(ValueError):
+                result[key] = plain_python(result[key])
+    return result
+
+
+def check_data(entry: Mapping[str, Any], place: str) -> None:
+    """
+    Make sure that the zoo will evaluate nothing of an entry.
+
+    :param entry: of :func:`as_data`
+    :param place: where it stands, for the message
+    :raises ZooConfigError: if a string is more than data
+    """
+    for key in EVALUATED:
+        if isinstance(entry.get(key), str):
+            raise ZooConfigError(
+                f"{place}: the zoo would evaluate {key}, {entry[key]!r:.80}, as Python; write a "
+                "mapping, as in the shipped files, or train from a file of your own with --trust"
+            )
+
+
+def check_class(found: Callable[..., Any], path: str, key: str, place: str) -> None:
+    """
+    Make sure that a dotted path stands for what its key needs, so that not just anything is called.
+
+    :param found: what was imported
+    :param path: its dotted path
+    :param key: under which it stands
+    :param place: where that is, for the message
+    :raises ZooConfigError: if it is of another kind
+    """
+    from stable_baselines3.common.callbacks import BaseCallback
+    from stable_baselines3.common.policies import BasePolicy
+    from stable_baselines3.common.vec_env import VecEnvWrapper
+
+    kinds: dict[str, type] = {
+        "callback": BaseCallback,
+        "env_wrapper": gym.Wrapper,
+        "policy": BasePolicy,
+        "vec_env_wrapper": VecEnvWrapper,
+    }
+    kind = kinds[key]
+    if not isinstance(found, type) or not issubclass(found, kind):
+        raise ZooConfigError(
+            f"{place}: {key} '{path}' is none: expected a class derived from "
+            f"{kind.__module__}.{kind.__qualname__}"
+        )
+
+
+def plain_python(text: str) -> Any:
+    """
+    Read an expression like ``dict(net_arch=[64, 64])``, as the zoo's own files have them.
+
+    :param text: of literals, in ``{}``, ``[]`` and calls of ``dict``
+    :return: their value; tuples become lists
+    :raises ValueError: if it is anything else: it would have to be evaluated
+    """
+    try:
+        return _value(ast.parse(text.strip(), mode="eval").body)
+    except TOO_MUCH as error:
+        raise ValueError(f"{text!r:.80} is no plain data") from error
+
+
+def _value(node: ast.expr) -> Any:
+    if isinstance(node, ast.List | ast.Tuple):
+        return [_value(item) for item in node.elts]
+    if isinstance(node, ast.Dict) and None not in node.keys:
+        keys = [ast.literal_eval(key) for key in node.keys if key is not None]
+        return dict(zip(keys, map(_value, node.values), strict=True))
+    if isinstance(node, ast.Call) and not node.args and ast.unparse(node.func) == "dict":
+        named = {keyword.arg: keyword.value for keyword in node.keywords}
+        if None not in named:  # of ``**``
+            return {str(name): _value(value) for name, value in named.items()}
+    return ast.literal_eval(node)
