@@ -13,7 +13,8 @@ import subprocess
 import sysconfig
 import tempfile
 import weakref
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -29,7 +30,8 @@ __all__ = ["GameProcess", "compiled_library", "game_environment"]
 PREFIX = "sb3-torcs-game-"  # of private folders
 LAST_LINES = 5  # of the game's words, for an error
 OWN_TRACKS = "own"  # the category of a track that is not the game's
-GRACE = 5.0  # [s] for a killed process to be gone
+GRACE = 5.0  # [s] for a killed process to be gone, or one that was asked to end
+LOOK = 0.1  # [s] between two looks at what the game prints
 
 
 class GameProcess:
@@ -104,6 +106,7 @@ class GameProcess:
         except BaseException:
             shutil.rmtree(self.folder, ignore_errors=True)
             raise
+        self._heard = 0  # [bytes] of what the game printed
         self._end = weakref.finalize(self, _end, self._process, self.folder, os.getpid())
 
     def __enter__(self) -> GameProcess:
@@ -141,6 +144,33 @@ class GameProcess:
         if self._process.returncode != 0:
             raise GameFailed(self.epitaph())
 
+    def follow(self, hear: Callable[[str], None]) -> None:
+        """
+        Wait for the game to end by itself, and pass on what it prints meanwhile.
+
+        :param hear: called with each line, without its end
+        :raises GameFailed: if it ends with an error
+        """
+        while self._process.poll() is None:
+            with suppress(subprocess.TimeoutExpired):
+                self._process.wait(LOOK)
+            self._pass_on(hear)
+        self._pass_on(hear)
+        self.wait()
+
+    def end_race(self) -> None:
+        """
+        End the race as if all had come to its end, so that clients are told and results are kept.
+
+        Only a game with our driver module does so; any other one is killed, and so is one that
+        somebody has paused.
+        """
+        self._process.terminate()
+        try:
+            self._process.wait(GRACE)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+
     def epitaph(self) -> str:
         """Say how the game ended, and what it said last."""
         status = self._process.poll()
@@ -151,6 +181,20 @@ class GameProcess:
         if status == -signal.SIGSEGV and self._own_scenery is not None:
             hint = f"; perhaps a file of the track's scenery in {self._own_scenery} is broken"
         return f"the game ended with {how}; it last said: {self.last_words()}{hint}"
+
+    def _pass_on(self, hear: Callable[[str], None]) -> None:
+        """
+        Pass on the whole lines that the game has printed since the last time.
+
+        :param hear: called with each
+        """
+        with (self.folder / "words").open("rb") as words:
+            words.seek(self._heard)
+            text = words.read()
+        whole = text[: text.rfind(b"\n") + 1]
+        self._heard += len(whole)
+        for line in whole.decode(errors="replace").splitlines():
+            hear(line)
 
     def last_words(self) -> str:
         """Return the last lines that the game printed, as one."""

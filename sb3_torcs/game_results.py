@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 
 from sb3_torcs.errors import GameFailed
 from sb3_torcs.game_process import GameProcess
-from sb3_torcs.race_file import RACE_FILE, RaceSetup
+from sb3_torcs.race_file import RACE_FILE, SCR_SERVER, RaceSetup
 from sb3_torcs.race_results import Lap, RobotResult
 
 __all__ = ["read_results"]
@@ -70,6 +70,7 @@ def _practice_result(
     :param laps: that were asked for
     """
     ordered = sorted(rows.findall("section"), key=_position)
+    client = _text(rows, "driver name") if robot == SCR_SERVER else ""
     driven = [Lap(_number(row, "time"), int(_number(row, "dammages"))) for row in ordered]
     return RobotResult(
         robot, index, car, driven,
@@ -79,6 +80,7 @@ def _practice_result(
         out=len(driven) < laps,
         laps_completed=len(driven),
         best_lap=(_number(ordered[-1], "best lap time") or None) if ordered else None,
+        client=client,
     )  # fmt: skip
 
 
@@ -124,6 +126,7 @@ def _race_result(
         *key, cars[key], laps=[], total_time=_number(row, "time"), rank=rank,
         damage=int(_number(row, "dammages")), out=False,
         laps_completed=int(_number(row, "laps")), best_lap=_number(row, "best lap time") or None,
+        client=_text(row, "name") if key[0] == SCR_SERVER else "",
     )  # fmt: skip
 
 

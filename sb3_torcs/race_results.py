@@ -36,6 +36,7 @@ class RobotResult:
     :param out: whether it was out of the race before the end: wrecked, or out of fuel
     :param laps_completed: number of whole laps
     :param best_lap: of those that count by the rules: no wall touched, no corner cut [s]
+    :param client: the name or the address of the client that drove; empty for a robot
     """
 
     robot: str
@@ -48,3 +49,9 @@ class RobotResult:
     out: bool
     laps_completed: int = field(default=0)
     best_lap: float | None = field(default=None)
+    client: str = field(default="")
+
+    @property
+    def driver(self) -> str:
+        """Who that is, for people."""
+        return self.client or f"{self.robot} {self.index}"

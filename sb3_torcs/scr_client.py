@@ -57,6 +57,7 @@ class ScrClient:
         as long as its port is open. ``None`` is as ``patience`` for both
     :param pause: before an action is said again [s], then twice that, and so on: servers but ours
         take each for the answer to another state, so it should be rare
+    :param name: of the driver, which our own server shows
     :param latencies: to which the time from each state to its answer is added [s], for a server
         that does not wait
     :param watch: called while nothing comes; raises if the server has ended
@@ -72,6 +73,7 @@ class ScrClient:
         patience: float = PATIENCE,
         silence: float | None = None,
         pause: float = PAUSE,
+        name: str = "",
         latencies: array[float] | None = None,
         watch: Callable[[], None] = lambda: None,
     ) -> None:
@@ -85,6 +87,7 @@ class ScrClient:
         self._latencies = latencies
         self._arrived = 0.0
         self._angles = angles
+        self._name = name
         self._patience = patience
         self._pause = pause
         self._watch = watch
@@ -115,7 +118,8 @@ class ScrClient:
         """
         self._taken = b""
         self._drain()
-        if not self._ask(format_init(self._angles, start, exact=True), IDENTIFIED, FIRST_PAUSE):
+        words = format_init(self._angles, start, exact=True, name=self._name)
+        if not self._ask(words, IDENTIFIED, FIRST_PAUSE):
             raise ServerNotFound(
                 f"no SCR server answers at {self.address}, tried for {self._patience:g} s; start "
                 "one with `sb3-torcs serve --track aalborg`, or check --host and --port"

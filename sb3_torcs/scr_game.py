@@ -16,11 +16,13 @@ from sb3_torcs.game_process import GameProcess
 from sb3_torcs.game_window import Window, WindowArguments, window_arguments
 from sb3_torcs.race_file import RaceSetup
 
-__all__ = ["SCR_PORT", "open_ports", "start_server"]
+__all__ = ["SCR_OPTIONS", "SCR_PORT", "open_ports", "start_server"]
 
 SCR_PORT = 3001
 """Of the first driver; the others follow. As the SCR server has it."""
 LAST_PORT = 65535
+SCR_OPTIONS = ("nofuel", "nodamage", "nolaptime", "noisy")
+"""What a server can leave out of a race or add to it, as patched ones call it."""
 
 
 def open_ports(
@@ -62,6 +64,7 @@ def start_server(
     sockets: Sequence[socket.socket],
     *,
     deadline: float | None = None,
+    options: Sequence[str] = (),
     window: Window | None = None,
 ) -> GameProcess:
     """
@@ -71,6 +74,7 @@ def start_server(
     :param race: with ``("scr_server", 0)`` and on among its drivers
     :param sockets: bound, the k-th for driver k; they can be closed here afterwards
     :param deadline: for an answer [s]; ``None`` waits for it, however long it takes
+    :param options: of :data:`SCR_OPTIONS`
     :param window: in which the race is shown or filmed; ``None`` runs it without one
     :return: the game; its clients are awaited now
     """
@@ -82,5 +86,6 @@ def start_server(
     arguments["environment"] |= {
         "SB3_TORCS_SCR_SOCKETS": ",".join(str(number) for number in numbers),
         "SB3_TORCS_SCR_DEADLINE": "wait" if deadline is None else f"{deadline * 1e6:.0f}",
+        "SB3_TORCS_SCR_OPTIONS": ",".join(options),
     }
     return GameProcess(game, race, **arguments)

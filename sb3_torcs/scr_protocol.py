@@ -36,6 +36,7 @@ __all__ = [
     "parse_engine",
     "parse_init",
     "parse_state",
+    "plain_name",
 ]
 
 IDENTIFIED = b"***identified***"
@@ -52,6 +53,7 @@ RPM = 10.0  # the server's "rpm" per rad/s
 DIGITS = 6  # of the server's numbers
 EXACT_DIGITS = 17  # that tell one double from every other
 HIGHEST_GEAR = 8  # the game has room for no more
+LONGEST_NAME = 31  # [characters] of a driver, in the game
 
 
 class ScrState(NamedTuple):
@@ -97,6 +99,7 @@ class ScrInit(NamedTuple):
     angles: tuple[float, ...]  # (19,) [rad] of the range finders, left negative
     start: Start | None = None  # where to begin; servers but ours ignore it
     exact: bool = False  # whether states shall have all digits; servers but ours ignore it
+    name: str = ""  # of the driver; servers but ours ignore it
 
 
 class EngineReading(NamedTuple):
@@ -147,6 +150,7 @@ _pick_names = itemgetter(*_BEGINS)
 _pick_numbers = itemgetter(*(word for word in range(_WORDS) if word not in _BEGINS))
 
 _GROUP = re.compile(rb"\s*\(([^()]*)\)")
+_STRANGE = re.compile(r"[^A-Za-z0-9_.:+@ -]")
 _SPACE = re.compile(rb"\s*")
 _ENGINE = (b"(curLapTime ", b"(gear ", b"(rpm ")
 
@@ -215,7 +219,10 @@ def format_state(state: ScrState) -> bytes:
 
 
 def format_init(
-    angles: FloatArray | Sequence[float], start: Start | None = None, exact: bool = False
+    angles: FloatArray | Sequence[float],
+    start: Start | None = None,
+    exact: bool = False,
+    name: str = "",
 ) -> bytes:
     """
     Write the message by which a client introduces itself.
@@ -223,12 +230,24 @@ def format_init(
     :param angles: (19,) of the range finders [rad], left negative
     :param start: where to begin, if not on the grid; only our own server does that
     :param exact: ask for all digits, not six; only our own server does that
+    :param name: of the driver, for boards and results; only our own server shows it
     :return: a datagram
     """
     words = " ".join(f"{math.degrees(angle):.12g}" for angle in angles)
     where = "" if start is None else " (start {!r} {!r} {!r} {!r})".format(*map(float, start))
     digits = f" (digits {EXACT_DIGITS})" if exact else ""
-    return f"SCR(init {words}){where}{digits}".encode() + b"\0"
+    own = f" (name {plain_name(name)})" if name else ""
+    return f"SCR(init {words}){where}{digits}{own}".encode() + b"\0"
+
+
+def plain_name(name: str) -> str:
+    """
+    Write a driver's name with what the game can draw.
+
+    :param name: any text
+    :return: at most 31 letters, digits, spaces and ``-_.:+@``; others become ``_``
+    """
+    return _STRANGE.sub("_", " ".join(name.split()))[:LONGEST_NAME].strip()
 
 
 def parse_init(message: bytes) -> ScrInit:
@@ -243,7 +262,7 @@ def parse_init(message: bytes) -> ScrInit:
         raise _broken("expected SCR(init ...)", message)
     _, opening, text = message.partition(b"\0")[0].partition(b"(")
     degrees: Sequence[float] = range(-90, 91, 10)
-    start, exact = None, False
+    start, exact, own = None, False, ""
     for name, words in _groups(opening + text) if opening else ():
         if name == b"init" and words:
             degrees = _numbers(name, words, 19)
@@ -251,7 +270,9 @@ def parse_init(message: bytes) -> ScrInit:
             start = Start(*_numbers(name, words, 4))
         elif name == b"digits":
             exact = _numbers(name, words, 1)[0] > DIGITS
-    return ScrInit(tuple(map(math.radians, degrees)), start, exact)
+        elif name == b"name":
+            own = plain_name(b" ".join(words).decode(errors="replace"))
+    return ScrInit(tuple(map(math.radians, degrees)), start, exact, own)
 
 
 def format_action(action: ScrAction) -> bytes:

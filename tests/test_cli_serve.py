@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -75,8 +76,8 @@ def test_a_client_drives_a_race_to_its_end(folder):
     out, err = process.communicate(timeout=PATIENCE)
     assert process.returncode == 0, err
     assert f"awaiting SCR clients at 127.0.0.1, UDP port {port}; the game waits" in out
-    assert f"scr_server 0: {client.answers} decisions, 0 late" in out
-    assert "scr_server 0, car1-trb1, a-speedway" in out
+    assert f"scr_server 0: {client.address}: {client.answers} decisions, 0 late" in out
+    assert f"{client.address}, car1-trb1, a-speedway" in out
 
 
 def test_two_clients_race_against_a_robot(folder):
@@ -95,8 +96,8 @@ def test_two_clients_race_against_a_robot(folder):
     assert process.returncode == 0, err
     assert f"UDP ports {port} to {port + 1}" in out
     assert "race on michigan" in out
-    assert "155-DTM" in out
-    assert "inferno" in out
+    names = re.findall(r"^ +[123]  (\S+)(?: 3)? +(?:155-DTM|car1-trb1) ", out, re.MULTILINE)
+    assert sorted(names) == sorted([one.address, other.address, "inferno"])
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
@@ -109,6 +110,8 @@ def test_whatever_ends_it_nothing_is_left(folder, number):
         assert len(games_of(folder)) == 1
         process.send_signal(number)
         _, err = process.communicate(timeout=PATIENCE)
+        if number != signal.SIGKILL:
+            assert client.last() == b"***shutdown***\0"
         ends = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGKILL: -9}
         assert process.returncode == ends[number]
         if number == signal.SIGINT:
@@ -129,10 +132,64 @@ def test_a_client_that_thinks_too_long_loses_ticks_and_is_told(folder):
     out, err = process.communicate(timeout=PATIENCE)
     assert process.returncode == 0, err
     assert "2 ms per answer" in out
-    (line,) = [line for line in out.splitlines() if line.startswith("scr_server 0:")]
-    decisions, late = (int(word) for word in line.split() if word.isdigit())
+    (told,) = re.findall(r"^scr_server 0: .*: (\d+) decisions, (\d+) late", out, re.MULTILINE)
+    decisions, late = map(int, told)
     assert late >= 40
     assert decisions > client.answers
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_what_was_driven_until_it_is_ended_is_told(folder, number):
+    port = free_ports(2)
+    words = ("--track", "a-speedway", "--drivers", "2", "--robots", "inferno", "--laps", "9")
+    process = serve(folder, port, *words, "--wait")
+    with ThirdParty(port) as one, ThirdParty(port + 1) as other:
+        one.identify()
+        other.identify()
+        for _ in range(100):
+            one.drive(1)
+            other.drive(1)
+        process.send_signal(number)
+        out, _ = process.communicate(timeout=PATIENCE)
+        assert one.last() == other.last() == b"***shutdown***\0"
+    assert re.search(rf"scr_server 0: {one.address}: 10\d decisions, 0 late", out)
+    assert "the race was ended early:\nrace on a-speedway\n" in out
+    results = out.partition("the race was ended early")[2]
+    assert results.count(" no\n") == 3  # nobody is out
+    assert other.address in results
+
+
+def test_what_clients_do_wrong_is_told_while_the_race_runs(folder):
+    port = free_ports()
+    process = serve(folder, port, "--wait")
+    assert "awaiting SCR clients" in process.stdout.readline()
+    with ThirdParty(port) as client, ThirdParty(port) as stranger:
+        client.identify()
+        assert f"{client.address} drives" in process.stdout.readline()
+        stranger.socket.sendto(b"XYZ(init)", stranger.server)
+        client.drive(1)
+        assert f"{stranger.address} says 'XYZ(init)', not SCR(init" in process.stdout.readline()
+        stranger.socket.sendto(b"SCR(init)", stranger.server)
+        client.drive(1)
+        assert f"{stranger.address} wants to drive, but" in process.stdout.readline()
+        process.send_signal(signal.SIGTERM)
+        process.communicate(timeout=PATIENCE)
+
+
+def test_options_of_other_servers_are_there(folder):
+    port = free_ports()
+    words = ("--no-fuel", "--no-damage", "--no-lap-limit", "--noisy", "--track", "a-speedway")
+    process = serve(folder, port, *words, "--laps", "1", "--wait")
+    with ThirdParty(port) as client:
+        client.identify()
+        message = client.socket.recv(2000)
+        fuel = re.search(rb"\(fuel \S+\)", message)[0]
+        assert len(set(re.search(rb"\(track ([^)]*)\)", message)[1].split())) == 19  # they err
+        client.socket.sendto(client.action(message), client.server)
+        client.drive(400)
+        assert fuel in client.socket.recv(2000)
+        process.send_signal(signal.SIGTERM)
+        process.communicate(timeout=PATIENCE)
 
 
 def test_a_window_shows_the_race(folder):

@@ -26,6 +26,7 @@ from sb3_torcs.scr_protocol import (
     parse_engine,
     parse_init,
     parse_state,
+    plain_name,
 )
 
 FUZZ = runpy.run_path(str(Path(__file__).parent.parent / "examples" / "fuzz_scr.py"))
@@ -116,7 +117,22 @@ def test_a_literal_introduction_is_written_and_read():
 def test_without_angles_they_are_ten_degrees_apart():
     expected = tuple(math.radians(angle) for angle in range(-90, 91, 10))
     for text in (b"SCR", b"SCR(init)", b"SCR\0", b"SCRAPHEAP"):
-        assert parse_init(text) == (expected, None, False)
+        assert parse_init(text) == (expected, None, False, "")
+
+
+@pytest.mark.parametrize(
+    ("given", "plain"),
+    [
+        ("ddpg-aalborg", "ddpg-aalborg"),
+        ("  Ann\tOther ", "Ann Other"),
+        ("Zoë (1)", "Zo_ _1_"),
+        ("x" * 40, "x" * 31),
+        ("", ""),
+    ],
+)
+def test_a_name_is_written_as_the_game_can_draw_it(given, plain):
+    assert plain_name(given) == plain
+    assert parse_init(format_init(np.zeros(19), name=given)).name == plain
 
 
 def test_tags_come_in_any_order_and_unknown_ones_are_passed_over():
@@ -213,11 +229,16 @@ def server_action(text):
     return ScrAction(steering, throttle, brake, gear, clutch, focus, restart, lap_time)
 
 
-@given(st.lists(st.floats(-90.0, 90.0), min_size=19, max_size=19), st.tuples(*[numbers] * 4))
-def test_both_ends_read_the_same_introduction(degrees, start):
-    text = format_init(np.radians(degrees), Start(*start))
+@given(
+    st.lists(st.floats(-90.0, 90.0), min_size=19, max_size=19),
+    st.tuples(*[numbers] * 4),
+    st.text(max_size=40),
+)
+def test_both_ends_read_the_same_introduction(degrees, start, own):
+    text = format_init(np.radians(degrees), Start(*start), name=own)
     init = parse_init(text)
-    angles, where, _exact = _engine.scr_parse_init(text)
+    angles, where, _exact, name = _engine.scr_parse_init(text)
+    assert name == init.name == plain_name(own)
     assert init.start == where == start
     np.testing.assert_allclose(init.angles, angles, rtol=1e-15)
     np.testing.assert_allclose(angles, np.radians(degrees), rtol=1e-11, atol=1e-300)

@@ -54,6 +54,17 @@ class Client:
     def identify(self, start=""):
         assert self.ask(INIT + start) == b"***identified***\0"
 
+    def insist(self):
+        """Introduce itself once a second, as clients do, until the server takes it."""
+        self.socket.settimeout(1.0)
+        until = time.monotonic() + PATIENCE
+        while time.monotonic() < until:
+            with contextlib.suppress(TimeoutError):
+                assert self.ask(INIT) == b"***identified***\0"
+                self.socket.settimeout(PATIENCE)
+                return
+        raise AssertionError("nobody answers")
+
     def restart(self):
         assert self.ask("(meta 1)") == b"***restart***\0"
         self.identify()
@@ -73,12 +84,12 @@ def serve(game):
     """Start a game and its clients, in the order of the drivers."""
     started = []
 
-    def start(drivers=(DRIVER,), track="aalborg", deadline=None, **race):
+    def start(drivers=(DRIVER,), track="aalborg", deadline=None, options=(), **race):
         clients = [index for name, index in drivers if name == "scr_server"]
         session = "practice" if len(drivers) == 1 else "race"
         sockets = open_ports(len(clients))
         setup = RaceSetup(track, drivers, session=session, **race)
-        process = start_server(game, setup, sockets, deadline=deadline)
+        process = start_server(game, setup, sockets, deadline=deadline, options=options)
         ends = [Client(bound.getsockname()[1]) for bound in sockets]
         started.extend([*sockets, *(end.socket for end in ends), process])
         return process, *ends
@@ -197,7 +208,7 @@ class TestTexts:
         assert _engine.scr_parse_action(text) == expected
 
     def test_an_introduction(self):
-        angles, start, _exact = _engine.scr_parse_init(
+        angles, start, _exact, _name = _engine.scr_parse_init(
             b"SCR(init " + b" ".join(b"%d" % i for i in range(19)) + b")"
         )
         assert angles == [math.radians(i) for i in range(19)]
@@ -212,6 +223,19 @@ class TestTexts:
         assert _engine.scr_parse_init(b"SCR(init) (start 1.5 -0.5 0.1 20)")[1] == (
             1.5, -0.5, 0.1, 20.0,
         )  # fmt: skip
+
+    @pytest.mark.parametrize(
+        ("text", "name"),
+        [
+            (b"SCR(init)(name ddpg-aalborg)", "ddpg-aalborg"),
+            (b"SCR(init)(name  Ann  Other )", "Ann  Other"),
+            (b"SCR(init)(name <a&b>/\xff)", "_a_b___"),
+            (b"SCR(init)(name " + b"x" * 40 + b")", "x" * 31),  # as many as the game has room for
+            (b"SCR(init)", ""),
+        ],
+    )
+    def test_an_introduction_with_a_name(self, text, name):
+        assert _engine.scr_parse_init(text)[3] == name
 
     def test_whatever_comes_has_a_meaning(self):
         source = random.Random(2)
@@ -333,7 +357,7 @@ class TestRace:
         assert number(states[-2], "lastLapTime") > 60
         client.nothing_comes()
         process.wait(PATIENCE)
-        told = re.search(r"scr_server 0: (\d+) decisions, 0 late", process.words())
+        told = re.search(r"scr_server 0: [\d.:]+: (\d+) decisions, 0 late", process.words())
         assert told
         assert int(told[1]) == pytest.approx(len(states), abs=2)
 
@@ -612,6 +636,117 @@ def memory(pid):
     return int(re.search(r"VmRSS:\s+(\d+)", Path(f"/proc/{pid}/status").read_text())[1])
 
 
+class TestOptions:
+    """What other servers call -nofuel, -nodamage, -nolaptime and -noisy."""
+
+    INTO_THE_WALL = " (start 300 0.9 0.5 60)"
+
+    def test_without_them_cars_use_fuel_and_take_damage(self, serve):
+        _, client = serve()
+        client.identify(self.INTO_THE_WALL)
+        last = drive(client, client.receive(), 100)[-1]
+        assert number(last, "fuel") < 94
+        assert number(last, "damage") > 0
+
+    def test_no_fuel_is_used(self, serve):
+        _, client = serve(options=["nofuel"])
+        client.identify()
+        states = drive(client, client.receive(), 400)
+        assert {number(state, "fuel") for state in states} == {94.0}
+        assert number(states[-1], "distRaced") > 50.0
+
+    def test_damage_is_told_but_not_taken(self, serve):
+        """Clients learn from it; the car stays as it was, and so say the results."""
+        process, client = serve([DRIVER, ("inferno", 3)], options=["nodamage"], laps=1)
+        client.identify(self.INTO_THE_WALL)
+        last = drive(client, client.receive(), 100)[-1]
+        assert number(last, "damage") > 0
+        client.receive()
+        assert number(client.restart(), "damage") == 0
+        client.identify()
+        process.end_race()
+        text = "".join(f.read_text() for f in (process.folder / "results").rglob("*.xml"))
+        assert set(re.findall(r'"dammages" val="(\d+)"', text)) == {"0"}
+
+    def test_a_slow_lap_goes_on(self, serve):
+        """Who stands is taken out of the race after 343 s on this track; see above."""
+        _, client = serve(options=["nolaptime"])
+        client.identify()
+        state = client.receive()
+        height = number(state, "z")
+        while number(state, "curLapTime") < 400.0:
+            state = client.ask(STAND)
+        assert number(state, "z") == pytest.approx(height, abs=0.01)
+        while number(state, "distRaced") < 100.0:  # and the lap ends as any other one
+            state = client.ask(action(state))
+        while number(state, "distRaced") < 250.0:
+            state = client.ask(action(state))
+            assert not state.startswith(b"***")
+        assert number(state, "speedX") > 10.0
+
+    def test_noise_is_new_in_each_race_and_the_same_in_each_session(self, serve):
+        def readings():
+            _, client = serve(options=["noisy"])
+            client.identify()
+            return [numbers(state, "track") for state in (client.receive(), client.restart())]
+
+        _, exact = serve()
+        exact.identify()
+        true = numbers(exact.receive(), "track")
+        first, second = readings()
+        assert first != second
+        ratios = [noisy / value for noisy, value in zip(first + second, true + true, strict=True)]
+        assert all(0.5 < ratio < 1.5 for ratio in ratios)
+        assert len(set(ratios)) > 30
+        assert readings() == [first, second]
+
+    def test_one_that_there_is_not(self, serve):
+        process, _ = serve(options=["nodamage", "nobrakes"])
+        process._process.wait(PATIENCE)
+        assert "names 'nobrakes'; it may name nofuel, nodamage, nolaptime and" in process.words()
+
+
+class TestTheEnd:
+    """The owner ends the race: SIGTERM."""
+
+    def results(self, process):
+        texts = [f.read_text() for f in (process.folder / "results").rglob("*.xml")]
+        return "".join(texts)
+
+    @pytest.mark.parametrize("deadline", [None, 0.5])
+    def test_clients_are_told_and_results_are_kept(self, serve, deadline):
+        process, client = serve([DRIVER, ("inferno", 3)], deadline=deadline)
+        client.identify(" (name Ann Other)")
+        drive(client, client.receive(), 50)
+        process.end_race()
+        assert process.poll() == 0
+        message = client.receive()
+        while not message.startswith(b"***"):
+            message = client.receive()
+        assert message == b"***shutdown***\0"
+        assert re.search(r"scr_server 0: Ann Other at 127.0.0.1:\d+: 5\d decisions, ",
+                         process.words())  # fmt: skip
+        assert '<attstr name="name" val="Ann Other"/>' in self.results(process)
+
+    def test_also_before_the_race(self, serve):
+        process, first, second = serve([("scr_server", 1), DRIVER])
+        second.send(INIT)
+        assert second.receive() == b"***identified***\0"
+        process.end_race()
+        assert process.poll() == 0
+        assert second.receive() == b"***shutdown***\0"
+        assert "scr_server 0: nobody: 0 decisions, 0 late" in process.words()
+        del first
+
+    def test_who_has_no_name_goes_by_the_address(self, serve):
+        process, client = serve()
+        client.identify()
+        client.receive()
+        process.end_race()
+        address = f"127.0.0.1:{client.socket.getsockname()[1]}"
+        assert f'"driver name" val="{address}"' in self.results(process)
+
+
 class TestThinking:
     """Clients that wait for the game and let it wait for them."""
 
@@ -682,16 +817,91 @@ class TestLostAndDoubled:
         stranger.socket.close()
 
     def test_a_client_that_comes_back(self, serve):
-        _, client = serve()
+        process, client = serve()
         client.identify()
         before = drive(client, client.receive(), 30)[-1]
         last = client.receive()
         other = Client(client.socket.getpeername()[1])
-        other.identify()
+        other.insist()
         assert other.receive() == last != before
         assert other.ask(STAND).startswith(b"(angle ")
         client.nothing_comes()
+        assert "takes over from 127.0.0.1:" in process.words()
         other.socket.close()
+
+    @pytest.mark.parametrize("deadline", [None, 0.5])
+    def test_a_second_client_waits_until_the_first_one_is_silent(self, serve, deadline):
+        process, client = serve(deadline=deadline)
+        client.identify()
+        state = client.receive()
+        other = Client(client.socket.getpeername()[1])
+        for _ in range(30):
+            other.send(INIT)
+            state = client.ask(action(state))
+            assert state.startswith(b"(angle ")
+        other.nothing_comes()
+        own, strange = (f"127.0.0.1:{c.socket.getsockname()[1]}" for c in (client, other))
+        told = f"scr_server 0: {strange} wants to drive, but {own} does; end one of them"
+        assert process.words().count(told) == 1
+        other.insist()  # while the first one says nothing
+        other.socket.close()
+
+    def test_a_restart_is_no_chance_for_a_second_client(self, serve):
+        _, client = serve()
+        client.identify()
+        first = client.receive()
+        other = Client(client.socket.getpeername()[1])
+        other.send(INIT)
+        client.ask(STAND)
+        assert client.ask("(meta 1)") == b"***restart***\0"
+        other.send(INIT)
+        other.nothing_comes()
+        client.identify()
+        assert client.receive() == first
+        assert client.ask("(meta 1)") == b"***restart***\0"
+        other.insist()  # while the first one does not come back
+        other.socket.close()
+
+    def test_who_is_not_asked_is_not_silent(self, serve):
+        """The other driver thinks longer than a client may be silent."""
+        _, first, second = serve([DRIVER, ("scr_server", 1)])
+        first.identify()
+        second.identify()
+        first.receive()
+        first.send(STAND)
+        second.receive()
+        stranger = Client(first.socket.getpeername()[1])
+        time.sleep(2.5)
+        stranger.send(INIT)
+        second.send(STAND)
+        assert first.receive().startswith(b"(angle ")
+        stranger.nothing_comes()
+        stranger.socket.close()
+
+    @pytest.mark.parametrize("word", ["XYZ", "championship2011", "scr", "\x01\x02"])
+    def test_a_wrong_identifier_is_told(self, serve, word):
+        process, client = serve()
+        stranger = Client(client.socket.getpeername()[1])
+        for _ in range(3):
+            stranger.send(f"{word}(init)")
+        client.identify()
+        client.receive()
+        address = f"127.0.0.1:{stranger.socket.getsockname()[1]}"
+        said = f"{word}(init)".replace("\x01", "?").replace("\x02", "?")[:20]
+        told = f"scr_server 0: {address} says '{said}', not SCR(init ...), and is not heard"
+        assert process.words().count(told) == 1
+        stranger.socket.close()
+
+    def test_no_stranger_fills_the_disk(self, serve):
+        process, client = serve()
+        client.identify()
+        state = client.receive()
+        for number in range(150):
+            stranger = Client(client.socket.getpeername()[1])
+            stranger.send(f"hello {number}")
+            stranger.socket.close()
+            state = client.ask(action(state))
+        assert (process.folder / "words").read_text().count("is not heard") < 100
 
     def test_garbage(self, serve):
         process, client = serve()

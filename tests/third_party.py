@@ -16,8 +16,18 @@ class ThirdParty:
     def __init__(self, port: int) -> None:
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.settimeout(GIVE_UP)
+        self.socket.bind(("127.0.0.1", 0))
+        self.address = "127.0.0.1:{1}".format(*self.socket.getsockname())
         self.server = ("127.0.0.1", port)
         self.answers = 0
+
+    def last(self) -> bytes:
+        """The last message, of those that wait."""
+        self.socket.settimeout(GIVE_UP)
+        message = b""
+        while not message.startswith(b"***"):
+            message = self.socket.recv(2000)
+        return message
 
     def __enter__(self) -> ThirdParty:
         return self

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 __all__ = ["results_as_json", "show_results"]
 
 LAP_HEADERS = ("lap", "time s", "damage")
-RACE_HEADERS = ("rank", "robot", "index", "car", "laps", "total s", "best lap s", "damage", "out")
+RACE_HEADERS = ("rank", "driver", "car", "laps", "total s", "best lap s", "damage", "out")
 
 
 def _own(results: list[RobotResult], robot: tuple[str, int]) -> RobotResult:
@@ -66,7 +66,7 @@ def show_results(results: list[RobotResult], robot: tuple[str, int], track: str)
         print(table(RACE_HEADERS, [_race_row(result) for result in results]))
         return
     own = _own(results, robot)
-    print(f"{own.robot} {own.index}, {own.car}, {_short(track)}")
+    print(f"{own.driver}, {own.car}, {_short(track)}")
     rows = [(str(n), f"{lap.time:.3f}", str(lap.damage)) for n, lap in enumerate(own.laps, 1)]
     print(table(LAP_HEADERS, rows) if rows else "no whole lap")
     best = "none without a fault" if own.best_lap is None else f"{own.best_lap:.3f} s"
@@ -77,8 +77,7 @@ def _race_row(result: RobotResult) -> list[str]:
     best = "-" if result.best_lap is None else f"{result.best_lap:.3f}"
     return [
         str(result.rank),
-        result.robot,
-        str(result.index),
+        result.driver,
         result.car,
         str(result.laps_completed),
         f"{result.total_time:.3f}",

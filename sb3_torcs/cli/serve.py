@@ -3,25 +3,38 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import suppress
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from sb3_torcs.cli.common import positive
 from sb3_torcs.cli.results import show_results
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from sb3_torcs.game_process import GameProcess
+    from sb3_torcs.race_file import RaceSetup
 
 __all__ = ["add_parser", "run"]
 
 DEFAULT_DEADLINE = 10.0  # [ms] as the SCR server has it
 SHORTEST_DEADLINE = 0.001  # [ms] the server counts in microseconds
 LONGEST_DEADLINE = 3_600_000.0  # [ms]
-REPORT = "scr_server "  # begins the lines that our drivers print when a race is over
+REPORT = "scr_server"  # begins the lines that our drivers print
+OPTIONS = {
+    "no_fuel": ("nofuel", "no car uses fuel"),
+    "no_damage": ("nodamage", "no car takes damage; clients are told what it would be"),
+    "no_lap_limit": ("nolaptime", "nobody is taken out of the race for a slow lap"),
+    "noisy": ("noisy", "sensors err: range finders by 10 %%, opponents by 2 %%, focus by 1 %%"),
+}
+"""Of the command, what the game's drivers call them, and what they do."""
 
 DESCRIPTION = """\
 Start the installed game with drivers that are clients of the SCR protocol (arXiv:1304.1672), one
 UDP port each; robots of the game start behind them. The race begins when every client has said who
-it is, and the command ends with the race, or with Ctrl-C, and leaves nothing behind.
+it is. The command ends with the race, and leaves nothing behind. Ctrl-C or SIGTERM ends the race
+for all clients, and prints the results so far.
 
 A client has 10 ms of real time for an answer, or what --deadline says; who is later drives on as
 before. With --wait the game waits, however long it takes: the drive is the same at any speed.
@@ -52,6 +65,8 @@ def add_parser(subparsers: Any) -> None:
     time.add_argument("--wait", action="store_true", help="wait for every answer")
     time.add_argument("--deadline", type=float, default=DEFAULT_DEADLINE, metavar="MS",
                       help="for an answer; default: 10")  # fmt: skip
+    for option, (_, effect) in OPTIONS.items():
+        add(f"--{option.replace('_', '-')}", action="store_true", help=effect)
     add("--window", action="store_true", help="show the game's 3D view")
     parser.set_defaults(run=run)
 
@@ -82,23 +97,24 @@ def run(args: argparse.Namespace) -> int:
     race = RaceSetup(args.track, drivers, args.laps, session_for(drivers), args.car)
     cars = race.cars(game)
     deadline = None if args.wait else args.deadline / 1000.0
-    window = (
-        Window(display=find_display("leave --window out"), driver="scr_server 0")
-        if args.window
-        else None
-    )
+    window = Window(display=find_display("leave --window out")) if args.window else None
+    options = [name for option, (name, _) in OPTIONS.items() if getattr(args, option)]
     sockets = open_ports(args.drivers, args.port, args.host)
     try:
-        process = start_server(game, race, sockets, deadline=deadline, window=window)
+        process = start_server(
+            game, race, sockets, deadline=deadline, options=options, window=window
+        )
     finally:
         for bound in sockets:
             bound.close()
     with process:
         _announce(args)
-        process.wait()
-        results = read_results(process, race, cars)
-        _report(process)
-    show_results(results, drivers[0], str(args.track))
+        try:
+            process.follow(_report)
+        except (KeyboardInterrupt, SystemExit):
+            _interrupt(process, race, cars)
+            raise
+        show_results(read_results(process, race, cars), drivers[0], str(args.track))
     return 0
 
 
@@ -114,12 +130,32 @@ def _announce(args: argparse.Namespace) -> None:
     print(f"{args.track}: awaiting SCR clients at {args.host}, UDP {ports}; {time}", flush=True)
 
 
-def _report(process: GameProcess) -> None:
+def _report(line: str) -> None:
     """
-    Pass on what our drivers counted.
+    Pass on what our drivers say.
 
-    :param process: of the game, at its end
+    :param line: that the game printed
     """
-    for line in process.words().splitlines():
-        if line.startswith(REPORT):
-            print(line)
+    if line.startswith(REPORT):
+        print(line, flush=True)
+
+
+def _interrupt(process: GameProcess, race: RaceSetup, cars: Sequence[str]) -> None:
+    """
+    End the race for all clients, and print what was driven.
+
+    :param process: of the game
+    :param race: who races where
+    :param cars: of the drivers, in their order
+    """
+    from sb3_torcs.errors import GameFailed
+    from sb3_torcs.game_results import read_results
+
+    process.end_race()
+    # A game that was still loading, or was paused, has none; nor does a closed terminal show any.
+    with suppress(GameFailed, OSError):
+        process.follow(_report)
+        # Who did not come to the end is not out of a race that was cut short.
+        results = [replace(r, out=False) for r in read_results(process, race, cars)]
+        print("the race was ended early:")
+        show_results(results, race.drivers[0], str(race.track))

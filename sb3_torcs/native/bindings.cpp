@@ -169,9 +169,11 @@ void bind_scr(py::module_& module) {
             if (init.start)
                 start = py::make_tuple(init.start->distance, init.start->track_position,
                                        init.start->heading_error, init.start->speed);
-            return py::make_tuple(init.angles, start, init.exact);
+            return py::make_tuple(init.angles, start, init.exact, init.name);
         },
-        "text"_a, "Read how a client introduces itself: angles, start or None, whether it wants all digits.");
+        "text"_a,
+        "Read how a client introduces itself: angles, start or None, whether it wants all digits, "
+        "its name.");
 }
 
 }  // namespace

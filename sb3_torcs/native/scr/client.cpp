@@ -14,6 +14,7 @@
 #include <string>
 
 #include "../owner.h"
+#include "loop.h"
 
 namespace torcs::scr {
 namespace {
@@ -22,8 +23,10 @@ using namespace std::chrono_literals;
 
 constexpr int FIRST_PORT = 3001;
 constexpr auto DEADLINE = 10ms;  // the server's usual one
+constexpr auto SILENCE = 2s;     // after which a client may be gone: most ask again every second
 constexpr auto WATCH = 500ms;    // how often a wait looks for the game's owner
 constexpr auto AWAKE = 100us;    // how long a wait looks for an answer before it sleeps
+constexpr int MANY_NOTES = 100;  // for who runs the server; more would only fill the disk
 constexpr int FULL_LUCK = 8;     // at two for each look in vain, after how many it sleeps at once
 constexpr int NO_LUCK = -200;    // ... for so many waits
 
@@ -61,6 +64,13 @@ int bound_socket(int index) {
     return bound;
 }
 
+std::string text_of(const sockaddr_storage& address) {
+    const auto& internet = reinterpret_cast<const sockaddr_in&>(address);
+    char host[INET_ADDRSTRLEN] = "";
+    inet_ntop(AF_INET, &internet.sin_addr, host, sizeof host);
+    return std::string(host) + ":" + std::to_string(ntohs(internet.sin_port));
+}
+
 std::chrono::microseconds deadline_of(int index) {
     const char* text = std::getenv("SB3_TORCS_SCR_DEADLINE");
     if (!text) return DEADLINE;
@@ -81,6 +91,7 @@ Client::~Client() { dismiss(SHUTDOWN); }
 void Client::open(int index) {
     if (opened_) return;
     opened_ = true;
+    index_ = index;
     deadline_ = deadline_of(index);
     const char* inherited = std::getenv("SB3_TORCS_SCR_SOCKETS");
     socket_ = inherited ? inherited_socket(inherited, index) : bound_socket(index);
@@ -93,14 +104,22 @@ bool Client::await_introduction() {
 }
 
 void Client::hear_introduction() {
+    const bool vacant = !identified_;
     bool introduced = false;
     // Of several that wait the newest is the one that still listens.
     while (const auto text = receive()) {
         if (is_init(*text)) {
-            adopt(*text);
-            introduced = true;
-        } else if (is_from_client() && parse_action(*text).restart) {
-            send(RESTART);  // it missed that
+            if ((vacant && !was_refused()) || is_admitted()) {
+                adopt(*text);
+                introduced = true;
+            } else {
+                refuse();
+            }
+        } else if (!is_from_client()) {
+            hear_stranger(*text);
+        } else {
+            awaited_since_ = Clock::now();
+            if (parse_action(*text).restart) send(RESTART);  // it missed that
         }
     }
     if (introduced) send(IDENTIFIED);
@@ -118,7 +137,7 @@ std::optional<Action> Client::ask(const State& state) {
     const Clock::time_point until = Clock::now() + deadline_;
     // Who answers state after state, and was late, answers the older ones first. Taken for the answer
     // to this one, they would keep him behind for the rest of the race.
-    while (!wants_restart() && (!answer_ || (owed_ > 0 && !forever))) {
+    while (!ending() && !wants_restart() && (!answer_ || (owed_ > 0 && !forever))) {
         watch_owner();
         const Clock::time_point next = Clock::now() + WATCH;
         if (wait(forever ? next : std::min(until, next))) read_all(true);
@@ -128,7 +147,7 @@ std::optional<Action> Client::ask(const State& state) {
         owed_ = 0;
         return answer_;
     }
-    late_++;
+    if (!ending()) late_++;
     return late_answer_;
 }
 
@@ -140,7 +159,8 @@ void Client::tell(const State& state) {
 
 void Client::dismiss(std::string_view reason) {
     if (identified_) send(reason);
-    identified_ = false;
+    identified_ = awaited_ = false;
+    await_client();
 }
 
 // ---- Datagrams ----------------------------------------------------------------------------------
@@ -200,12 +220,14 @@ void Client::read_all(bool answers) {
 
 void Client::read(std::string_view text, bool answers) {
     if (is_init(text)) {
+        if (!is_admitted()) return refuse();
         adopt(text);
         send(IDENTIFIED);
         if (answers) send_state();
         return;
     }
-    if (!is_from_client()) return;
+    if (!is_from_client()) return hear_stranger(text);
+    awaited_ = false;
     const Action action = parse_action(text);
     owed_ = action.lap_time ? 0 : std::max(owed_ - 1, 0L);
     if (action.restart || (answers && action.lap_time.value_or(lap_time_) == lap_time_)) {
@@ -217,12 +239,73 @@ void Client::read(std::string_view text, bool answers) {
 }
 
 void Client::adopt(std::string_view text) {
+    if (identified_ && !is_from_client() && is_silent())
+        note("takes over from " + description() + ", who was silent for two seconds");
     init_ = parse_init(text);
     client_ = sender_;
     client_size_ = sender_size_;
     identified_ = true;
     owed_ = 0;
+    refused_size_ = 0;
+    awaited_ = false;
+    await_client();
+    const bool is_first = name_.empty();
+    name_ = init_.name.empty() ? text_of(client_) : init_.name;
+    if (is_first) note(init_.name.empty() ? "drives" : "drives, and calls itself " + name_);
 }
+
+bool Client::is_silent() const {
+    return awaited_ && Clock::now() - awaited_since_ >= SILENCE;
+}
+
+bool Client::was_refused() const {
+    return sender_size_ == refused_size_ && std::memcmp(&sender_, &refused_, refused_size_) == 0;
+}
+
+bool Client::is_admitted() const {
+    return is_from_client() || is_silent() || !(identified_ || was_refused());
+}
+
+void Client::await_client() {
+    if (awaited_) return;
+    awaited_ = true;
+    awaited_since_ = Clock::now();
+}
+
+// ---- For who runs the server --------------------------------------------------------------------
+
+std::string Client::description() const {
+    if (name_.empty()) return {};
+    return init_.name.empty() ? name_ : name_ + " at " + text_of(client_);
+}
+
+void Client::refuse() {
+    refused_ = sender_;
+    refused_size_ = sender_size_;
+    note("wants to drive, but " + description() +
+         " does; end one of them, or give it another port");
+}
+
+// A client of another server introduces itself by another word. Actions of a client that is gone,
+// or has another socket now, are none of that.
+void Client::hear_stranger(std::string_view text) {
+    if (text.empty() || text.front() == '(') return;
+    std::string said(text.substr(0, 20));
+    for (char& c : said)
+        if (c < ' ' || c > '~') c = '?';
+    note("says '" + said + "', not SCR(init ...), and is not heard");
+}
+
+void Client::note(const std::string& what) {
+    const std::string text = text_of(sender_) + " " + what;
+    if (text == last_note_ || notes_ >= MANY_NOTES) return;
+    last_note_ = text;
+    ++notes_;
+    std::printf("scr_server %d: %s\n", index_, text.c_str());
+    std::fflush(stdout);
+}
+
+// ---- What is sent -------------------------------------------------------------------------------
 
 void Client::send(std::string_view text) const {
     // The texts are literals: the zero that closes them goes along.
@@ -231,6 +314,7 @@ void Client::send(std::string_view text) const {
 }
 
 void Client::send_state() {
+    await_client();
     sendto(socket_, state_, state_size_, MSG_DONTWAIT, reinterpret_cast<const sockaddr*>(&client_),
            client_size_);
 }

@@ -1,14 +1,16 @@
 // The conversation with one client, over UDP.
 //
 // Datagrams get lost, doubled and late. A client that comes back introduces itself again and is
-// taken up where the race is. One that missed a state says its last action again; if it tells which
-// state that was for (see Action::lap_time), the newest state is sent once more.
+// taken up where the race is; but not while another one drives, see `is_admitted`. One that missed
+// a state says its last action again; if it tells which state that was for (see Action::lap_time),
+// the newest state is sent once more.
 #pragma once
 
 #include <netinet/in.h>
 
 #include <chrono>
 #include <optional>
+#include <string>
 #include <string_view>
 
 #include "messages.h"
@@ -44,6 +46,12 @@ public:
     // How the client that is there now introduced itself.
     const Init& init() const { return init_; }
 
+    // What it calls itself, else its address; empty before there was one.
+    const std::string& name() const { return name_; }
+
+    // Name and address, where both are known.
+    std::string description() const;
+
     long decisions() const { return decisions_; }  // states that were sent
     long late() const { return late_; }            // of them, answered too late
 
@@ -55,6 +63,18 @@ private:
     std::optional<std::string_view> receive();  // the next one that has come
     bool is_from_client() const;
     bool wants_restart() const;
+    // Whether the client has owed an answer for so long that it may be gone; or its introduction,
+    // since it was dismissed.
+    bool is_silent() const;
+    // Whether the sender wanted to drive while the client did.
+    bool was_refused() const;
+    // Whether who introduces itself now may drive: it is the same one, or that one may be gone, or
+    // nobody drives. A restart is no chance for who was refused: the client comes back.
+    bool is_admitted() const;
+    void refuse();
+    void hear_stranger(std::string_view text);
+    void note(const std::string& what);  // for who runs the server
+    void await_client();
     // Everything that has come, up to the wish for a restart; `answers` is whether to the state
     // that was sent last.
     void read_all(bool answers);
@@ -65,11 +85,16 @@ private:
 
     int socket_ = -1;
     int luck_ = 0;  // with looking for answers; below zero it does not
+    int index_ = 0;
     bool opened_ = false, identified_ = false;
     Clock::duration deadline_{};  // zero waits for ever
-    sockaddr_storage client_{}, sender_{};
-    socklen_t client_size_ = 0, sender_size_ = 0;
+    sockaddr_storage client_{}, sender_{}, refused_{};
+    socklen_t client_size_ = 0, sender_size_ = 0, refused_size_ = 0;
     Init init_{};
+    std::string name_, last_note_;
+    int notes_ = 0;
+    bool awaited_ = false;             // the client owes an answer
+    Clock::time_point awaited_since_;  // ... since then
     char state_[LONGEST_STATE];
     std::size_t state_size_ = 0;
     double lap_time_ = 0.0;  // [s] of that state, as it was written

@@ -4,14 +4,15 @@
 #include <cmath>
 #include <cstdio>
 
-#include "../sensors.h"
 #include "engine.h"
 #include "loop.h"
+#include "options.h"
 
 namespace torcs::scr {
 namespace {
 
 constexpr double FOCUS_COOL_DOWN = 1.0;  // [s] the focused range finders rest
+constexpr double FOCUS_NOISE = 0.01;     // [-] of each reading, standard deviation
 constexpr float WHITE[] = {1.0f, 1.0f, 1.0f, 1.0f};
 
 }  // namespace
@@ -20,6 +21,8 @@ void Driver::new_track(int index, const TrackData* track) {
     index_ = index;
     track_ = track;
     client_.open(index);
+    // It goes on over restarts: each race has other noise, each session the same.
+    if (options().noisy && !noise_) noise_.emplace(static_cast<std::uint64_t>(index));
 }
 
 void Driver::new_race(CarElement* car, const Situation* situation) {
@@ -31,15 +34,23 @@ void Driver::new_race(CarElement* car, const Situation* situation) {
     action_ = Action{};
     action_.focus.reset();  // nobody has asked for it yet
     if (!client_.has_network() || leaving() == Leaving::UNNOTICED) return;
-    while (!client_.await_introduction())
+    while (!ending() && !client_.await_introduction())
         for (Driver& other : drivers())
             if (other.client_.has_network()) other.client_.hear_introduction();
+    name_car();
+}
+
+// On the game's boards and in its results stands who drives, not which port it came to.
+void Driver::name_car() {
+    if (!client_.name().empty())
+        std::snprintf(car_->info.name, NAME_LENGTH, "%s", client_.name().c_str());
 }
 
 bool Driver::drive() {
-    if (!client_.has_network() || restart_requested()) return false;
+    if (!client_.has_network() || !goes_on()) return false;
     const State state = sense();
     const auto answer = client_.ask(state);
+    name_car();
     if (!answer) return false;  // the car goes on with what it was told last
     action_ = *answer;
     Control& control = car_->control;
@@ -53,7 +64,7 @@ bool Driver::drive() {
 }
 
 bool Driver::watch() {
-    if (!car_ || !client_.has_network() || restart_requested()) return false;
+    if (!car_ || !client_.has_network() || !goes_on()) return false;
     if (!(car_->pub.status & NOT_SIMULATED)) return false;
     const auto answer = client_.ask(sense());
     return answer && answer->restart;
@@ -65,8 +76,9 @@ void Driver::leave() {
     if (for_good && client_.has_network()) {
         // The race may end at the line, before a client hears of its last lap.
         if (car_->race.crossings != told_crossings_) client_.tell(sense());
-        std::printf("scr_server %d: %ld decisions, %ld late\n", index_, client_.decisions(),
-                    client_.late());
+        const std::string who = client_.description();
+        std::printf("scr_server %d: %s: %ld decisions, %ld late\n", index_,
+                    who.empty() ? "nobody" : who.c_str(), client_.decisions(), client_.late());
         std::fflush(stdout);
     }
     if (leaving() != Leaving::UNNOTICED) client_.dismiss(for_good ? SHUTDOWN : RESTART);
@@ -89,7 +101,7 @@ State Driver::sense() {
     State state{};
     state.heading_error = heading_error(*car_);
     state.lap_time = car_->race.lap_time;
-    state.damage = car_->priv.damage;
+    state.damage = mercy().damage_of(*car_);
     state.distance = distance_along(*car_, track_->length);
     state.distance_raced = car_->race.distance_raced - raced_before_;
     state.fuel = car_->priv.fuel;
@@ -106,6 +118,7 @@ State Driver::sense() {
     for (int i = 0; i < 4; i++) state.wheel_speeds[i] = car_->priv.wheel[i].spin;
     state.height = motion.pos.z - road_height(&position);
     sense_focus(state);
+    if (noise_) add_noise(*noise_, state.range_finders, state.opponents);
     return state;
 }
 
@@ -115,6 +128,8 @@ void Driver::sense_focus(State& state) {
     if (!action_.focus || now < next_focus_ || state.range_finders[0] == OFF_TRACK) return;
     next_focus_ = now + FOCUS_COOL_DOWN;
     focused_range_finders(*car_, *action_.focus, state.focus);
+    if (!noise_) return;
+    for (double& reading : state.focus) reading *= 1.0 + FOCUS_NOISE * noise_->normal();
 }
 
 // ---- The game's board ---------------------------------------------------------------------------

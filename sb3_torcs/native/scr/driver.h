@@ -2,8 +2,10 @@
 #pragma once
 
 #include <array>
+#include <optional>
 
 #include "../layout.h"
+#include "../sensors.h"
 #include "client.h"
 
 namespace torcs::scr {
@@ -29,12 +31,14 @@ public:
     const Init& init() const { return client_.init(); }
 
 private:
+    void name_car();
     State sense();
     void sense_focus(State& state);
     void show_board(const State& state) const;
 
     int index_ = 0;
     Client client_;
+    std::optional<Generator> noise_;
     const TrackData* track_ = nullptr;
     CarElement* car_ = nullptr;
     const Situation* situation_ = nullptr;

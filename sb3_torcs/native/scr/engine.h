@@ -16,6 +16,9 @@ void to_global(TrackPosition*, float* x, float* y,
                int against) asm("_Z19RtTrackLocal2GlobalP10tTrkLocPosPfS1_i");
 float road_height(TrackPosition*) asm("_Z14RtTrackHeightLP10tTrkLocPos");
 
+// The simulation's own cars; null if it does not tell where they are.
+SimulatedCar** simulated_cars(const Simulation& simulation);
+
 constexpr int TEXT_MODE = 4;  // of RaceManager::display_mode
 
 }  // namespace torcs::scr

@@ -1,7 +1,5 @@
 #include "flying_start.h"
 
-#include <dlfcn.h>
-
 #include <algorithm>
 #include <cstdio>
 #include <utility>
@@ -10,20 +8,6 @@
 #include "engine.h"
 
 namespace torcs::scr {
-namespace {
-
-// The simulation's own cars. Its library keeps its symbols to itself, but says where it is.
-SimulatedCar** simulated_cars(const Simulation& simulation) {
-    Dl_info info{};
-    dladdr(reinterpret_cast<void*>(simulation.update), &info);
-    void* library = dlopen(info.dli_fname, RTLD_NOW | RTLD_NOLOAD);
-    if (!library) return nullptr;
-    void* cars = dlsym(library, "SimCarTable");
-    dlclose(library);
-    return static_cast<SimulatedCar**>(cars);
-}
-
-}  // namespace
 
 FlyingStart& flying_start() {
     static FlyingStart start;

@@ -1,9 +1,13 @@
 #include "loop.h"
 
+#include <csignal>
+#include <cstdlib>
+
 #include "client.h"
 #include "driver.h"
 #include "engine.h"
 #include "flying_start.h"
+#include "options.h"
 
 namespace torcs::scr {
 namespace {
@@ -14,6 +18,7 @@ constexpr int WATCH_STEPS = 250;  // between two looks for the game's owner: hal
 Simulation simulation;  // the engine's own
 bool restart_wanted, settling;
 Leaving why = Leaving::FOR_GOOD;
+volatile std::sig_atomic_t ended = 0;
 
 void restart(Leaving reason) {
     restart_wanted = false;
@@ -43,13 +48,19 @@ void step(Situation* situation, double duration, int telemetry) {
         if (!start.stands()) simulation.update(situation, duration, telemetry);
         return;
     }
+    if (ending()) {
+        situation->state = ENDED;
+        return;
+    }
     if (start.misses_grid()) return restart(Leaving::UNNOTICED);
     if (start.stands()) return start.drive_off(*situation);
     if (ReInfo->robots_time == situation->time)
         for (Driver& driver : drivers())
             if (driver.watch()) request_restart();
     if (restart_wanted) return restart(Leaving::TO_RESTART);
+    mercy().before(*situation);
     simulation.update(situation, duration, telemetry);
+    mercy().after(*situation);
     start.start_clocks(*situation);
 }
 
@@ -60,13 +71,20 @@ void enter_loop() {
     if (ReInfo->simulation.update == step) return;
     settling = true;
     simulation = ReInfo->simulation;
+    mercy().begin(simulation);
     ReInfo->simulation.config = put_on_grid;
     ReInfo->simulation.update = step;
 }
 
 void request_restart() { restart_wanted = true; }
 
-bool restart_requested() { return restart_wanted; }
+void hear_owner() {
+    if (std::getenv("SB3_TORCS_OWNER")) std::signal(SIGTERM, [](int) { ended = 1; });
+}
+
+bool ending() { return ended != 0; }
+
+bool goes_on() { return !restart_wanted && !ending(); }
 
 Leaving leaving() { return why; }
 

@@ -11,9 +11,18 @@ namespace torcs::scr {
 // simulation anew for each.
 void enter_loop();
 
-// At the next step. Until then nobody is asked any more.
+// At the next step.
 void request_restart();
-bool restart_requested();
+
+// From now on SIGTERM ends the race, as if all had come to its end. Only of a game that has an
+// owner: that of a user ends as it always did.
+void hear_owner();
+
+// Whether that has come.
+bool ending();
+
+// Whether this race is still driven: nobody is asked any more once it is to end or to begin anew.
+bool goes_on();
 
 // Why drivers are shut down.
 enum class Leaving {

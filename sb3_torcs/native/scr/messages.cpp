@@ -84,6 +84,17 @@ void for_each_tag(std::string_view text, Use use) {
     }
 }
 
+// As the game can draw it, and write it to its files.
+std::string plain(std::string_view text) {
+    std::string name(text.substr(0, NAME_LENGTH - 1));
+    for (char& c : name) {
+        const bool is_letter = (c >= 'a' && c <= 'z') || (c >= 'A' && c <= 'Z');
+        const bool is_digit = c >= '0' && c <= '9';
+        if (!is_letter && !is_digit && !std::strchr(" -_.:+@", c)) c = '_';
+    }
+    return name;
+}
+
 char* write(double number, bool exact, char* begin, char* end) {
     const auto general = std::chars_format::general;
     return exact ? std::to_chars(begin, end, number, general).ptr
@@ -150,6 +161,7 @@ Init parse_init(std::string_view text) {
         if (tag == "start" && numbers(rest, start) == start.size())
             init.start = Start{start[0], start[1], start[2], start[3]};
         if (tag == "digits") init.exact = number(next_word(rest)).value_or(DIGITS) > DIGITS;
+        if (tag == "name") init.name = plain(trimmed(rest));
     });
     for (std::size_t i = 0; i < degrees.size(); i++) init.angles[i] = degrees[i] * RADIANS;
     return init;

@@ -7,6 +7,7 @@
 #include <array>
 #include <cstddef>
 #include <optional>
+#include <string>
 #include <string_view>
 
 #include "../placing.h"
@@ -63,6 +64,7 @@ struct Init {
     std::array<double, 19> angles;  // [rad] of range finders, left negative
     std::optional<Start> start{};  // not on the grid (an extension)
     bool exact = false;            // states shall have all digits (an extension)
+    std::string name{};            // of the driver (an extension): plain characters only
 };
 
 // Writes the state with its closing zero; returns the length with it. Six significant digits, as

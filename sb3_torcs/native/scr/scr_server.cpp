@@ -53,6 +53,7 @@ void stay_loaded() {
 // Fills ten places; the game frees the texts.
 extern "C" __attribute__((visibility("default"))) int scr_server(torcs::ModuleInfo* modules) {
     torcs::scr::stay_loaded();
+    torcs::scr::hear_owner();
     for (int i = 0; i < torcs::MODULE_INTERFACES; i++) {
         const std::string name = "scr_server " + std::to_string(i);
         modules[i] = {strdup(name.c_str()), strdup("client of the SCR protocol"),
