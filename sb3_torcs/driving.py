@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, cast
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
 
 from sb3_torcs.models import load_driver
 
@@ -22,6 +21,7 @@ class Agent:
     :param settings: of ``Torcs-v0`` with ``backend="scr"``: ``host``, ``port``, ``track`` and so on
     :param algo: of the model, if that cannot be found out
     :param trust: run what is pickled in the model
+    :param name: of the driver, for the game's boards and results
     :raises ModelMismatch: if the model does not fit
     :raises ModelNotTrusted: if it takes more than plain data
     """
@@ -32,21 +32,16 @@ class Agent:
         settings: Mapping[str, Any],
         algo: str | None = None,
         trust: bool = False,
+        name: str = "",
     ) -> None:
         self.env = gym.make("sb3_torcs:Torcs-v0", backend="scr", max_episode_steps=-1, **settings)
         self.driver = load_driver(model, self.env, algo, trust)
-        # The first decision of all loads libraries, for which a race has no time.
-        self.driver.predict(cast(spaces.Box, self.env.observation_space).high, deterministic=True)
-        self.lap_times: list[float] = []
-        """[s] of each whole lap."""
-        self.distance = 0.0
-        """[m] driven."""
-        self.end: str | None = None
-        """Why the drive ended, as in ``info``; ``None`` while it goes on, or if the race ended."""
-        self.end_time: float | None = None
-        """[s] of the race when that was."""
+        self.backend.driver_name = name
         self.error: BaseException | None = None
         """What went wrong, where the agent drives in a thread."""
+        with self.backend.rehearsal():  # a race has no time for what is done for the first time
+            self._race(None)
+        self._forget()
 
     @property
     def backend(self) -> Any:
@@ -64,14 +59,24 @@ class Agent:
         try:
             self._race(aftermath)
             while self.backend.restarted:
-                self.lap_times, self.distance = [], 0.0
-                self.end = self.end_time = None
                 self._race(aftermath)
         finally:
             self.env.close()
 
+    def _forget(self) -> None:
+        """Begin to count anew."""
+        self.lap_times: list[float] = []
+        """[s] of each whole lap."""
+        self.distance = 0.0
+        """[m] driven."""
+        self.end: str | None = None
+        """Why the drive ended, as in ``info``; ``None`` while it goes on, or if the race ended."""
+        self.end_time: float | None = None
+        """[s] of the race when that was."""
+
     def _race(self, aftermath: float | None) -> None:
         """Drive until the race ends, or as ``drive`` says."""
+        self._forget()
         observation, _ = self.env.reset()
         state, episode_start = None, np.ones(1, dtype=bool)
         while not self.backend.over and not self._has_enough(aftermath):

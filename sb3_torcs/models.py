@@ -26,6 +26,7 @@ __all__ = [
     "TrainingRecord",
     "check_resumable",
     "check_spaces",
+    "driver_name",
     "driver_record",
     "find_model",
     "load_driver",
@@ -163,6 +164,20 @@ def driver_record(driver: str | Path) -> TrainingRecord:
     :return: what is known
     """
     return TrainingRecord() if str(driver) == SCRIPTED else training_record(find_model(driver))
+
+
+def driver_name(driver: str | Path) -> str:
+    """
+    Name what is to drive, for boards and tables.
+
+    :param driver: as in :func:`find_model`, or ``"scripted"``
+    :return: a shipped agent's name, e.g. ``"ddpg-aalborg"``, else that of the file; of its folder
+        if the file is called as in every run
+    """
+    given = Path(os.path.expanduser(driver))
+    if given.name == BEST_MODEL or given.name == Path(BEST_MODEL).stem:
+        given = given.absolute().parent
+    return given.absolute().name.removesuffix(".zip")
 
 
 def one_track(track: Any) -> Any:

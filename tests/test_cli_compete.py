@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+import subprocess
+import sys
 
 import pytest
 from scr_loopback import Loopback
@@ -47,9 +49,13 @@ def test_an_agent_drives_to_the_end_and_says_how_long_it_took(race, capsys):
 
 
 def test_for_people_it_prints_three_lines(race, capsys):
-    port, _ = race
-    assert main(["compete", "scripted", "--port", str(port), "--track", "a-speedway"]) == 0
-    first, second, third = capsys.readouterr().out.splitlines()
+    port, process = race
+    words = ["compete", "scripted", "--port", str(port), "--track", "a-speedway"]
+    assert main([*words, "--name", "Ann Other"]) == 0
+    ready, awaiting, first, second, third = capsys.readouterr().out.splitlines()
+    assert ready == f"scripted gets ready to drive in the race at 127.0.0.1, UDP port {port}"
+    assert awaiting.startswith(f"awaiting the SCR server at 127.0.0.1, UDP port {port}")
+    assert "calls itself Ann Other" in process.words()
     assert re.fullmatch(r"lap times s: [\d.]+; \d+ m", first)
     assert re.fullmatch(r"lost ticks: \d+; answers: \d+", second)
     assert re.fullmatch(r"answer ms: median .*, 99 % within .*, longest .*", third)
@@ -61,7 +67,29 @@ def test_a_server_that_is_not_there_is_told(monkeypatch, capsys):
     port = bound.getsockname()[1]
     bound.close()
     assert main(["compete", "scripted", "--port", str(port)]) == 2
-    assert f"no SCR server answers at 127.0.0.1:{port}" in capsys.readouterr().err
+    out, err = capsys.readouterr()
+    assert f"awaiting the SCR server at 127.0.0.1, UDP port {port}" in out
+    assert f"no SCR server answers at 127.0.0.1:{port}" in err
+
+
+def test_what_it_waits_for_is_told_before_anything_is_loaded():
+    """The command says it with its first breath: torch and the model take seconds."""
+    (bound,) = open_ports(1)
+    port = bound.getsockname()[1]
+    call = [sys.executable, "-X", "importtime", "-m", "sb3_torcs.cli", "compete", "scripted"]
+    process = subprocess.Popen(
+        [*call, "--port", str(port)], text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+    )
+    loaded = []
+    for line in process.stdout:
+        if f"gets ready to drive in the race at 127.0.0.1, UDP port {port}" in line:
+            break
+        loaded.append(line.split("|")[-1].strip())
+    bound.close()
+    process.kill()
+    process.communicate()
+    assert "argparse" in loaded
+    assert not {"torch", "stable_baselines3", "numba"} & set(loaded)
 
 
 class Dying(Loopback):

@@ -328,6 +328,69 @@ def test_the_last_lap_counts_though_the_race_ends_in_mid_step():
     assert cars[1].last_lap_time == 70.0
 
 
+LOADED_BEFORE_THE_RACE = """
+import sys
+import gymnasium as gym
+from numba.core.dispatcher import Dispatcher
+from scr_loopback import Loopback
+import sb3_torcs.actions, sb3_torcs.sensors
+from sb3_torcs.driving import Agent
+
+def loaded():
+    compiled = {
+        (name, function): len(value.signatures)
+        for name, module in list(sys.modules.items()) if name.startswith("sb3_torcs")
+        for function, value in vars(module).items() if isinstance(value, Dispatcher)
+    }
+    return set(sys.modules), compiled
+
+class Watching(Loopback):
+    seen = None
+
+    def take(self, message, sender):
+        self.seen = self.seen or loaded()
+        super().take(message, sender)
+
+with Watching(ticks=300) as server:
+    address = {"host": server.host, "port": server.port}
+    if sys.argv[1:]:
+        Agent(sys.argv[1], {"track": "aalborg", **address}).drive()
+    else:
+        env = gym.make("sb3_torcs:Torcs-v0", backend="scr", **address)
+        env.reset()
+        for _ in range(20):
+            env.step([0.0, 1.0, 0.0])
+        env.close()
+    modules, compiled = loaded()
+    assert not modules - server.seen[0], modules - server.seen[0]
+    assert compiled == server.seen[1], (compiled, server.seen[1])
+    assert compiled["sb3_torcs.sensors", "_scale"] == 1
+"""
+
+
+@pytest.mark.parametrize("driver", [[], ["scripted"], ["ddpg-aalborg"]])
+def test_nothing_is_loaded_or_compiled_once_a_race_has_begun(driver):
+    """It takes up to a second, and a race does not wait so long for an answer."""
+    paths = {"PYTHONPATH": str(Path(__file__).parent)}
+    call = [sys.executable, "-c", LOADED_BEFORE_THE_RACE, *driver]
+    done = subprocess.run(
+        call, env={**os.environ, **paths}, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_rehearsal_leaves_nothing_behind():
+    with Loopback(ticks=5) as server:
+        world = ScrBackend("aalborg", host=server.host, port=server.port)
+        assert world.over
+        assert (list(world.latencies), world.lost_ticks) == ([], 0)
+        agent = Agent("scripted", {"track": "aalborg", "host": server.host, "port": server.port})
+        assert (agent.lap_times, agent.distance, agent.end) == ([], 0.0, None)
+        assert not server.inits
+        world.close()
+        agent.env.close()
+
+
 @pytest.mark.parametrize("think", [0.012, 0.2])
 def test_both_sides_count_the_same_lost_ticks(think):
     """In real time; an answer that crosses the next state on its way may count on one side only."""

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import os
 from array import array
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from sb3_torcs.actions import controls_from_action
 from sb3_torcs.backends.native import AGENT, starting_list, track_path
 from sb3_torcs.backends.scr_car import CarReader
 from sb3_torcs.backends.scr_gearbox import read_gearbox
+from sb3_torcs.backends.scr_rehearsal import Rehearsal
 from sb3_torcs.car import CONTROL_TICK, MANY_LAPS, CarState, Controls, Start, is_count
 from sb3_torcs.errors import EngineForked, GameFailed, GameTimeout, InvalidOption, ServerLost
 from sb3_torcs.game import find_game
@@ -22,7 +24,7 @@ from sb3_torcs.race_file import SCR_SERVER, RaceSetup
 from sb3_torcs.scr_client import ScrClient
 from sb3_torcs.scr_game import SCR_PORT, open_ports, start_server
 from sb3_torcs.scr_protocol import ScrAction, format_action, parse_engine, parse_state
-from sb3_torcs.sensors import range_finder_angles
+from sb3_torcs.sensors import encode, range_finder_angles
 from sb3_torcs.tracks import Track, load_track
 
 __all__ = ["ScrBackend"]
@@ -106,13 +108,18 @@ class ScrBackend:
             car=car,
         )
         self._process: GameProcess | None = None
-        self._client: ScrClient | None = None
+        self._client: ScrClient | Rehearsal | None = None
+        self._stand_in: Rehearsal | None = None
         self._reader = CarReader(self.track)
         self._lost_before = 0  # of a client that has hung up
+        self.driver_name = ""
+        """What our own server shows and writes down; empty for the address."""
         self.latencies = array("d")
         """From the arrival of each state to our answer [s], at a host of its own."""
         self._owner = os.getpid()
         self._drive: list[Any] = []  # since the reset, so that a copy can follow
+        if not self._own:
+            self._rehearse()
 
     def reset(self, rng: np.random.Generator, start: Start | None) -> CarState:
         """Begin an episode; see :class:`~sb3_torcs.backends.base.Backend`."""
@@ -171,6 +178,20 @@ class ScrBackend:
         """Control ticks for which an answer came too late, or none; since the world was made."""
         return self._lost_before + (0 if self._client is None else self._client.lost)
 
+    @contextmanager
+    def rehearsal(self) -> Iterator[None]:
+        """
+        Drive against a stand-in for the server, so that nothing is done for the first time in a
+        race that does not wait: compiled code, for one, is loaded by its first call.
+        """
+        self._stand_in = Rehearsal()
+        try:
+            yield
+        finally:
+            self._hang_up()
+            self._stand_in = None
+            self._drive = []
+
     def close(self) -> None:
         """End the game, or leave the server."""
         self._hang_up()
@@ -193,13 +214,23 @@ class ScrBackend:
         for controls, ticks in steps:
             self.step(controls, ticks)
 
+    def _rehearse(self) -> None:
+        """Do what an environment does with this world."""
+        with self.rehearsal():
+            encode(self.reset(np.random.default_rng(), None))
+            encode(self.step(controls_from_action(np.zeros(3, np.float32)), 5))
+
     def _connect(self, start: Start | None) -> None:
         """
         Bring the race to where it begins: by a restart where there is one, else by a new game.
 
         :param start: as of ``reset``
         """
-        if self._client is not None and not self._client.over:
+        if self._stand_in is not None:
+            self._client = self._stand_in
+            self._client.identify(start)
+            return
+        if isinstance(self._client, ScrClient) and not self._client.over:
             try:
                 self._client.restart(start)
             except (GameFailed, ServerLost):
@@ -216,6 +247,7 @@ class ScrBackend:
         }  # fmt: skip
         if self._own:
             manners = {"patience": PATIENCE, "pause": PAUSE, "watch": self._watch}
+        manners["name"] = self.driver_name
         self._client = ScrClient(host, port, self.range_finder_angles, **manners)
         self._client.identify(start)
 
@@ -271,7 +303,7 @@ class ScrBackend:
             client.send(_action(STANDING, 0, lap_time))
         raise ServerLost(f"the race at {client.address} ended before it began; call reset again")
 
-    def _hold(self, client: ScrClient, controls: Controls, ticks: int) -> int:
+    def _hold(self, client: ScrClient | Rehearsal, controls: Controls, ticks: int) -> int:
         """
         Drive one tick after the other; the last message is that of the new state.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import gc
 from typing import TYPE_CHECKING, Any
 
 from sb3_torcs.cli.common import (
@@ -48,6 +49,7 @@ def add_parser(subparsers: Any) -> None:
     add("--port", type=positive, default=3001, metavar="P", help="default: 3001")
     add("--track", metavar="T", help="that runs there; default: that of the training, or aalborg")
     add("--car", metavar="C", help="that one drives there; default: that of the training")
+    add("--name", metavar="N", help="of the driver, which `serve` shows; default: the model's")
     add("--algo", help="the model's algorithm, if it cannot be found out")
     add("--trust", action="store_true", help=TRUST_HELP)
     add("--json", action="store_true", help="print one JSON object and nothing else")
@@ -59,8 +61,12 @@ def run(args: argparse.Namespace) -> int:
     :param args: from the command line
     :return: the exit status
     """
+    where = f"{args.host}, UDP port {args.port}"
+    with quiet_output(args.json):  # loading takes seconds; whoever waits is told at once for what
+        print(f"{args.model} gets ready to drive in the race at {where}", flush=True)
+
     from sb3_torcs.driving import Agent
-    from sb3_torcs.models import one_track
+    from sb3_torcs.models import driver_name, one_track
 
     record = told_record(args.model)
     settings = record.kept(KEPT)
@@ -68,11 +74,17 @@ def run(args: argparse.Namespace) -> int:
     settings |= {name: value for name, value in given.items() if value is not None}
     one_track(settings.get("track"))
     with quiet_output(args.json):
-        agent = Agent(args.model, settings, args.algo, args.trust)
+        name = args.name or driver_name(args.model)
+        agent = Agent(args.model, settings, args.algo, args.trust, name)
+        print(f"awaiting the SCR server at {where}, and there the start of the race", flush=True)
+    # To look through all that was loaded for what can be freed takes longer than a tick.
+    gc.collect()
+    gc.freeze()
     try:
         with quiet_output(args.json):
             agent.drive()
     finally:
+        gc.unfreeze()
         # What was driven counts, also when the server is gone or Ctrl-C has ended it.
         if agent.backend.latencies and args.json:
             print_json(_figures(agent))
