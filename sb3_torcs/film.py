@@ -32,7 +32,7 @@ PATIENCE = 120.0  # [s] for one frame, on a busy machine
 GRACE = 20.0  # [s] for the game to end after its last frame
 PIPE_SIZE = 1 << 20  # [bytes] as much as a user may have
 
-HEADER = struct.Struct("=4sIIId")  # as in native/window/frames.cpp
+HEADER = struct.Struct("=4sIIIdd")  # as in native/window/frames.cpp
 MARK = b"SB3F"
 
 
@@ -44,11 +44,13 @@ class Frame:
     :param number: from 0
     :param time: simulated [s], negative before the start
     :param picture: red, green and blue, from the top
+    :param share: of the race that the first car on the grid has driven, 0 to 1
     """
 
     number: int
     time: float
     picture: npt.NDArray[np.uint8]  # (height, width, 3)
+    share: float = 0.0
 
 
 class Film:
@@ -171,13 +173,13 @@ def read_frame(file: int, game: GameProcess) -> Frame | None:
     got = _fill(file, memoryview(header), game)
     if got == 0:
         return None
-    mark, width, height, number, time = HEADER.unpack(header)
+    mark, width, height, number, time, share = HEADER.unpack(header)
     if got < HEADER.size or mark != MARK:
         raise GameFailed(game.epitaph())
     picture = np.empty((height, width, 3), np.uint8)
     if _fill(file, picture.reshape(-1).data, game) < picture.nbytes:
         raise GameFailed(game.epitaph())
-    return Frame(number, time, picture)
+    return Frame(number, time, picture, share)
 
 
 def _fill(file: int, buffer: memoryview, game: GameProcess) -> int:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
-from contextlib import closing, suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import closing, contextmanager, suppress
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,15 @@ from typing import Any
 import imageio_ffmpeg  # type: ignore[import-untyped]
 import numpy as np
 import numpy.typing as npt
-from tqdm import tqdm
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    Progress,
+    TaskProgressColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 from sb3_torcs.errors import InvalidOption, OutputNotWritable
 
@@ -44,9 +52,12 @@ def write_video(
     fps: float,
     total: int | None = None,
     encoding: Mapping[str, Any] = ENCODING,
+    share: Callable[[], float] | None = None,
 ) -> Path:
     """
-    Write frames to an mp4 file (H.264, yuv420p), with a progress bar on a terminal's stderr.
+    Write frames to an mp4 file (H.264, yuv420p).
+
+    On a terminal, standard error shows how much is done and how long the rest takes.
 
     The file appears whole or not at all: it grows beside its place and is moved there at the end.
 
@@ -55,6 +66,7 @@ def write_video(
     :param fps: frames per second
     :param total: number of frames, for the progress bar, if known
     :param encoding: that of this module: for figures, or :data:`PHOTOGRAPHIC`
+    :param share: says how much of the video is done, 0 to 1, where ``total`` is not known
     :return: the path
     :raises InvalidOption: if the name does not end in ``.mp4``, or there are no frames
     :raises OutputNotWritable: if the file cannot be written; no part of it is left behind
@@ -65,7 +77,8 @@ def write_video(
     part = path.with_name(f".{path.stem}.{os.getpid()}.part.mp4")
     try:
         _claim(path, part)
-        _encode(path, part, frames, fps, total, encoding)
+        with _progress(path.name, total, share) as advance:
+            _encode(path, part, frames, fps, advance, encoding)
         part.replace(path)
     finally:
         with suppress(OSError):  # no folder, no part
@@ -87,12 +100,41 @@ def _claim(path: Path, part: Path) -> None:
         ) from error
 
 
+@contextmanager
+def _progress(
+    name: str, total: int | None, share: Callable[[], float] | None
+) -> Iterator[Callable[[], None]]:
+    """
+    Show on a terminal how much of a video is done, and how long the rest takes.
+
+    :param name: of the video
+    :param total: number of frames, if known
+    :param share: as of :func:`write_video`
+    :return: to be called after each frame
+    """
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(),
+               TimeElapsedColumn(), TextColumn("left:"), TimeRemainingColumn())  # fmt: skip
+    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
+        task = progress.add_task(name, total=total if share is None else 1.0)
+
+        def advance() -> None:
+            if share is None:
+                progress.advance(task)
+            else:
+                progress.update(task, completed=share())
+
+        yield advance
+        end = progress.tasks[0].total
+        progress.update(task, completed=end)  # a drive may end before its race
+
+
 def _encode(
     path: Path,
     part: Path,
     frames: Iterable[Frame],
     fps: float,
-    total: int | None,
+    advance: Callable[[], None],
     encoding: Mapping[str, Any],
 ) -> None:
     """
@@ -102,7 +144,7 @@ def _encode(
     :param part: file to write
     :param frames: (height, width, 3) each
     :param fps: frames per second
-    :param total: number of frames, if known
+    :param advance: called after each frame
     :param encoding: options of ffmpeg
     """
     remaining = iter(frames)
@@ -113,13 +155,10 @@ def _encode(
             'of an environment made with render_mode="rgb_array"'
         )
     size = (first.shape[1], first.shape[0])
-    every = chain([first], remaining)
-    # disable=None: no bar where stderr is a file
-    bar = tqdm(every, total=total, unit="frame", desc=path.name, disable=None)
     # imageio's own writer stays open, and its ffmpeg alive, when a frame raises; this one closes.
     with closing(imageio_ffmpeg.write_frames(part, size, fps=fps, **encoding)) as ffmpeg:
         ffmpeg.send(None)
-        for frame in bar:
+        for frame in chain([first], remaining):
             if frame.shape != first.shape or frame.dtype != np.uint8:
                 raise InvalidOption(
                     f"a frame is {frame.dtype} {frame.shape}; the first is uint8 {first.shape}, "
@@ -129,6 +168,7 @@ def _encode(
                 ffmpeg.send(np.ascontiguousarray(frame))
             except OSError as error:
                 raise _out_of_room(path) from error
+            advance()
     if not _is_whole(part):
         raise _out_of_room(path)
 

@@ -20,9 +20,11 @@ from sb3_torcs.game import Game
 from sb3_torcs.game_process import GameProcess
 from sb3_torcs.game_results import read_results
 from sb3_torcs.game_window import Window, window_arguments
+from sb3_torcs.models import driver_name
 from sb3_torcs.race_file import SCR_SERVER, RaceSetup, session_for
 from sb3_torcs.race_results import RobotResult
 from sb3_torcs.scr_game import open_ports, start_server
+from sb3_torcs.scr_protocol import plain_name
 from sb3_torcs.video import PHOTOGRAPHIC, write_video
 
 __all__ = ["Show", "film_shows", "show_in_window"]
@@ -56,6 +58,7 @@ class Show:
     trust: bool = False
     agent: Agent | None = None
     results: list[RobotResult] = field(default_factory=list)
+    share: float = 0.0  # of the race that is filmed, 0 to 1
 
     @property
     def race(self) -> RaceSetup:
@@ -67,7 +70,9 @@ class Show:
     @property
     def driver_name(self) -> str:
         """As the game shows it."""
-        return self.game.find_robot(*self.robot).name if self.robot else f"{SCR_SERVER} 0"
+        if self.robot is not None:
+            return self.game.find_robot(*self.robot).name
+        return plain_name(driver_name(self.model))
 
     def start(self, window: Window) -> GameProcess:
         """
@@ -86,7 +91,7 @@ class Show:
             sockets[0].close()
         try:
             settings = {"track": self.track, "host": "127.0.0.1", "port": port, **self.settings}
-            self.agent = Agent(self.model, settings, trust=self.trust)
+            self.agent = Agent(self.model, settings, trust=self.trust, name=self.driver_name)
         except BaseException:
             process.stop()
             raise
@@ -161,7 +166,11 @@ def film_shows(
         threads = [_begin(show, film) for show, film in zip(shows, films, strict=True)]
         pictures = [_pictures(show, film) for show, film in zip(shows, films, strict=True)]
         try:
-            write_video(path, side_by_side(*pictures), fps, encoding=PHOTOGRAPHIC)
+            joint = side_by_side(*pictures)
+            write_video(
+                path, joint, fps, encoding=PHOTOGRAPHIC,
+                share=lambda: min(show.share for show in shows),
+            )  # fmt: skip
         finally:
             for film in films:
                 film.game.stop()
@@ -204,6 +213,7 @@ def _pictures(show: Show, film: Film) -> Iterator[npt.NDArray[np.uint8]]:
     agent = show.agent
     try:
         for frame in film.frames():
+            show.share = frame.share
             yield frame.picture
             if agent is not None and agent.end_time is not None:
                 left = agent.end_time + AFTERMATH - frame.time

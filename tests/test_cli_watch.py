@@ -82,7 +82,7 @@ def test_two_drivers_side_by_side(tmp_path, capsys):
     words = ["watch", "scripted", *SMALL, "--beside", "inferno", "--film", str(film)]
     assert main(words) == 0
     out = capsys.readouterr().out
-    assert "scr_server 0, car1-trb1, a-speedway" in out
+    assert "scripted, car1-trb1, a-speedway" in out
     assert "inferno 3, car1-trb1, a-speedway" in out
     slower = max(float(lap) for lap in re.findall(r"best lap: ([\d.]+) s", out))
     kind, frames = stream(film)

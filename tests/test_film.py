@@ -67,6 +67,13 @@ class TestFrames:
         # The game's own clock is a sum of thousands of steps.
         np.testing.assert_allclose([frame.time for frame in lap], expected, rtol=0, atol=1e-9)
 
+    def test_each_frame_tells_how_much_of_the_race_is_driven(self, lap):
+        shares = [frame.share for frame in lap]
+        assert shares == sorted(shares)
+        assert shares[0] == 0.0
+        assert shares[len(lap) // 2] == pytest.approx(0.5, abs=0.2)
+        assert shares[-1] == pytest.approx(1.0, abs=0.05)
+
     def test_the_last_crossing_of_the_line_is_on_film(self, game, lap):
         (result,) = run(game, "a-speedway", LAP.drivers, laps=1)
         after_the_race = lap[-1].time - result.laps[0].time
@@ -197,8 +204,8 @@ class TestFaults:
     @pytest.mark.parametrize(
         "sent",
         [
-            HEADER.pack(b"SB3F", 2, 2, 0, 0.0) + b"short",
-            HEADER.pack(b"what", 2, 2, 0, 0.0) + bytes(12),
+            HEADER.pack(b"SB3F", 2, 2, 0, 0.0, 0.0) + b"short",
+            HEADER.pack(b"what", 2, 2, 0, 0.0, 0.0) + bytes(12),
             b"SB3F",
         ],
     )

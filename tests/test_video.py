@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import re
 import subprocess
 
 import imageio_ffmpeg
@@ -37,6 +39,29 @@ def test_a_video_is_encoded_for_every_player(tmp_path):
     assert "yuv420p" in described
     assert "48x32" in described
     assert "10 fps" in described
+
+
+class Terminal(io.StringIO):
+    """A standard error that somebody looks at."""
+
+    def isatty(self):
+        return True
+
+
+@pytest.mark.parametrize(
+    "known", [{"total": 4}, {"share": iter([0.25, 0.5, 0.75, 1.0]).__next__}, {"share": lambda: 0}]
+)
+def test_a_terminal_shows_per_cent_and_the_time_left(tmp_path, monkeypatch, known):
+    terminal = Terminal()
+    monkeypatch.setattr("sys.stderr", terminal)
+    write_video(tmp_path / "lap.mp4", frames(4), fps=10, **known)
+    shown = re.sub(r"\x1b\[[\d;?]*[A-Za-z]", "", terminal.getvalue())  # without colours
+    assert re.search(r"lap\.mp4 .* 100% \d:\d\d:\d\d left: 0:00:00", shown)
+
+
+def test_a_log_file_shows_nothing(tmp_path, capsys):
+    write_video(tmp_path / "lap.mp4", frames(), fps=10, total=5)
+    assert capsys.readouterr() == ("", "")
 
 
 def test_a_video_that_fails_half_way_leaves_nothing_behind(tmp_path):

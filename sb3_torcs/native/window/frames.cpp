@@ -1,5 +1,6 @@
 // The pictures of a race, sent to whoever films it.
 
+#include <algorithm>
 #include <cerrno>
 #include <cstdint>
 #include <cstdlib>
@@ -27,13 +28,19 @@ struct Header {
     char mark[4] = {'S', 'B', '3', 'F'};
     std::uint32_t width = 0, height = 0;
     std::uint32_t number = 0;
-    double time = 0;  // [s] simulated
+    double time = 0;   // [s] simulated
+    double share = 0;  // [0, 1] of the race that the first car on the grid has driven
 };
-static_assert(sizeof(Header) == 24);
+static_assert(sizeof(Header) == 32);
 
 int (*draw)(torcs::Situation*) = nullptr;
 bool drawn = false;  // the picture in the making is that of the race, complete
 Header header;
+
+double share_driven(const torcs::Situation& situation) {
+    const double whole = static_cast<double>(situation.laps) * ReInfo->track->length;
+    return std::clamp(ReInfo->cars[0].race.distance_raced / whole, 0.0, 1.0);
+}
 
 int frames_descriptor() {
     static const char* text = std::getenv("SB3_TORCS_FRAMES");
@@ -81,6 +88,7 @@ void send_picture() {
 int draw_and_send(torcs::Situation* situation) {
     const int result = draw(situation);
     header.time = situation->time;
+    header.share = share_driven(*situation);
     drawn = rolling();
     GfuiDisplay();
     drawn = false;
