@@ -19,10 +19,11 @@ __all__ = ["add_parser", "run"]
 ROBOT_HEADERS = ("robot", "index", "name", "car")
 
 DESCRIPTION = """\
-Let a robot of the game drive, alone, in the session that the game calls practice; or, with --with,
-against others in a race. Without NAME: list the robots that are installed.
+List the robots that are installed; or, with NAME, let one of them drive: alone in a practice
+session, or against the robots that --with names in a race.
 
-The engine drives it in this process; --game lets the game's own text mode do so, for comparison.
+The engine runs the race in this process. With --game the game's own text mode runs it instead, for
+comparison.
 """
 
 
@@ -37,15 +38,15 @@ def add_parser(subparsers: Any) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
-    add("name", nargs="?", metavar="NAME", help="e.g. inferno")
+    add("name", nargs="?", metavar="NAME", help="the robot, e.g. inferno")
     add("--index", type=natural, metavar="I",
         help="which of the robot's drivers; default: that of car1-trb1")  # fmt: skip
-    add("--track", default="aalborg", metavar="T", help="default: aalborg")
-    add("--laps", type=positive, default=3, metavar="N", help="default: 3")
+    add("--track", default="aalborg", metavar="T", help="the track; default: aalborg")
+    add("--laps", type=positive, default=3, metavar="N", help="laps to drive; default: 3")
     add("--with", dest="rivals", metavar="NAME:I,…",
-        help="race against these, who start behind")  # fmt: skip
-    add("--game", action="store_true", help="by the game's text mode, not by the engine")
-    add("--telemetry", metavar="FILE", help="write the drive itself down; only by the engine")
+        help="robots to race against; they start behind")  # fmt: skip
+    add("--game", action="store_true", help="run the race in the game's text mode")
+    add("--telemetry", metavar="FILE", help="write the drive to this file; not with --game")
     add("--json", action="store_true", help="print JSON and nothing else")
     parser.set_defaults(run=run)
 

@@ -21,9 +21,11 @@ def add_parser(subparsers: Any) -> None:
         help="list the tracks, or draw one",
         description="List the bundled tracks and those of an installed TORCS, or draw one.",
     )
-    parser.add_argument("names", nargs="*", metavar="NAME", help="only these; also file paths")
+    parser.add_argument(
+        "names", nargs="*", metavar="NAME", help="a track or the path of its file; default: all"
+    )
     parser.add_argument("--json", action="store_true", help="print a JSON list and nothing else")
-    parser.add_argument("--plot", metavar="FILE.png", help="draw the named track")
+    parser.add_argument("--plot", metavar="FILE.png", help="draw the named track into this file")
     parser.set_defaults(run=run)
 
 

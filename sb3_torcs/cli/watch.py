@@ -20,15 +20,15 @@ KEPT = ("car", "action_repeat", "range_finders")
 """What an agent drives with as in its training, unless the command line says otherwise."""
 
 DESCRIPTION = """\
-Open the game's own 3D view directly in a race: a saved model drives a car, or a robot of the game
-does. The game's keys work: F2 to F11 change the view, p pauses, + and - change the pace, Esc ends
-it.
+Watch a saved model, or a robot of the game, drive a car in the game's own window. The game's keys
+work there: F2 to F11 change the view, p pauses, + and - change the pace, Esc ends the race.
 
-With --film the race is filmed instead, frame by frame in simulated time: no frame is dropped or
-doubled, however slow the machine, and no display is needed but Xvfb, which `sb3-torcs install-torcs
---film` gets.
+With --film the command writes a video instead, frame by frame in simulated time: no frame is
+dropped or doubled, however slow the machine. It needs no display, only the program Xvfb, which
+`sb3-torcs install-torcs --film` gets.
 
-The race ends after --laps laps; a model's also two seconds after it has left the road or stands.
+The race ends after --laps laps. A model's race also ends two seconds after the car has left the
+road or stands still.
 """
 
 
@@ -36,6 +36,8 @@ def add_parser(subparsers: Any) -> None:
     """
     :param subparsers: of the command
     """
+    from sb3_torcs.game_window import VIEWS
+
     parser = subparsers.add_parser(
         "watch",
         help="see an agent or a robot in the game's own window, or film it",
@@ -44,16 +46,31 @@ def add_parser(subparsers: Any) -> None:
     )
     add = parser.add_argument
     add("name", metavar="MODEL|ROBOT", help=f"{MODEL_HELP}; or a robot, e.g. inferno")
-    add("--track", metavar="T", help="default: that of the training, or aalborg")
-    add("--car", metavar="C", help="of a model; default: that of its training")
-    add("--robots", metavar="NAME:I,…", help="of the game, who start behind")
-    add("--laps", type=positive, default=1, metavar="L", help="default: 1")
-    add("--view", default="behind", metavar="V", help="where the camera is; default: behind")
-    add("--size", type=_size, default=(1280, 720), metavar="WxH", help="default: 1280x720")
-    add("--film", metavar="FILE.mp4", help="film it")
-    add("--fps", type=float, metavar="N", help="of the film; default: 30")
+    add("--track", metavar="T", help="the track; default: that of the training, or aalborg")
+    add("--car", metavar="C", help="the car that a model drives; default: that of its training")
+    add("--robots", metavar="NAME:I,…", help="robots that race, too, and start behind")
+    add("--laps", type=positive, default=1, metavar="L", help="laps to drive; default: 1")
+    add(
+        "--view",
+        default="behind",
+        metavar="V",
+        help=f"the camera: {', '.join(VIEWS)}; default: behind",
+    )
+    add(
+        "--size",
+        type=_size,
+        default=(1280, 720),
+        metavar="WxH",
+        help="width and height in pixels; default: 1280x720",
+    )
+    add("--film", metavar="FILE.mp4", help="write a video of the race to this file")
+    add("--fps", type=float, metavar="N", help="frames per second of the video; default: 30")
     add("--trust", action="store_true", help=TRUST_HELP)
-    add("--beside", metavar="MODEL|ROBOT", help="film this one, too, to the right")
+    add(
+        "--beside",
+        metavar="MODEL|ROBOT",
+        help="show this driver's race, too, in the right half of the video",
+    )
     parser.set_defaults(run=run)
 
 
