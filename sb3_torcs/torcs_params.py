@@ -1,12 +1,15 @@
 """The parameter files of TORCS: XML that holds sections of named numbers and texts.
 
 Numbers come in SI units. Track files take their common surfaces from a file of the installation;
-nothing else is ever opened, and nothing over a network.
+nothing else is ever opened, and nothing over a network. What the game's loader would read
+otherwise than it is written is refused, and so is what could keep a parser busy for long.
 """
 
 from __future__ import annotations
 
+import hashlib
 import math
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from xml.parsers import expat
@@ -14,7 +17,7 @@ from xml.parsers import expat
 from sb3_torcs.errors import TrackFileError
 from sb3_torcs.game import torcs_folders
 
-__all__ = ["Section", "read_params"]
+__all__ = ["Section", "digests", "read_bounded", "read_params"]
 
 UNITS = {  # to SI; a foot is TORCS's own
     "m": 1.0,
@@ -35,6 +38,13 @@ UNITS = {  # to SI; a foot is TORCS's own
     "hour": 3600.0,
     "hours": 3600.0,
 }
+NUMBER = re.compile(r"\s*[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\s*", re.ASCII)
+HEX = re.compile(r"0x[0-9a-fA-F]+")
+LARGEST = 1e9  # [-] of a value in SI; the game computes in single precision
+MAX_BYTES = 4 << 20  # of a file; the largest of the game's has 205 kB
+MAX_DEPTH = 16  # of tags in tags; the game's tracks have 6
+MAX_ATTRIBUTES = 16  # of one tag; the game knows five
+MAX_NAME = 100  # letters; the game's loader cuts paths of sections at 255
 SHARED_SURFACES = "surfaces.xml"
 UNREAD_ENTITIES = ("objects.xml",)  # trees and houses
 UNREAD_NAMES = ("default-objects",)  # what the game's tracks call them
@@ -48,6 +58,8 @@ class Section:
     """File and line, for complaints."""
     numbers: dict[str, float] = field(default_factory=dict)
     texts: dict[str, str] = field(default_factory=dict)
+    names: set[str] = field(default_factory=set)
+    """Of numbers and texts."""
     children: dict[str, Section] = field(default_factory=dict)
 
     def child(self, *names: str) -> Section:
@@ -70,6 +82,7 @@ class _Parser:
         self.path = path
         self.root = Section(str(path))
         self._open = [self.root]
+        self._depth = 0
         self._parsing: list[tuple[Path, expat.XMLParserType]] = []
 
     def parse(self) -> Section:
@@ -102,15 +115,23 @@ class _Parser:
         parser.StartElementHandler = self._start
         parser.EndElementHandler = self._end
         parser.EntityDeclHandler = self._declare
+        parser.AttlistDeclHandler = self._declare_attribute
         parser.ExternalEntityRefHandler = self._include
         parser.SkippedEntityHandler = self._skip
         self._parsing.append((path, parser))
         try:
-            parser.Parse(path.read_bytes(), True)
+            parser.Parse(read_bounded(path), True)
         except expat.ExpatError as error:
             reason = expat.ErrorString(error.code)
             raise TrackFileError(
                 f"{path}, line {error.lineno}: this is not well-formed XML ({reason})"
+            ) from error
+        except TrackFileError:
+            raise
+        except (LookupError, ValueError) as error:  # of Python's codecs
+            raise self._fail(
+                f"its encoding cannot be read ({error}); write the file in UTF-8, and say so in "
+                'its first line: <?xml version="1.0" encoding="UTF-8"?>'
             ) from error
         self._parsing.pop()
 
@@ -122,6 +143,13 @@ class _Parser:
         del is_parameter, base, system_id, public_id, notation
         if value is not None:
             raise self._fail(f"entity '{name}' has a text of its own; only files are supported")
+
+    def _declare_attribute(
+        self, tag: str, name: str, kind: str, default: str | None, required: int
+    ) -> None:
+        """Refuse attributes that are given to every tag: TORCS has none, and they can explode."""
+        del kind, default, required
+        raise self._fail(f"declares the attribute '{name}' of <{tag}>; write it where it belongs")
 
     def _skip(self, name: str, is_parameter: bool) -> None:
         """
@@ -162,9 +190,7 @@ class _Parser:
 
     def _shared_surfaces(self) -> Path:
         """Find the file of surfaces that all tracks of an installation share."""
-        folders = [self.path.resolve().parent, *self.path.resolve().parents[3:4], *torcs_folders()]
-        candidates = [folder / "data" / "tracks" / SHARED_SURFACES for folder in folders]
-        candidates.insert(0, self.path.parent / SHARED_SURFACES)
+        candidates = _surface_files(self.path)
         for candidate in candidates:
             if candidate.is_file():
                 return candidate
@@ -181,20 +207,32 @@ class _Parser:
         :param tag: its name
         :param attributes: name, val, unit
         """
+        if (tag == "params") != (self._depth == 0):
+            raise self._fail(f"<{tag}>; everything stands in one <params>")
+        self._depth += 1
+        if self._depth > MAX_DEPTH:
+            raise self._fail(f"<{tag}> lies {self._depth} tags deep, at most {MAX_DEPTH} may")
+        if len(attributes) > MAX_ATTRIBUTES:
+            raise self._fail(
+                f"<{tag}> has {len(attributes)} attributes, at most {MAX_ATTRIBUTES} may be"
+            )
+        inside = self._open[-1]
         if tag == "section":
-            siblings = self._open[-1].children
-            name = self._attribute(tag, attributes, "name")
-            if name in siblings:
-                raise self._fail(f"section '{name}' is already at {siblings[name].place}")
-            siblings[name] = Section(self._place)
-            self._open.append(siblings[name])
-        elif tag == "attnum":
-            name = self._attribute(tag, attributes, "name")
+            name = self._name(tag, attributes)
+            if name in inside.children:
+                raise self._fail(f"section '{name}' is already at {inside.children[name].place}")
+            inside.children[name] = Section(self._place)
+            self._open.append(inside.children[name])
+        elif tag in ("attnum", "attstr"):
+            name = self._name(tag, attributes)
             # Of two values with the same name, the game's loader finds the first.
-            self._open[-1].numbers.setdefault(name, self._number(attributes))
-        elif tag == "attstr":
-            name = self._attribute(tag, attributes, "name")
-            self._open[-1].texts.setdefault(name, self._attribute(tag, attributes, "val"))
+            if name in inside.names:
+                return
+            inside.names.add(name)
+            if tag == "attnum":
+                inside.numbers[name] = self._number(attributes)
+            elif text := self._attribute(tag, attributes, "val"):  # no text is as if not there
+                inside.texts[name] = text
 
     def _end(self, tag: str) -> None:
         """
@@ -202,8 +240,25 @@ class _Parser:
 
         :param tag: its name
         """
+        self._depth -= 1
         if tag == "section":
             self._open.pop()
+
+    def _name(self, tag: str, attributes: dict[str, str]) -> str:
+        """
+        Read a name, by which the game's loader can find what has it.
+
+        :param tag: that has it
+        :param attributes: of the tag
+        :return: the name
+        """
+        name = self._attribute(tag, attributes, "name")
+        if not name or "/" in name or len(name.encode()) > MAX_NAME:
+            raise self._fail(
+                f"<{tag}> is named '{name[:MAX_NAME]}'; expected 1 to {MAX_NAME} letters, and no "
+                "'/', at which the game would cut the name in two"
+            )
+        return name
 
     def _attribute(self, tag: str, attributes: dict[str, str], name: str) -> str:
         """
@@ -227,15 +282,63 @@ class _Parser:
         """
         text = self._attribute("attnum", attributes, "val")
         unit = attributes.get("unit", "")
-        try:
-            value = float(int(text, 16)) if text[:2].lower() == "0x" else float(text)
-        except ValueError:
-            value = math.nan
-        if not math.isfinite(value):
-            raise self._fail(f"'{text}' is not a finite number")
         if unit and unit not in UNITS:
             raise self._fail(f"unknown unit '{unit}'; known are {', '.join(UNITS)}")
-        return value * UNITS.get(unit, 1.0)
+        value = math.nan
+        if len(text) <= MAX_NAME:
+            if HEX.fullmatch(text):
+                value = float(int(text, 16))
+            elif NUMBER.fullmatch(text):
+                value = float(text)
+        value *= UNITS.get(unit, 1.0)
+        if math.isnan(value):
+            raise self._fail(f"'{text[:MAX_NAME]}' is not a finite number")
+        if abs(value) > LARGEST:
+            raise self._fail(f"{text} is too large a number; at most {LARGEST:g} makes sense")
+        return value
+
+
+def read_bounded(path: Path) -> bytes:
+    """
+    Read a file that may be anything, but not endless.
+
+    :param path: of the file
+    :return: its bytes
+    :raises TrackFileError: if it cannot be read, or is larger than any track
+    """
+    try:
+        with path.open("rb") as file:
+            content = file.read(MAX_BYTES + 1)
+    except OSError as error:
+        raise TrackFileError(f"{path}: cannot be read: {error.strerror}") from error
+    if len(content) > MAX_BYTES:
+        raise TrackFileError(f"{path}: has more than {MAX_BYTES >> 20} MB, which no track has")
+    return content
+
+
+def digests(path: Path) -> tuple[str, ...]:
+    """
+    Tell one content of a track's file from another, whatever its times say.
+
+    :param path: of the file
+    :return: SHA-256 of the file, and of the surfaces that it may include
+    """
+    files = [path]
+    if path.suffix.lower() == ".xml":
+        files += [candidate for candidate in _surface_files(path) if candidate.is_file()][:1]
+    return tuple(hashlib.sha256(read_bounded(file)).hexdigest() for file in files)
+
+
+def _surface_files(path: Path) -> list[Path]:
+    """
+    List where the surfaces may lie that a track includes; the first one that is there counts.
+
+    :param path: of the track's file
+    """
+    real = path.resolve()
+    folders = [real.parent, *real.parents[3:4], *torcs_folders()]
+    shared = [folder / "data" / "tracks" / SHARED_SURFACES for folder in folders]
+    return [path.parent / SHARED_SURFACES, *shared]
 
 
 def read_params(path: Path) -> Section:

@@ -23,12 +23,16 @@ import math
 from pathlib import Path
 
 from sb3_torcs.errors import TrackFileError
+from sb3_torcs.torcs_params import read_bounded
 from sb3_torcs.tracks import Grid, Segment, Surface, Track
 
 __all__ = ["read_track_file", "write_track_file"]
 
 MAGIC = ["sb3-torcs track", "1"]
 NUMBERS_PER_SEGMENT = 8
+MAX_SEGMENTS = 20_000
+LARGEST = 1e9  # [-] of any number
+LONGEST = 40  # letters of a number, for complaints
 MIN_CURVATURE = 1e-9  # [1/m] a radius of a million kilometres
 FIELDS = {
     "name": 1,
@@ -73,7 +77,9 @@ class _Reader:
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
-            raise self.fail(f"'{text}' is not a finite number")
+            raise self.fail(f"'{text[:LONGEST]}' is not a finite number")
+        if abs(value) > LARGEST:
+            raise self.fail(f"{text[:LONGEST]} is too large; at most {LARGEST:g} makes sense")
         return value
 
     def surface(self, name: str) -> Surface:
@@ -122,6 +128,8 @@ class _Reader:
         if len(values) != FIELDS[keyword]:
             raise self.fail(f"'{keyword}' has {len(values)} fields, expected {FIELDS[keyword]}")
         if keyword == "segment":
+            if len(self.segments) == MAX_SEGMENTS:
+                raise self.fail(f"there are more than {MAX_SEGMENTS} segments, which no road has")
             self.segments.append(self.segment(values))
         elif keyword == "surface":
             name, *texts = values
@@ -163,7 +171,7 @@ def read_track_file(path: Path) -> Track:
     """
     reader = _Reader(path)
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_bounded(path).decode("utf-8")
     except UnicodeDecodeError as error:
         raise TrackFileError(f"{path}: is not UTF-8 text: {error}") from error
     begun = False

@@ -4,7 +4,8 @@ A track file is a tree of sections holding numbers and texts. The road is a list
 ``str`` has a length, ``lft`` and ``rgt`` have a radius, an arc and perhaps another radius at the
 end. What a segment does not say of its sides, it inherits from the segment before it. The rules
 are those of the game's loader (``src/modules/track/track3.cpp`` and ``track4.cpp`` of TORCS
-1.3.7); elevation, banking, pits, cameras and graphics are not read: the world is a plane.
+1.3.7); elevation, banking, cameras and graphics are not read: the world is a plane. What that
+loader would lay otherwise than it is written, or could not lay at all, is refused.
 
 Beside the road come a border (a kerb), a side (grass, sand, more asphalt) and the barrier. Border
 and side become one strip of ground with the surface of the wider one, and the barrier stands at
@@ -19,14 +20,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from sb3_torcs.errors import TrackFileError
 from sb3_torcs.torcs_params import Section, read_params
+from sb3_torcs.track_pits import check_pits
 from sb3_torcs.tracks import Grid, Segment, Surface, Track
 
 __all__ = ["read_track_xml"]
 
 LEFT, RIGHT = "left", "right"
-MAX_STEPS = 10_000  # [-] of one segment; the game's tracks stay below a hundred
+MAX_STEPS = 20_000  # [-] of the whole road; the longest of the game's tracks has 2,956
+MAX_WIDTH = 1000.0  # [m] of road or ground; the game's tracks have 101
+MAX_LENGTH = 100_000.0  # [m] of one segment; the game computes in single precision
 SAMPLES_PER_ARC = 36  # as TORCS does when it looks for the corner of its map
 
 
@@ -67,17 +73,22 @@ class _Builder:
         self.version = version
         self.main = root.child("Main Track")
         self.width = self.main.numbers.get("width", 15.0)
-        if self.width <= 0.0:
-            raise TrackFileError(f"{self.main.place}: the road's width has to be above 0")
+        if not 0.0 < self.width <= MAX_WIDTH:
+            raise TrackFileError(
+                f"{self.main.place}: the road's width is {self.width:g} m; it has to be above 0, "
+                f"and {MAX_WIDTH:g} at most"
+            )
         self.step_length = self.main.numbers.get("profil steps length", 0.0)
         self.material = self.main.texts.get("surface", "asphalt")
         self.verges = {side: _Verge(side) for side in (LEFT, RIGHT)}
         for verge in self.verges.values():
-            verge.end_width = self._of(self.main, verge, "side").number("width", 0.0)
+            verge.end_width = self._of(self.main, verge, "side").width("width", 0.0)
             self._update(self.main, verge)
         self.segments: list[Segment] = []
         self.fine: list[Segment] = []
         """The same road in the steps of the game's loader."""
+        self.names: list[str] = []
+        """Of the segments that these steps are of."""
 
     def _of(self, section: Section, verge: _Verge, part: str) -> _Keys:
         """
@@ -103,7 +114,7 @@ class _Builder:
         # Version 3 knows one barrier for the whole track.
         barrier = self._of(section if self.version >= 4 else self.main, verge, "barrier")
         verge.material = self._of(section, verge, "side").text("surface", verge.material)
-        verge.border_width = border.number("width", verge.border_width)
+        verge.border_width = border.width("width", verge.border_width)
         verge.border_material = border.text("surface", verge.border_material)
         verge.barrier_material = barrier.text("surface", verge.barrier_material)
 
@@ -117,15 +128,15 @@ class _Builder:
         """
         self._update(section, verge)
         side = self._of(section, verge, "side")
-        start = side.number("start width", verge.end_width)
-        end = start if self.version < 4 else side.number("width", start)
-        end = side.number("end width", end)
+        start = side.width("start width", verge.end_width)
+        end = start if self.version < 4 else side.width("width", start)
+        end = side.width("end width", end)
         verge.end_width = end
-        border = max(verge.border_width, 0.0)
+        border = verge.border_width
         wider = verge.material if start + end >= 2.0 * border else verge.border_material
         return _Strip(
-            border + max(start, 0.0),
-            border + max(end, 0.0),
+            border + start,
+            border + end,
             self.surface(wider),
             self.surface(verge.barrier_material),
         )
@@ -151,10 +162,11 @@ class _Builder:
             raise TrackFileError(f"{section.place}: the surface '{name}' has a negative number")
         return surface
 
-    def add(self, section: Section) -> None:
+    def add(self, name: str, section: Section) -> None:
         """
         Add one segment of the file.
 
+        :param name: of the segment
         :param section: of the segment
         """
         self.material = section.texts.get("surface", self.material)
@@ -181,6 +193,7 @@ class _Builder:
             )
             fine.append(step)
         self.fine += fine
+        self.names += [name] * len(fine)
         self.segments += _joined(fine)
 
     def _bends(self, section: Section) -> Iterator[tuple[float, float]]:
@@ -222,18 +235,43 @@ class _Builder:
         :param section: of the segment
         :param length: of the segment [m]
         """
+        if length > MAX_LENGTH:
+            raise TrackFileError(
+                f"{section.place}: the segment is {length:g} m long, at most {MAX_LENGTH:g} m "
+                "make sense"
+            )
         if section.texts.get("profil", "spline") != "spline":
             return 1
-        steps = int(section.numbers.get("profil steps", 1.0))
+        wanted = section.numbers.get("profil steps", 1.0)
         step_length = section.numbers.get("profil steps length", self.step_length)
-        if steps == 1 and step_length > 0.0:
-            steps = int(length / step_length) + 1
-        if steps > MAX_STEPS:
+        steps = int(wanted)
+        if steps == 1 and step_length:
+            steps = _quotient(length, step_length) + 1
+        if steps < 1:
             raise TrackFileError(
-                f"{section.place}: the segment is cut into {steps} steps, at most {MAX_STEPS} make "
-                "sense; see 'profil steps' and 'profil steps length'"
+                f"{section.place}: the segment is cut into {steps} steps, so that the game would "
+                f"leave it out; 'profil steps' is {wanted:g}, at least 1 is allowed, and 'profil "
+                f"steps length' is {step_length:g}, at least 0 is allowed"
             )
-        return max(steps, 1)
+        if len(self.fine) + steps > MAX_STEPS:
+            raise TrackFileError(
+                f"{section.place}: the segment is cut into {steps} steps, at most {MAX_STEPS} of "
+                "the whole road make sense; see 'profil steps' and 'profil steps length'"
+            )
+        return steps
+
+
+def _quotient(length: float, step_length: float) -> int:
+    """
+    Divide in single precision, as the game does: else some roads have a step more or less.
+
+    :param length: of a segment [m]
+    :param step_length: of its steps [m]
+    :return: their number, rounded towards 0; more than allowed if they are many
+    """
+    if length > MAX_STEPS * abs(step_length):
+        return MAX_STEPS
+    return int(np.float32(length) / np.float32(step_length))
 
 
 class _Keys(NamedTuple):
@@ -250,6 +288,21 @@ class _Keys(NamedTuple):
         :param default: if it is not there
         """
         return self.section.numbers.get(self.prefix + name, default)
+
+    def width(self, name: str, default: float) -> float:
+        """
+        Return a width, which cannot be negative: the game's loader crashes at some that are.
+
+        :param name: after the prefix
+        :param default: if it is not there [m]
+        """
+        width = self.number(name, default)
+        if not 0.0 <= width <= MAX_WIDTH:
+            raise TrackFileError(
+                f"{self.section.place}: '{self.prefix}{name}' is {width:g} m; 0 to {MAX_WIDTH:g} "
+                "is allowed"
+            )
+        return width
 
     def text(self, name: str, default: str) -> str:
         """
@@ -309,8 +362,8 @@ def _corner(segments: Iterable[Segment]) -> tuple[float, float]:
         left, right = s.left_end, s.right_end
         if s.curvature:
             left, right = max(s.left_start, left), max(s.right_start, right)
-        left_most = 0.5 * s.width_end + max(left, 0.0)
-        right_most = -0.5 * s.width_end - max(right, 0.0)
+        left_most = 0.5 * s.width_end + left
+        right_most = -0.5 * s.width_end - right
         turn = s.curvature * s.length / samples
         chord = s.length / samples * (math.sin(0.5 * turn) / (0.5 * turn) if turn else 1.0)
         for _ in range(samples):
@@ -363,11 +416,12 @@ def read_track_xml(path: Path) -> Track:
         raise TrackFileError(f"{header.place}: version {version} of the format; known are 0 to 4")
     builder = _Builder(root, version)
     listed = builder.main.child("Track Segments" if version >= 4 else "segments")
-    for section in listed.children.values():
+    for name, section in listed.children.items():
         if "type" in section.texts:
-            builder.add(section)
+            builder.add(name, section)
     if not builder.segments:
         raise TrackFileError(f"{listed.place}: there are no track segments")
+    check_pits(builder.main, version, builder.names, builder.fine)
     low_x, low_y = _corner(builder.fine)
     return Track(
         path.stem,
@@ -377,4 +431,5 @@ def read_track_xml(path: Path) -> Track:
         start_x=-low_x,
         start_y=0.5 * builder.width - low_y,
         grid=_grid(root, builder.segments, builder.width),
+        steps=tuple(builder.fine),
     )

@@ -21,6 +21,7 @@ import numpy as np
 from sb3_torcs.car import FloatArray
 from sb3_torcs.errors import InvalidOption, TrackFileError, TrackNotFound, near_miss
 from sb3_torcs.game import torcs_folders, track_files
+from sb3_torcs.torcs_params import digests
 
 __all__ = [
     "Grid",
@@ -136,6 +137,8 @@ class Track:
     :param start_y: of the axis at the start line [m]
     :param start_heading: of the axis at the start line [rad]
     :param grid: the first starting place
+    :param steps: the same road as the game's loader lays it, step by step and with its gap at the
+        start line; empty for what is no file of the game
     """
 
     name: str
@@ -146,6 +149,7 @@ class Track:
     start_y: float = 0.0
     start_heading: float = 0.0
     grid: Grid = field(default=Grid(distance=10.0, offset=0.0))
+    steps: tuple[Segment, ...] = field(default=(), repr=False)
 
     @functools.cached_property
     def length(self) -> float:
@@ -403,26 +407,28 @@ def _known_files() -> dict[str, tuple[Path, str]]:
 
 def _read(path: Path, source: str) -> Track:
     """
-    Read a track file of either kind, once per state of the file.
+    Read a track file of either kind, once per content: times may stay as they are.
 
     :param path: of the file
     :param source: where it came from
     :return: the track
     """
-    return _read_once(path.resolve(), source, path.stat().st_mtime_ns)
+    return _read_once(path.resolve(), source, digests(path))
 
 
 @functools.lru_cache(maxsize=128)
-def _read_once(path: Path, source: Literal["bundled", "torcs", "file"], modified: int) -> Track:
+def _read_once(
+    path: Path, source: Literal["bundled", "torcs", "file"], content: tuple[str, ...]
+) -> Track:
     """
     Read a track file of either kind.
 
     :param path: of the file
     :param source: where it came from
-    :param modified: time of the last change of the file [ns]; only a key of the cache
+    :param content: from :func:`~sb3_torcs.torcs_params.digests`; only a key of the cache
     :return: the track
     """
-    del modified
+    del content
     # The readers build tracks, so they import this module; it can import them only when asked.
     if path.suffix.lower() == ".xml":
         from sb3_torcs.track_xml import read_track_xml as read

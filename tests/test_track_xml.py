@@ -214,7 +214,7 @@ class TestErrors:
             ('name="bend"', 'name="straight"', r"section 'straight' is already at .*, line \d+"),
             ('name="version" val="4"', 'name="version" val="5"', r"version 5 .* known are 0 to 4"),
             ('name="version" val="4"', 'name="version" val="-1"', r"version -1 of the format"),
-            ('name="width" unit="m" val="12"', 'name="width" val="0"', "width has to be above 0"),
+            ('name="width" unit="m" val="12"', 'name="width" val="0"', "the road.s width is 0 m; it has to be above 0"),
             ('name="profil steps" val="4"', 'name="profil steps" val="1e9"', "1000000000 steps"),
             ('"Track Segments"', '"Segments"', "there are no track segments"),
         ],
@@ -296,3 +296,77 @@ class TestInstalledTracks:
                 assert track.segments == closed(laid.segments), path.stem
                 assert track.grid == laid.grid
                 assert (track.start_x, track.start_y) == (laid.start_x, laid.start_y)
+
+
+class TestBombs:
+    """Small or large, what could keep a parser busy for long is refused, and how is said."""
+
+    @pytest.mark.parametrize(
+        ("text", "message"),
+        [
+            (HEAD + '<section name="n">' * 100_000, "line 7: <section> lies 17 tags deep, at most"),
+            (HEAD + "<a>" * 1_000_000, "<a> lies 17 tags deep"),
+            (
+                "<params {}/>".format(" ".join(f"a{i}=''" for i in range(200_000))),
+                "<params> has 200000 attributes, at most 16",
+            ),
+            (HEAD + " " * (5 << 20), "has more than 4 MB, which no track has"),
+            (
+                HEAD.replace("]>", '<!ATTLIST attnum a CDATA "b">]>'),
+                "line 5: declares the attribute 'a' of <attnum>",
+            ),
+            (HEAD.replace("]>", '<!ENTITY a "b">]>'), "entity 'a' has a text of its own"),
+            (
+                VERSION_4.replace('"profil steps" val="4"', '"profil steps" val="1e8"'),
+                "cut into 100000000 steps, at most 20000 of the whole road",
+            ),
+            (VERSION_4.replace('val="0.1"', f'val="{"9" * 100_000}"'), "is not a finite number"),
+        ],
+    )
+    def test_it_is_an_error(self, read, text, message):
+        with pytest.raises(TrackFileError, match=message):
+            read(text)
+
+
+@pytest.mark.parametrize("name", ["klingon", "utf-7", "big5", "idna", "hex"])
+def test_an_encoding_that_is_not_known_is_an_error_with_a_remedy(read, name):
+    text = VERSION_4.replace("UTF-8", name)
+    with pytest.raises(TrackFileError, match=r"line 1: .*write the file in UTF-8"):
+        read(text)
+
+
+class TestAsTheGame:
+    """What the game's loader makes of odd files."""
+
+    def test_a_text_that_is_empty_is_none(self, read):
+        straight, *_ = read(
+            VERSION_4.replace('"surface" val="asphalt"/><att', '"surface" val=""/><att')
+        ).segments
+        assert straight.road.name == "asphalt"
+
+    def test_of_a_number_and_a_text_with_one_name_the_first_counts(self, read):
+        kept = '<attstr name="lg" val="long"/><attnum name="lg" unit="km" val="0.1"/>'
+        text = VERSION_4.replace('<attnum name="lg" unit="km" val="0.1"/>', kept)
+        with pytest.raises(TrackFileError, match="the segment needs 'lg' above 0"):
+            read(text)
+
+    @pytest.mark.parametrize("number", ["1_0", "٣", "1e", "0x", "0x1p3", "infinity", "1,5", ""])
+    def test_what_c_does_not_read_as_a_whole_is_no_number(self, read, number):
+        with pytest.raises(TrackFileError, match=f"'{number}' is not a finite number"):
+            read(VERSION_4.replace('val="0.1"', f'val="{number}"'))
+
+    @pytest.mark.parametrize("name", ["", "a/b", "a" * 101])
+    @pytest.mark.parametrize("tag", ["section", "attnum", "attstr"])
+    def test_a_name_by_which_nothing_is_found_is_refused(self, read, tag, name):
+        text = VERSION_4.replace('<section name="bend">', f'<{tag} name="{name}" val="1"/>')
+        with pytest.raises(TrackFileError, match=f"<{tag}> is named .* expected 1 to 100 letters"):
+            read(text)
+
+    def test_steps_are_counted_in_single_precision(self, read):
+        """0.3 / 0.1 is a little less than 3 in double precision, and 3 in the game's."""
+        text = VERSION_4.replace('unit="km" val="0.1"', 'val="0.3"')
+        text = text.replace(
+            '"profil steps length" unit="m" val="4"', '"profil steps length" val="0.1"'
+        )
+        steps = read(text).steps
+        assert [step.length for step in steps[:5]] == pytest.approx([0.075] * 4 + [steps[4].length])
