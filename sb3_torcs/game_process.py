@@ -23,6 +23,7 @@ from sb3_torcs.errors import BackendUnavailable, GameFailed, GameIncomplete, Gam
 from sb3_torcs.game import Game
 from sb3_torcs.game_scenery import Scenery, find_scenery
 from sb3_torcs.race_file import RACE_FILE, SCR_SERVER, RaceSetup, write_race
+from sb3_torcs.track_trial import engine_arguments, try_race
 from sb3_torcs.tracks import load_track
 
 __all__ = ["GameProcess", "compiled_library", "game_environment"]
@@ -258,16 +259,17 @@ def _is_own(race: RaceSetup) -> bool:
 
 def _track_file(game: Game, race: RaceSetup) -> Path:
     """
-    Find the file of the track.
+    Find the file of the track, and refuse one that the game cannot drive.
 
     :param game: the installation
     :param race: with the track
     :return: its path, absolute
     """
-    if not _is_own(race):
-        return game.tracks()[game.find_track(os.fspath(race.track))].absolute()
-    file = Path(os.path.expanduser(race.track)).absolute()
-    load_track(file)  # the game would end without a word
+    if _is_own(race):
+        file = Path(os.path.expanduser(race.track)).absolute()
+    else:
+        file = game.tracks()[game.find_track(os.fspath(race.track))].absolute()
+    _check_track(game, race, file)
     return file
 
 
@@ -300,6 +302,25 @@ def _data(
     if scenery is not None and scenery.folder != file.parent:
         _link_all(scenery.folder, own, besides=f"{scenery.folder.name}.xml")
     return data, replace(race, track=place)
+
+
+def _check_track(game: Game, race: RaceSetup, file: Path) -> None:
+    """
+    Refuse a track at which the game would end without a word, or not at all.
+
+    :param game: the installation
+    :param race: who races where
+    :param file: of the track
+    """
+    load_track(file)
+    robots = [driver for driver in race.drivers if driver[0] != SCR_SERVER]
+    agent = [("", 0)] if race.has_clients else []  # the engine has one, whoever drives it
+    try_race(
+        file,
+        engine_arguments(
+            game, file, agent + robots, car=race.car, session=race.session, laps=race.laps
+        ),
+    )
 
 
 def _libraries(game: Game, folder: Path, race: RaceSetup) -> Path:

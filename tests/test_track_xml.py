@@ -214,7 +214,11 @@ class TestErrors:
             ('name="bend"', 'name="straight"', r"section 'straight' is already at .*, line \d+"),
             ('name="version" val="4"', 'name="version" val="5"', r"version 5 .* known are 0 to 4"),
             ('name="version" val="4"', 'name="version" val="-1"', r"version -1 of the format"),
-            ('name="width" unit="m" val="12"', 'name="width" val="0"', "the road.s width is 0 m; it has to be above 0"),
+            (
+                'name="width" unit="m" val="12"',
+                'name="width" val="0"',
+                "the road.s width is 0 m; it has to be above 0",
+            ),
             ('name="profil steps" val="4"', 'name="profil steps" val="1e9"', "1000000000 steps"),
             ('"Track Segments"', '"Segments"', "there are no track segments"),
         ],

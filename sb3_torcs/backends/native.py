@@ -12,10 +12,12 @@ import numpy as np
 
 from sb3_torcs.building import build_command
 from sb3_torcs.car import MANY_LAPS, CarState, Controls, FloatArray, Start, checked_laps, is_count
-from sb3_torcs.errors import BackendUnavailable, InvalidOption
+from sb3_torcs.errors import BackendUnavailable, InvalidOption, TrackFileError
 from sb3_torcs.game import Game, find_game
-from sb3_torcs.race_file import SCR_SERVER, SESSIONS, RaceSetup
+from sb3_torcs.race_file import SCR_SERVER, SESSIONS, RaceSetup, Session
 from sb3_torcs.sensors import range_finder_angles
+from sb3_torcs.track_trial import check_road, engine_arguments, try_race
+from sb3_torcs.track_trial_child import encoded
 from sb3_torcs.tracks import Track, load_track
 
 if TYPE_CHECKING:
@@ -43,7 +45,7 @@ def make_engine(
     entries: Sequence[tuple[str, int]],
     *,
     car: str = "car1-trb1",
-    session: str = "practice",
+    session: Session = "practice",
     laps: int = 0,
     angles: FloatArray | None = None,
 ) -> Engine:
@@ -80,17 +82,15 @@ def make_engine(
             game.find_robot(name, index)
     path = track_path(game, track)
     load_track(path)  # a broken file is told here, before the game's own loader stumbles on it
-    engine: Engine = native.Engine(  # paths as bytes: not every one is a text
-        data=os.fsencode(game.data),
-        libraries=os.fsencode(game.libraries),
-        plib=os.fsencode(game.extra_libraries or ""),
-        track=os.fsencode(path),
-        session=SESSIONS[session],
-        car=car,
-        entries=list(entries),
-        laps=laps,
-        angles=(range_finder_angles("scr") if angles is None else angles).tolist(),
-    )
+    race = engine_arguments(game, path, entries, car=car, session=session, laps=laps)
+    try_race(path, race)
+    angles = range_finder_angles("scr") if angles is None else angles
+    engine: Engine = native.Engine(**encoded(race), angles=angles.tolist())
+    try:
+        check_road(path, engine.road())
+    except TrackFileError:
+        engine.close()
+        raise
     return engine
 
 

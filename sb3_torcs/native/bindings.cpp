@@ -12,6 +12,7 @@
 #include "engine.h"
 #include "errors.h"
 #include "pool.h"
+#include "road.h"
 #include "scr/messages.h"
 
 namespace py = pybind11;
@@ -301,6 +302,13 @@ PYBIND11_MODULE(_engine, module) {
                                  "y"_a = 0.5 * (first.vertex[START_LEFT].y +
                                                 first.vertex[START_RIGHT].y),
                                  "heading"_a = first.heading);
+             })
+        .def("road",
+             [](Engine& engine) {
+                 const std::vector<RoadSegment> road = road_of(Engine::Access(engine)->track());
+                 py::array_t<double> rows({road.size(), std::size_t{ROAD_COLUMNS}});
+                 std::memcpy(rows.mutable_data(), road.data(), road.size() * sizeof road[0]);
+                 return rows;
              })
         .def("replay",
              [](Engine& engine, const py::array_t<double, py::array::c_style>& controls,

@@ -86,6 +86,41 @@ void check_plausible(const CarElement& car, const SimulatedCar& simulated) {
         refuse(car, "has a first gear of ratio 0");
 }
 
+bool is_finite(const Segment& segment) {
+    return std::all_of(std::begin(segment.vertex), std::end(segment.vertex), [](const Point& at) {
+        return std::isfinite(at.x) && std::isfinite(at.y) && std::isfinite(at.z);
+    });
+}
+
+// The road and the ground beside it, as far as the barriers.
+void check_strips(const Probe& probe, const Segment& road, const std::string& path) {
+    constexpr int STRIPS = 2;  // a border and a side
+    Surface surface;
+    if (!probe.read(road.surface, surface)) disagree("a road's surface", "a record", "not there");
+    for (const Side side : {RIGHT, LEFT}) {
+        Barrier barrier;
+        if (!probe.read(road.barrier[side], barrier) || !probe.read(barrier.surface, surface))
+            disagree("a barrier", "a record of 32 bytes", "none of that layout");
+        Segment strip = road;
+        for (int i = 0; i <= STRIPS; i++) {
+            if (!is_finite(strip))
+                throw Error("TrackFileError", path + " has a segment with a corner nowhere: a " +
+                                                  "height, a width or an angle is absurd");
+            if (!strip.side[side]) break;
+            if (i == STRIPS || !probe.read(strip.side[side], strip))
+                disagree("the ground beside a segment", "two strips at most", "more");
+        }
+    }
+}
+
+void check_pits(const Pits& pits, const std::string& path) {
+    constexpr int MOST_PITS = 1000;
+    if (pits.type == 1 && (pits.number < 1 || pits.number > MOST_PITS))
+        throw Error("TrackFileError", path + " has room for " + std::to_string(pits.number) +
+                                          " pits; expected 1 to " + std::to_string(MOST_PITS) +
+                                          ", see start, end and length in its section Pits");
+}
+
 }  // namespace
 
 void check_track(const TrackData* track, const Params& file, const std::string& path) {
@@ -112,6 +147,7 @@ void check_track(const TrackData* track, const Params& file, const std::string& 
         if (!(std::isfinite(next.length) && next.length > 0.0f))
             throw Error("TrackFileError", path + " has a segment that is " +
                                               std::to_string(next.length) + " m long");
+        check_strips(probe, next, path);
         // Range finders would look past its other end.
         if (next.type != STRAIGHT && !(next.arc <= HALF_CIRCLE))
             throw Error("TrackFileError", path + " has a segment that turns by " +
@@ -123,6 +159,7 @@ void check_track(const TrackData* track, const Params& file, const std::string& 
                  std::to_string(data.segments_number));
     if (!(std::fabs(length - data.length) <= 1e-3f * length))
         disagree("the track's length", std::to_string(length), std::to_string(data.length));
+    check_pits(data.pits, path);
 }
 
 void check_simulation(const SimulatedCar* simulated, const CarElement* cars, int number) {

@@ -42,6 +42,24 @@ enum RaceInfo : unsigned {
     PIT_END = 0x100,
 };
 
+struct Surface {
+    Surface* next;
+    const char* name;
+    float friction;
+    float rebound;
+    float rolling_resistance;
+    Unused<8> a_;
+    float damage;
+};
+
+struct Barrier {
+    int style;
+    float width;       // [m]
+    float height;      // [m]
+    Surface* surface;
+    Unused<8> a_;
+};
+
 struct Segment {
     const char* name;
     int id;
@@ -66,8 +84,9 @@ struct Segment {
     Unused<8> e_;
     unsigned race_info;
     Unused<16> f_;
-    void* surface;
-    Unused<24> g_;
+    Surface* surface;
+    Barrier* barrier[2];  // Side
+    Unused<8> g_;
     Segment* next;
     Segment* prev;
     Segment* side[2];  // Side
@@ -424,6 +443,8 @@ static_assert(offsetof(Segment, vertex) == 72 && offsetof(Segment, heading) == 1
 static_assert(offsetof(Segment, widening) == 156 && offsetof(Segment, race_info) == 180);
 static_assert(offsetof(Segment, surface) == 200 && offsetof(Segment, next) == 232);
 static_assert(offsetof(Segment, side) == 248 && sizeof(Segment) == 264);
+static_assert(offsetof(Segment, barrier) == 208 && offsetof(Barrier, surface) == 16);
+static_assert(offsetof(Surface, rolling_resistance) == 24 && offsetof(Surface, damage) == 36);
 static_assert(sizeof(TrackPosition) == 32 && sizeof(Pit) == 80 && sizeof(Pits) == 80);
 static_assert(offsetof(Pit, cars) == 48 && offsetof(Pits, entry) == 32);
 static_assert(offsetof(Pits, exit) == 56 && offsetof(Pits, pits) == 64);

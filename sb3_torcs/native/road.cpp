@@ -1,0 +1,45 @@
+#include "road.h"
+
+#include <algorithm>
+
+namespace torcs {
+
+namespace {
+
+struct Widths {
+    double start = 0.0, end = 0.0;  // [m]
+};
+
+// Border and side together; a negative width is none.
+Widths ground(const Segment& segment, Side side) {
+    Widths widths;
+    for (const Segment* part = segment.side[side]; part; part = part->side[side]) {
+        widths.start += std::max(part->start_width, 0.0f);
+        widths.end += std::max(part->end_width, 0.0f);
+    }
+    return widths;
+}
+
+double curvature(const Segment& segment) {
+    if (segment.type == STRAIGHT) return 0.0;
+    return (segment.type == LEFT_TURN ? segment.arc : -segment.arc) / segment.length;
+}
+
+}  // namespace
+
+std::vector<RoadSegment> road_of(const TrackData& track) {
+    std::vector<RoadSegment> road;
+    const Segment* segment = track.last;
+    for (int i = 0; i < track.segments_number; i++) {
+        segment = segment->next;
+        const Widths left = ground(*segment, LEFT), right = ground(*segment, RIGHT);
+        road.push_back({segment->length, curvature(*segment), segment->start_width,
+                        segment->end_width, left.start, left.end, right.start, right.end,
+                        segment->surface->friction, segment->surface->rolling_resistance,
+                        segment->barrier[LEFT]->surface->friction,
+                        segment->barrier[RIGHT]->surface->friction});
+    }
+    return road;
+}
+
+}  // namespace torcs
