@@ -39,6 +39,13 @@ def test_train_saves_a_model_that_evaluate_drives(monkeypatch, capsys, tmp_path)
     assert capsys.readouterr().out.startswith("episode 1: no whole lap;")
 
 
+@pytest.mark.slow
+def test_broken_tracks_are_refused_or_drive_what_is_written(monkeypatch, capsys, tmp_path):
+    run(monkeypatch, "fuzz_tracks.py", "--tracks", "12", "--workers", "1", "--keep", str(tmp_path))
+    assert re.search(r"^Torcs-v0: 12 files: ", capsys.readouterr().out, re.MULTILINE)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_own_reward_learns_from_it(monkeypatch, capsys):
     run(monkeypatch, "own_reward.py", "--timesteps", "120")
     assert "the best return by this reward was" in capsys.readouterr().out
