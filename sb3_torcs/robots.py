@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from sb3_torcs.backends.native import make_engine
-from sb3_torcs.car import CarState
-from sb3_torcs.errors import InvalidOption, OutputNotWritable
+from sb3_torcs.errors import InvalidOption
 from sb3_torcs.game import find_game
 from sb3_torcs.race_file import RaceSetup, Session
 from sb3_torcs.race_results import Lap, RobotResult
+from sb3_torcs.telemetry import STATE_FIELDS, write_telemetry
 
-__all__ = ["TELEMETRY_FIELDS", "race"]
+__all__ = ["race"]
 
 TICKS_AT_ONCE = 50  # a second of the race
 MAX_ROBOTS = 20  # that a grid of the game's tracks has room for
-
-STATE_FIELDS = CarState._fields[: CarState._fields.index("wheel_speeds")]
-TELEMETRY_FIELDS = ("robot", "index", *STATE_FIELDS, "steering", "throttle", "brake", "gear_asked")
-"""Columns of a telemetry file: one row per robot and call of drivers, every 0.02 s."""
 
 
 def race(
@@ -39,7 +34,7 @@ def race(
     :param track: ``"aalborg"``, ``"road/aalborg"``, or the path of a TORCS XML file
     :param laps: to drive
     :param session: the game's ``"practice"``, or ``"race"``
-    :param telemetry: CSV file for the drive itself, see :data:`TELEMETRY_FIELDS`
+    :param telemetry: CSV file for the drive itself, see :mod:`sb3_torcs.telemetry`
     :return: one result per robot, the winner first
     :raises InvalidOption: if the session cannot be had
     :raises BackendUnavailable: if the game or the extension is missing
@@ -54,7 +49,7 @@ def race(
             while not engine.ended:
                 engine.advance(TICKS_AT_ONCE)
         else:
-            _record(engine, robots, telemetry)
+            write_telemetry(telemetry, _rows(engine, robots))
         return [
             _result(engine, robots, rank, row) for rank, row in enumerate(engine.results(), start=1)
         ]
@@ -81,15 +76,9 @@ def _result(
     )
 
 
-def _record(engine: Any, robots: Sequence[tuple[str, int]], path: Path) -> None:
-    try:
-        with path.open("w", newline="") as file:
-            writer = csv.writer(file)
-            writer.writerow(TELEMETRY_FIELDS)
-            while not engine.ended:
-                engine.advance(1)
-                for car, robot in enumerate(robots):
-                    state = engine.read(car)[: len(STATE_FIELDS)]
-                    writer.writerow((*robot, *state, *engine.controls(car)))
-    except OSError as error:
-        raise OutputNotWritable(f"{path}: {error}; choose another file") from error
+def _rows(engine: Any, robots: Sequence[tuple[str, int]]) -> Iterator[tuple[Any, ...]]:
+    """Drive to the end, a call of drivers at a time."""
+    while not engine.ended:
+        engine.advance(1)
+        for car, robot in enumerate(robots):
+            yield (*robot, *engine.read(car)[: len(STATE_FIELDS)], *engine.controls(car))

@@ -1,3 +1,4 @@
+import csv
 import dataclasses
 import itertools
 import json
@@ -20,6 +21,7 @@ from sb3_torcs import __version__, bench, building, evaluation, game_process, mo
 from sb3_torcs.cli import VERBS, common, doctor, evaluate, main, recording, train
 from sb3_torcs.cli.train import TrainOptions
 from sb3_torcs.errors import BackendUnavailable, InvalidOption
+from sb3_torcs.telemetry import TELEMETRY_FIELDS
 
 NAMES = [verb.__name__.rpartition(".")[2].replace("_", "-") for verb in VERBS]
 PNG = b"\x89PNG"
@@ -421,6 +423,24 @@ def test_the_time_limit_cuts_no_lap_of_a_car_that_does_not_count_as_standing():
     assert evaluation.time_limit(kwargs) > 55890
     assert evaluation.time_limit({**kwargs, "action_repeat": 1}) > 5 * 55890
     assert evaluation.time_limit({**kwargs, "track": "random"}) > 55890
+
+
+def test_an_evaluation_writes_its_drives_as_the_robots_are_written(capsys, tmp_path):
+    file = tmp_path / "drive.csv"
+    words = ["scripted", "--env", "TorcsLite-v0", "--track", "g-track-1", "--laps", "1"]
+    words += ["--episodes", "2", "--telemetry", str(file)]
+    status, out, _ = run(capsys, "evaluate", *words)
+    assert (status, out.splitlines()[-1]) == (0, f"telemetry: {file}")
+    with file.open(newline="") as opened:
+        rows = list(csv.DictReader(opened))
+    assert tuple(rows[0]) == TELEMETRY_FIELDS
+    assert {(row["robot"], row["index"]) for row in rows} == {("scripted", "1"), ("scripted", "2")}
+    first = [row for row in rows if row["index"] == "1"]
+    times = [round(float(row["time"]), 3) for row in first]
+    assert times == [round(0.1 * number, 3) for number in range(1, len(first) + 1)]
+    assert {row["gear_asked"] for row in rows} == {""}
+    assert max(float(row["throttle"]) for row in rows) == 1.0
+    assert [file.name for file in tmp_path.iterdir()] == ["drive.csv"]
 
 
 def decision(lap_time=None, distance=0.0):

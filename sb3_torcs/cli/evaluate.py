@@ -65,6 +65,7 @@ def add_parser(subparsers: Any) -> None:
     add("--json", action="store_true", help="print one JSON object and nothing else")
     add("--video", metavar="FILE.mp4", help="film the best lap from above")
     add("--line", metavar="FILE.png", help="draw the line of the best lap, coloured by speed")
+    add("--telemetry", metavar="FILE.csv", help="write the drives themselves down")
     parser.set_defaults(run=run)
 
 
@@ -75,12 +76,15 @@ def run(args: argparse.Namespace) -> int:
     """
     video = writable_file(args.video, (".mp4",)) if args.video else None
     line = writable_file(args.line, (".png",)) if args.line else None
+    telemetry = writable_file(args.telemetry, (".csv",)) if args.telemetry else None
     with quiet_output(args.json):
         result, recorder = _drive(args)
         if video is not None:
             recorder.film(video)
         if line is not None:
             recorder.draw_line(line)
+        if telemetry is not None:
+            recorder.write(telemetry, str(args.model))
         recorder.close()
     if args.json:
         episodes = [episode.as_dict() for episode in result]
@@ -88,7 +92,7 @@ def run(args: argparse.Namespace) -> int:
         return 0
     print(f"{recorder.env_id}, {', '.join(recorder.names().values())}")
     print(table(HEADERS, [_row(number, episode) for number, episode in enumerate(result, 1)]))
-    for what, path in (("video", video), ("line", line)):
+    for what, path in (("video", video), ("line", line), ("telemetry", telemetry)):
         if path is not None:
             print(f"{what}: {path}")
     return 0

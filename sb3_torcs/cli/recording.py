@@ -10,7 +10,8 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 
-from sb3_torcs.car import CarState
+from sb3_torcs.car import CarState, Controls
+from sb3_torcs.telemetry import STATE_FIELDS, write_telemetry
 
 __all__ = ["Decision", "Recorder", "Stretch", "best_stretch"]
 
@@ -24,6 +25,7 @@ class Decision(NamedTuple):
     action: npt.NDArray[np.float32]
     car: CarState
     lap_time: float  # [s] if it completed a lap, else 0
+    controls: Controls = Controls(0.0, 0.0, 0.0)  # that the action has become
 
 
 class Stretch(NamedTuple):
@@ -96,13 +98,30 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
         """
         result = self.env.step(action)
         info = result[4]
-        self.episodes[-1].append(Decision(action, info["car"], info["lap_time"]))
+        controls = self.get_wrapper_attr("controls")
+        self.episodes[-1].append(Decision(action, info["car"], info["lap_time"], controls))
         return result
 
     def names(self) -> dict[str, str]:
         """Return the track's and the car's names."""
         backend = self.get_wrapper_attr("backend")
         return {"track": backend.track.name, "car": backend.car}
+
+    def write(self, path: Path, driver: str) -> None:
+        """
+        Write the drives down, as those of robots are; the index is the episode, from 1.
+
+        :param path: of the CSV file
+        :param driver: its name
+        """
+        write_telemetry(
+            path,
+            (
+                (driver, number, *decision.car[: len(STATE_FIELDS)], *decision.controls)
+                for number, decisions in enumerate(self.episodes, 1)
+                for decision in decisions
+            ),
+        )
 
     def draw_line(self, path: Path) -> None:
         """

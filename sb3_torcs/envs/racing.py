@@ -222,6 +222,11 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         self._controls = controls_from_action(action)
         return self._controls
 
+    @property
+    def controls(self) -> Controls:
+        """What the last timestep has asked of the car."""
+        return self._controls
+
     def finish_step(
         self, drive: Callable[[], CarState]
     ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:

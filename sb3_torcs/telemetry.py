@@ -1,0 +1,39 @@
+"""Drives as tables: one row per driver and moment, for robots and agents alike."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from sb3_torcs.car import CarState
+from sb3_torcs.errors import OutputNotWritable
+
+__all__ = ["STATE_FIELDS", "TELEMETRY_FIELDS", "write_telemetry"]
+
+STATE_FIELDS = CarState._fields[: CarState._fields.index("wheel_speeds")]
+TELEMETRY_FIELDS = ("robot", "index", *STATE_FIELDS, "steering", "throttle", "brake", "gear_asked")
+"""Columns of a telemetry file."""
+
+
+def write_telemetry(path: Path, rows: Iterable[tuple[Any, ...]]) -> None:
+    """
+    Write a drive down.
+
+    :param path: of the CSV file, which is there when it is whole
+    :param rows: values of :data:`TELEMETRY_FIELDS`; they are taken one by one while they are driven
+    :raises OutputNotWritable: if the file cannot be written
+    """
+    aside = path.with_name(f".{path.name}")
+    try:
+        try:
+            with aside.open("w", newline="", encoding="utf-8", errors="surrogateescape") as file:
+                writer = csv.writer(file)
+                writer.writerow(TELEMETRY_FIELDS)
+                writer.writerows(rows)
+            aside.replace(path)
+        finally:
+            aside.unlink(missing_ok=True)
+    except OSError as error:
+        raise OutputNotWritable(f"{path}: {error}; choose another file") from error
