@@ -145,7 +145,7 @@ def train(folder: Path, wanted: int, done: int, seed: int) -> bool:
     print("Ctrl-C keeps what was learned so far.", flush=True)
     try:
         # The zoo's tables would run through the progress bar.
-        with (folder / LOG).open("a") as log, contextlib.redirect_stdout(log):
+        with (folder / LOG).open("a", buffering=1) as log, contextlib.redirect_stdout(log):
             interrupted = train_run(options).interrupted
     except KeyboardInterrupt:  # before the first decision, or a third time
         interrupted = True
