@@ -1,43 +1,27 @@
-"""The report of a study: learning curves and tables from its results, every seed shown.
-
-Curves are interquartile means with 95 % stratified bootstrap intervals (Agarwal et al. 2021,
-arXiv:2108.13264, by rliable); the bootstrap is seeded, so the same results give the same report.
-"""
+"""The report of a study: learning curves and tables from its results, every seed shown."""
 
 from __future__ import annotations
 
 import csv
-import io
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from sb3_torcs.errors import StudyError
 from sb3_torcs.ladder import RUNGS
+from sb3_torcs.study_estimates import Estimate, estimate
 from sb3_torcs.study_file import slug
 from sb3_torcs.study_folder import RECIPE, RESULTS, ROWS, write_whole
+from sb3_torcs.study_pictures import NO_LAP, draw_together, draw_variant
 
-__all__ = ["Estimate", "Results", "estimate", "iqm", "read_results", "write_report"]
+__all__ = ["Results", "read_results", "write_report"]
 
-Array = npt.NDArray[np.float64]
-
-REPETITIONS = 2000  # of the bootstrap
-LEVEL = 0.95
 FEWEST = 3  # seeds that have an interval
-NO_LAP = math.inf  # [s] worse than any, so that whoever has none is not forgotten
-
-
-class Estimate(NamedTuple):
-    """A figure over seeds, and the interval that it lies in."""
-
-    value: Array  # (points,)
-    low: Array  # (points,)
-    high: Array  # (points,)
+TOGETHER = "learning.png"  # the picture of all variants
 
 
 class Results(NamedTuple):
@@ -112,53 +96,6 @@ def _read(row: dict[str, str]) -> dict[str, Any]:
     return {**row, **numbers, **whole, **truths, "lap_times_s": laps}
 
 
-def iqm(scores: Array) -> Array:
-    """
-    Average the middle half of the seeds: rliable's ``aggregate_iqm`` for all points at once.
-
-    :param scores: (seeds, 1, points)
-    :return: (points,)
-    """
-    from scipy.stats import trim_mean
-
-    return np.asarray(trim_mean(scores, proportiontocut=0.25, axis=0)[0])
-
-
-def share(scores: Array) -> Array:
-    """
-    Average all seeds: what share of them is 1.
-
-    :param scores: (seeds, 1, points)
-    :return: (points,)
-    """
-    return np.asarray(scores.mean(axis=0)[0])
-
-
-def estimate(scores: Array, function: Callable[[Array], Array] = iqm) -> Estimate:
-    """
-    Estimate a figure over seeds, with a stratified bootstrap.
-
-    :param scores: (seeds, points)
-    :param function: of (seeds, 1, points)
-    :return: value and interval
-    """
-    from rliable.library import StratifiedBootstrap
-
-    class Seeded(StratifiedBootstrap):
-        """Draws from its own generator; rliable's draws from that of the whole process."""
-
-        def update_indices(self) -> tuple[Any, ...]:
-            drawn = self.generator.choice(self._num_items, self._args_shape, replace=True)
-            return (drawn, *self._strata_indices)
-
-    stacked = scores[:, None, :]
-    drawn = Seeded(stacked, seed=0).apply(function, reps=REPETITIONS)
-    tail = 0.5 * (1.0 - LEVEL)
-    # Without interpolation, which would make nonsense of a lap that was never driven.
-    low, high = np.quantile(drawn, [tail, 1.0 - tail], axis=0, method="inverted_cdf")
-    return Estimate(function(stacked), low, high)
-
-
 def write_report(folder: Path, output: Path) -> Path:
     """
     Write ``report.md`` and its pictures.
@@ -184,9 +121,13 @@ def write_report(folder: Path, output: Path) -> Path:
         *_ladder(trials),
         *_shares(trials),
     ]
-    for variant, group in _variants(trials).items():
+    variants = _variants(trials)
+    if len(variants) > 1:
+        write_whole(output / TOGETHER, draw_together(variants))
+        lines += ["## Learning: all variants", "", f"![all variants]({TOGETHER})", ""]
+    for variant, group in variants.items():
         picture = output / f"learning-{slug(variant)}.png"
-        write_whole(picture, _drawn(variant, group))
+        write_whole(picture, draw_variant(variant, group))
         lines += [f"## Learning: {variant}", "", f"![{variant}]({picture.name})", ""]
     lines += [
         "Thin: every seed; bold: the interquartile mean of the seeds. A seed without a lap counts "
@@ -351,81 +292,3 @@ def _shares(trials: Sequence[Results]) -> list[str]:
         rows.append([f"{trial.variant}, {trial.seed}", *cells])
     headers = ["variant, seed", "tracks completed", "of those that did not choose its model"]
     return _markdown("Tracks completed", headers, rows)
-
-
-def _curves(trial: Results) -> dict[str, Array]:
-    """
-    Arrange the evaluations of a trial, means over its tracks.
-
-    :param trial: that was evaluated
-    :return: decisions, distance [m], best lap so far [s], and whether all laps were driven, each
-        (evaluations,)
-    """
-
-    def curve(value: Callable[[dict[str, Any]], float]) -> Array:
-        return np.array([np.mean([value(row) for row in tracks]) for tracks in trial.evaluations])
-
-    return {
-        "decisions": curve(lambda row: row["decisions"]),
-        "distance": curve(lambda row: row["distance_m"]),
-        "lap": np.minimum.accumulate(curve(lambda row: row["best_flying_lap_s"] or NO_LAP)),
-        "completes": curve(lambda row: row["completes"]),
-    }
-
-
-def _drawn(variant: str, group: Sequence[Results]) -> bytes:
-    """Draw distance, lap time and success over decisions, as PNG."""
-    from matplotlib.figure import Figure
-
-    every = [_curves(trial) for trial in group]
-    length = min(len(curves["decisions"]) for curves in every)
-    # As far as all seeds are.
-    shared = {name: np.array([curves[name][:length] for curves in every]) for name in every[0]}
-    decisions = shared["decisions"].mean(axis=0) / 1000.0
-    figure = Figure(figsize=(12.0, 3.4), layout="constrained")
-    panels = figure.subplots(1, 3)
-    for panel, name, label in zip(
-        panels[:2],
-        ("distance", "lap"),
-        ("distance of three laps [m]", "best flying lap so far [s]"),
-        strict=True,
-    ):
-        for curves in every:
-            own = curves["decisions"] / 1000.0, _drawable(curves[name])
-            panel.plot(*own, color="tab:blue", alpha=0.35, linewidth=0.8)
-        _band(panel, decisions, estimate(shared[name]))
-        panel.set_ylabel(label)
-    panels[0].set_ylim(bottom=0.0)
-    if not any(np.isfinite(curves["lap"]).any() for curves in every):
-        panels[1].set_yticks([])
-        panels[1].text(0.5, 0.5, "no seed has one", ha="center", transform=panels[1].transAxes)
-    _band(panels[2], decisions, estimate(shared["completes"], share))
-    so_far = np.maximum.accumulate(shared["completes"], axis=1).mean(axis=0)
-    panels[2].plot(decisions, so_far, color="tab:blue", linestyle="--")
-    panels[2].set_ylabel("share of races that complete")
-    panels[2].set_ylim(-0.03, 1.03)
-    panels[2].legend(["in this evaluation", "95 %", "in one so far"], fontsize=8)
-    for panel in panels:
-        panel.set_xlabel("thousand decisions learned from")
-        panel.set_xlim(0.0, 1.02 * max(curves["decisions"][-1] for curves in every) / 1000.0)
-        panel.grid(alpha=0.3)
-    figure.suptitle(f"{variant}: {len(group)} seeds", fontsize=11)
-    picture = io.BytesIO()
-    figure.savefig(picture, dpi=100)
-    return picture.getvalue()
-
-
-def _band(panel: Any, decisions: Array, figure: Estimate) -> None:
-    """Draw a figure and its interval, which ends where the axes do if it has no end."""
-    value = _drawable(figure.value)
-    panel.plot(decisions, value, color="tab:red", linewidth=2.0)
-    top = np.where(np.isfinite(figure.high), figure.high, panel.get_ylim()[1])
-    shown = np.isfinite(value) & np.isfinite(figure.low)
-    panel.fill_between(
-        decisions, figure.low, top, where=shown, color="tab:red", alpha=0.2, linewidth=0.0
-    )
-
-
-def _drawable(values: Array) -> Array:
-    """Leave a gap where there is no lap."""
-    return np.where(np.isfinite(values), values, np.nan)

@@ -8,8 +8,9 @@ import pytest
 from rliable.metrics import aggregate_iqm
 
 from sb3_torcs.cli import main
+from sb3_torcs.study_estimates import estimate, iqm, share
 from sb3_torcs.study_file import FIELDS
-from sb3_torcs.study_report import estimate, iqm, read_results, share, write_report
+from sb3_torcs.study_report import read_results, write_report
 
 LAPS = (97.0, 84.0, 83.5)
 
@@ -194,3 +195,20 @@ def test_a_study_in_which_nobody_laps_is_reported_too(tmp_path):
     assert lines_of(report, "| base |") == [
         "| base | 0 of 0, 2 not measured | - | - | - | - | - | - |"
     ]
+
+
+def test_one_picture_shows_all_variants(tmp_path):
+    """Where there are several; each has its own beside it."""
+    rows = [
+        row(seed, variant=variant, decisions=decisions)
+        for variant in ("base", "wide")
+        for seed in (0, 1, 2)
+        for decisions in (100, 200)
+    ]
+    folder = written(tmp_path / "study", rows)
+    text = write_report(folder, tmp_path / "out").read_text()
+    assert sorted(path.name for path in (tmp_path / "out").glob("*.png")) == [
+        "learning-base.png", "learning-wide.png", "learning.png",
+    ]  # fmt: skip
+    assert text.index("![all variants](learning.png)") < text.index("![base](learning-base.png)")
+    assert (tmp_path / "out" / "learning.png").read_bytes()[:4] == b"\x89PNG"
