@@ -1,6 +1,10 @@
+import subprocess
+import sys
+
 import gymnasium as gym
 import pytest
 import yaml
+from stable_baselines3 import DDPG
 
 import sb3_torcs  # noqa: F401  registers the environments
 from sb3_torcs import zoo
@@ -255,3 +259,30 @@ def test_a_symmetric_policy_needs_observations_that_have_a_mirror_image(tmp_path
     accepted({**symmetric, **one_sided, "policy_kwargs": {"symmetric": False}})
     assert "whose middle is 0" in complaint(tmp_path, {**symmetric, "normalize": True})
     assert "set range_finders to scr or narrow" in complaint(tmp_path, {**symmetric, **one_sided})
+
+
+def zoo_script(*words):
+    command = [sys.executable, "-m", "sb3_torcs.rl_zoo", *words]
+    return subprocess.run(command, capture_output=True, text=True)
+
+
+@pytest.mark.slow
+def test_the_script_for_videos_knows_our_environments(tmp_path):
+    """It has no --gym-packages."""
+    run = tmp_path / "ddpg" / "TorcsLite-v0_1"
+    env = gym.make("TorcsLite-v0")
+    DDPG("MlpPolicy", env, buffer_size=1, policy_kwargs={"net_arch": [4]}).save(
+        run / "TorcsLite-v0"
+    )
+    words = ["--algo", "ddpg", "--env", "TorcsLite-v0", "-f", str(tmp_path), "-n", "5"]
+    done = zoo_script("record_video", *words)
+    assert done.returncode == 0, done.stderr
+    (video,) = run.glob("videos/*.mp4")
+    assert video.stat().st_size > 1000
+
+
+@pytest.mark.parametrize("words", [[], ["no_such"], ["../x"]])
+def test_another_script_is_told(words):
+    done = zoo_script(*words)
+    assert done.returncode == 1
+    assert done.stderr.startswith("the RL Zoo has no script '")

@@ -1,0 +1,28 @@
+"""``python -m sb3_torcs.rl_zoo SCRIPT …``: the RL Zoo's own scripts, with our environments.
+
+Some of them, ``record_video`` among them, have no ``--gym-packages``.
+"""
+
+from __future__ import annotations
+
+import runpy
+import sys
+from importlib import util
+
+import sb3_torcs  # noqa: F401  registers the environments
+
+__all__ = ["main"]
+
+
+def main() -> None:
+    """Run the script that the first word names, with the words after it."""
+    script = sys.argv[1] if len(sys.argv) > 1 else ""
+    name = f"rl_zoo3.{script}"
+    if not script.isidentifier() or util.find_spec(name) is None:
+        sys.exit(f"the RL Zoo has no script '{script}'; e.g.: python -m sb3_torcs.rl_zoo enjoy -h")
+    sys.argv = [name, *sys.argv[2:]]
+    runpy.run_module(name, run_name="__main__", alter_sys=True)
+
+
+if __name__ == "__main__":
+    main()
