@@ -33,6 +33,7 @@ LEFT, RIGHT = "left", "right"
 MAX_STEPS = 20_000  # [-] of the whole road; the longest of the game's tracks has 2,956
 MAX_WIDTH = 1000.0  # [m] of road or ground; the game's tracks have 101
 MAX_LENGTH = 100_000.0  # [m] of one segment; the game computes in single precision
+LEAST = 1e-6  # [m] or [rad] of a length, a radius or an arc: less is lost in rounding
 SAMPLES_PER_ARC = 36  # as TORCS does when it looks for the corner of its map
 
 
@@ -323,8 +324,11 @@ def _positive(section: Section, name: str) -> float:
     :return: its value
     """
     value = section.numbers.get(name, 0.0)
-    if value <= 0.0:
-        raise TrackFileError(f"{section.place}: the segment needs '{name}' above 0, it is {value}")
+    if value < LEAST:
+        raise TrackFileError(
+            f"{section.place}: the segment needs '{name}' above 0, it is {value:g}; at least "
+            f"{LEAST:g} makes sense"
+        )
     return value
 
 

@@ -366,6 +366,13 @@ class TestAsTheGame:
         with pytest.raises(TrackFileError, match=f"<{tag}> is named .* expected 1 to 100 letters"):
             read(text)
 
+    def test_a_radius_that_rounding_swallows_is_refused(self, read):
+        text = VERSION_4.replace('"end radius" val="20"', '"end radius" val="1e-30"')
+        with pytest.raises(
+            TrackFileError, match="needs 'end radius' above 0, it is 1e-30; at least 1e-06"
+        ):
+            read(text)
+
     def test_steps_are_counted_in_single_precision(self, read):
         """0.3 / 0.1 is a little less than 3 in double precision, and 3 in the game's."""
         text = VERSION_4.replace('unit="km" val="0.1"', 'val="0.3"')
