@@ -270,10 +270,8 @@ def zoo_script(*words):
 def test_the_script_for_videos_knows_our_environments(tmp_path):
     """It has no --gym-packages."""
     run = tmp_path / "ddpg" / "TorcsLite-v0_1"
-    env = gym.make("TorcsLite-v0")
-    DDPG("MlpPolicy", env, buffer_size=1, policy_kwargs={"net_arch": [4]}).save(
-        run / "TorcsLite-v0"
-    )
+    run.mkdir(parents=True)
+    DDPG("MlpPolicy", gym.make("TorcsLite-v0"), buffer_size=1).save(run / "TorcsLite-v0")
     words = ["--algo", "ddpg", "--env", "TorcsLite-v0", "-f", str(tmp_path), "-n", "5"]
     done = zoo_script("record_video", *words)
     assert done.returncode == 0, done.stderr
