@@ -160,6 +160,14 @@ class TestStartsElsewhere:
             drives.append([engine.read(car).x for car in range(len(field))])
         assert drives[0] == drives[2] != drives[1]
 
+    def test_a_robot_is_pushed_back(self, game):
+        """Its plan is a ring, whose index gets below zero where it begins."""
+        field = [AGENT, ("inferno", 3)]
+        engine = make_engine(game, "dirt-1", field, car="155-DTM", session="race")
+        engine.start_at(0.0, 0.0, 0.0, 0.0)
+        engine.step(0.0, 1.0, 0.0, -1, 900)
+        assert engine.read(1).distance_raced < -100.0
+
 
 class TestRefusals:
     @pytest.mark.parametrize(

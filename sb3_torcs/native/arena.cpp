@@ -91,6 +91,27 @@ void Arena::release(void* memory) {
     head().free[block->size_class] = memory;
 }
 
+void* Arena::allocate_roomy(std::size_t size) {
+    Head& top = head();
+    if (top.roomy_number == MOST_ROOMY) return allocate(size);
+    const std::size_t room = (size + 15) / 16 * 16;
+    char* block = static_cast<char*>(allocate(room + size));
+    top.roomy[top.roomy_number++] = {block + room, block};
+    return block + room;
+}
+
+void Arena::release_roomy(void* memory) {
+    Head& top = head();
+    Roomy* end = top.roomy + top.roomy_number;
+    Roomy* found = std::find_if(top.roomy, end, [memory](const Roomy& roomy) {
+        return roomy.memory == memory;
+    });
+    if (found == end) return release(memory);
+    release(found->block);
+    *found = end[-1];
+    top.roomy_number--;
+}
+
 std::size_t Arena::size_of(const void* memory) const {
     return class_size((static_cast<const Block*>(memory) - 1)->size_class);
 }

@@ -19,6 +19,11 @@ public:
 
     void* allocate(std::size_t size);
     void release(void* memory);
+
+    // The same with room before it, as much as in it, that is nobody else's.
+    void* allocate_roomy(std::size_t size);
+    void release_roomy(void* memory);  // takes any block
+
     std::size_t size_of(const void* memory) const;
     bool owns(const void* memory) const {
         return memory >= base_ && memory < base_ + reserve_;
@@ -31,10 +36,17 @@ public:
     void restore(const std::vector<char>& saved);
 
 private:
+    static constexpr int MOST_ROOMY = 512;
+    struct Roomy {
+        void* memory;
+        void* block;  // with the room
+    };
     // In the arena itself, so that a snapshot has it.
     struct Head {
         std::size_t used;
         void* free[64];  // lists of released blocks, by size class
+        int roomy_number;
+        Roomy roomy[MOST_ROOMY];
     };
     struct Block {
         std::size_t size_class;

@@ -48,6 +48,23 @@ void release(void* memory) {
         free(memory);
 }
 
+// The plans of some robots (inferno, lliaw, tita) are rings of 25 kB, whose index gets below zero when
+// the car is pushed back over the ring's beginning: the remainder of a negative number. In the game
+// they then use what lies before, and crash it sooner or later. With room there the ring is whole.
+constexpr std::size_t SMALLEST_RING = 4 << 10, LARGEST_RING = 64 << 10;
+
+void* allocate_array(std::size_t size) {
+    if (!current || size < SMALLEST_RING || size > LARGEST_RING) return allocate(size);
+    return current->arena->allocate_roomy(size);
+}
+
+void release_array(void* memory) {
+    if (memory && current && current->arena->owns(memory))
+        current->arena->release_roomy(memory);
+    else
+        release(memory);
+}
+
 void* allocate_zeroed(std::size_t number, std::size_t size) {
     if (!current) return calloc(number, size);
     void* memory = allocate(number * size);
@@ -182,11 +199,11 @@ const std::unordered_map<std::string, void*>& replacements() {
         {"free", address(release)},
         {"strdup", address(duplicate)},
         {"_Znwm", address(allocate)},
-        {"_Znam", address(allocate)},
+        {"_Znam", address(allocate_array)},
         {"_ZdlPv", address(release)},
         {"_ZdlPvm", address(release)},
-        {"_ZdaPv", address(release)},
-        {"_ZdaPvm", address(release)},
+        {"_ZdaPv", address(release_array)},
+        {"_ZdaPvm", address(release_array)},
         {"rand", address(random_number)},
         {"srand", address(seed_random)},
         {"clock", address(no_time_passes)},
