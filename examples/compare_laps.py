@@ -55,7 +55,12 @@ def robot_samples(name, track):
 def model_samples(name, track):
     """What a model does in three laps, once per decision."""
     record = driver_record(name)
-    env = race_environment(record.env_id or "Torcs-v0", record.env_kwargs, track)
+    env = race_environment(
+        record.env_id or "Torcs-v0",
+        record.env_kwargs,
+        track,
+        hyperparameters=record.hyperparameters,
+    )
     rows = [
         {**step.car._asdict(), "throttle": step.action[1], "brake": step.action[2]}
         for step in drive(env, load_driver(name, env))

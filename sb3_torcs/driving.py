@@ -8,7 +8,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from sb3_torcs.models import load_driver
+from sb3_torcs.models import driver_record, load_driver
+from sb3_torcs.wrapping import wrapped
 
 __all__ = ["Agent"]
 
@@ -34,7 +35,8 @@ class Agent:
         trust: bool = False,
         name: str = "",
     ) -> None:
-        self.env = gym.make("sb3_torcs:Torcs-v0", backend="scr", max_episode_steps=-1, **settings)
+        bare = gym.make("sb3_torcs:Torcs-v0", backend="scr", max_episode_steps=-1, **settings)
+        self.env = wrapped(bare, driver_record(model).hyperparameters, trust=trust)
         self.driver = load_driver(model, self.env, algo, trust)
         self.backend.driver_name = name
         self.error: BaseException | None = None

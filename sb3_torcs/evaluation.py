@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
 
 import gymnasium as gym
@@ -172,7 +173,12 @@ def time_limit(kwargs: Mapping[str, Any]) -> int:
 
 
 def race_environment(
-    env_id: str, env_kwargs: Mapping[str, Any], track: str | None = None
+    env_id: str,
+    env_kwargs: Mapping[str, Any],
+    track: str | None = None,
+    *,
+    hyperparameters: Mapping[str, Any] = MappingProxyType({}),
+    trust: bool = False,
 ) -> gym.Env[Any, Any]:
     """
     Build the environment of an evaluation: three laps from the grid.
@@ -180,11 +186,16 @@ def race_environment(
     :param env_id: of the training
     :param env_kwargs: of the training
     :param track: instead of the training's
+    :param hyperparameters: of the training, whose wrappers are put around the environment
+    :param trust: as of :func:`~sb3_torcs.wrapping.wrapped`
     :return: the environment, which nothing but the race ends
     """
+    from sb3_torcs.wrapping import wrapped
+
     kwargs = {name: env_kwargs[name] for name in KEPT if name in env_kwargs}
     kwargs.update({"laps": RACE_LAPS}, **({} if track is None else {"track": track}))
-    return gym.make(env_id, max_episode_steps=time_limit(kwargs), **kwargs)
+    env = gym.make(env_id, max_episode_steps=time_limit(kwargs), **kwargs)
+    return wrapped(env, hyperparameters, trust=trust)
 
 
 def drive(env: gym.Env[Any, Any], driver: Driver, *, seed: int | None = None) -> Iterator[Step]:

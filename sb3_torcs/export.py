@@ -106,7 +106,7 @@ def export_actor(model: Any, path: str | os.PathLike[str]) -> Path:
             f"an export needs {' and '.join(missing)}; type: pip install {' '.join(NEEDED)}"
         )
     policy, statistics = _parts(model)
-    _check_policy(policy)
+    _check_policy(policy, statistics)
     path = Path(path)
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
@@ -134,7 +134,7 @@ def _parts(model: Any) -> tuple[Any, Any]:
     return getattr(model, "policy", model), statistics if normalized else None
 
 
-def _check_policy(policy: Any) -> None:
+def _check_policy(policy: Any, statistics: Any) -> None:
     """Make sure that a policy is a function from one observation to one action."""
     name = type(policy).__name__
     if not isinstance(policy, BasePolicy) or not any(True for _ in policy.parameters()):
@@ -150,6 +150,12 @@ def _check_policy(policy: Any) -> None:
     for space in (policy.observation_space, policy.action_space):
         if not isinstance(space, spaces.Box):
             raise ModelMismatch(f"{name} is for {space}; an export needs spaces of numbers (Box)")
+    found = getattr(statistics, "obs_rms", statistics)
+    if found is not None and np.shape(found.mean) != policy.observation_space.shape:
+        raise ModelMismatch(
+            f"{name} sees stacked frames that are normalized one by one, and an export has no "
+            "memory for them; export a model that was trained without normalize or frame_stack"
+        )
 
 
 def _graph(driver: _RawDriver, space: spaces.Space[Any]) -> bytes:

@@ -6,6 +6,7 @@ import io
 import json
 import os
 import pickle
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +16,23 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from sb3_torcs.drivers import SCRIPTED, ScriptedDriver
-from sb3_torcs.errors import InvalidOption, ModelMismatch, ModelNotTrusted, near_miss
-from sb3_torcs.model_file import as_mismatch, check_finite, saved_data, saved_weights
+from sb3_torcs.errors import (
+    InvalidOption,
+    ModelMismatch,
+    ModelNotTrusted,
+    near_miss,
+)
+from sb3_torcs.model_algorithm import algorithm_of, check_same, is_sbx, told_algorithm
+from sb3_torcs.model_file import (
+    as_mismatch,
+    check_finite,
+    saved_data,
+    saved_weights,
+)
 from sb3_torcs.model_policy import Spaces, build_policy, readable_policy, readable_space
 from sb3_torcs.model_record import TrainingRecord, record_beside, record_within
 from sb3_torcs.sensors import range_finder_angles
+from sb3_torcs.wrapping import frames_of, stacked_space, unrebuilt
 
 __all__ = [
     "Driver",
@@ -40,23 +53,9 @@ __all__ = [
 BEST_MODEL = "best_model.zip"
 AGENTS = Path(__file__).parent / "agents"
 
-SAVED_AS = {"ddpg": "td3"}  # a model of one does not tell that it is not of the other
-
 UNTRUSTED = (
     "'{model}' cannot be driven from plain data alone: {why}. Loading the rest runs whatever code "
     "is pickled in it; if you know who made it, add --trust (from Python: trust=True)"
-)
-
-# What only one family of algorithms saves; the first that is there names it. DDPG saves what TD3
-# does, and either class drives the other's models.
-TELLING_KEYS = (
-    ("top_quantiles_to_drop_per_net", "tqc"),
-    ("line_search_shrinking_factor", "trpo"),
-    ("clip_range", "ppo"),
-    ("exploration_fraction", "dqn"),
-    ("target_entropy", "sac"),
-    ("target_policy_noise", "td3"),
-    ("vf_coef", "a2c"),
 )
 
 
@@ -67,11 +66,14 @@ class Driver:
     :param model: an algorithm or a policy of Stable-Baselines3
     :param statistics: something with VecNormalize's ``normalize_obs``; ``None`` if the model
         learned from the observations as they are
+    :param frames: newest observations that it sees at once, as behind ``VecFrameStack``; ``None``
+        if it sees one as it is
     """
 
-    def __init__(self, model: Any, statistics: Any = None) -> None:
+    def __init__(self, model: Any, statistics: Any = None, frames: int | None = None) -> None:
         self.model = model
         self.statistics = statistics
+        self.frames = frames
 
     def predict(
         self,
@@ -84,17 +86,35 @@ class Driver:
         Choose an action.
 
         :param observation: as the environment gives it
-        :param state: of a recurrent model, as the call before returned it
+        :param state: as the call before returned it; ``None`` begins
         :param episode_start: (1,) whether an episode begins here
         :param deterministic: whether to leave out chance
-        :return: the action and the model's state
+        :return: the action, and what is to be remembered
         """
         if self.statistics is not None:
             observation = self.statistics.normalize_obs(observation)
-        answer: tuple[npt.NDArray[np.float32], Any] = self.model.predict(
-            observation, state, episode_start, deterministic
-        )
-        return answer
+        if self.frames is None:
+            action, state = self.model.predict(observation, state, episode_start, deterministic)
+            return action, state
+        stack, state = (None, None) if state is None else state
+        stack = self._stacked(observation, stack, episode_start)
+        action, state = self.model.predict(stack, state, episode_start, deterministic)
+        return action, (stack, state)
+
+    def _stacked(
+        self,
+        observation: npt.NDArray[np.float32],
+        before: npt.NDArray[np.float32] | None,
+        episode_start: npt.NDArray[np.bool_] | None,
+    ) -> npt.NDArray[np.float32]:
+        """Put the newest observation behind those before it, which are 0 before an episode."""
+        assert self.frames is not None
+        size = observation.shape[-1]
+        if before is None:
+            before = np.zeros((*observation.shape[:-1], self.frames * size), observation.dtype)
+        elif episode_start is not None:
+            before = np.where(np.reshape(episode_start, (*before.shape[:-1], 1)), 0.0, before)
+        return np.concatenate([before[..., size:], observation], axis=-1, dtype=observation.dtype)
 
 
 def find_model(path: str | Path, *, prefer_last: bool = False) -> Path:
@@ -236,6 +256,7 @@ def check_spaces(
     model: Path,
     saved: Spaces,
     env: gym.Env[Any, Any],
+    frames: int | None = None,
 ) -> None:
     """
     Make sure that a model fits an environment.
@@ -243,9 +264,10 @@ def check_spaces(
     :param model: the file, for the message
     :param saved: what the model sees and does
     :param env: that it is to drive
+    :param frames: observations that the model is to see at once
     :raises ModelMismatch: if the layouts differ
     """
-    given = (env.observation_space, env.action_space)
+    given = (stacked_space(env.observation_space, frames), env.action_space)
     for what, has, needs in zip(("observations", "actions"), saved, given, strict=True):
         if has == needs:
             continue
@@ -260,7 +282,13 @@ def check_spaces(
 
 
 def check_resumable(
-    model: Path, env: gym.Env[Any, Any], algo: str, n_envs: int, *, trust: bool = False
+    model: Path,
+    env: gym.Env[Any, Any],
+    algo: str,
+    n_envs: int,
+    *,
+    frames: int | None = None,
+    trust: bool = False,
 ) -> bool:
     """
     Make sure that a training can go on from a model.
@@ -269,6 +297,7 @@ def check_resumable(
     :param env: that the training is to go on in
     :param algo: that is to learn, as the zoo calls it
     :param n_envs: number of environments in which it is to learn
+    :param frames: observations that it is to see at once
     :param trust: whether the model need not tell how it was trained
     :return: whether there is a memory to go on with
     :raises ModelMismatch: if they do not belong together
@@ -289,8 +318,8 @@ def check_resumable(
             "a model runs whatever code is pickled in it and in the replay buffer beside it; if "
             "you know who made them, add --trust"
         )
-    check_spaces(model, saved_spaces(model, trust=True), env)
-    _check_same(model, record.algo or _told_algorithm(data), algo)
+    check_spaces(model, saved_spaces(model, trust=True), env, frames)
+    check_same(model, record.algo or told_algorithm(data), algo)
     seen, angles = record.env_kwargs.get("range_finders", "scr"), "range_finder_angles"
     sees = env.get_wrapper_attr(angles) if env.has_wrapper_attr(angles) else None
     if record.env_id and sees is not None and not np.allclose(range_finder_angles(seen), sees):
@@ -309,12 +338,6 @@ def check_resumable(
     return True
 
 
-def _check_same(model: Path, saved: str | None, algo: str) -> None:
-    """Make sure that a model is one of this algorithm."""
-    if saved is not None and SAVED_AS.get(saved, saved) != SAVED_AS.get(algo, algo):
-        raise ModelMismatch(f"'{model}' is a model of {saved}, not of {algo}; give --algo {saved}")
-
-
 def _layout(space: spaces.Space[Any]) -> str:
     """Say in a few words what a space is."""
     if isinstance(space, spaces.Box):
@@ -330,7 +353,7 @@ def load_driver(
     Load what is to drive. Nothing that the file holds is run, unless it is trusted.
 
     :param path: of a saved model or its run's folder, or ``"scripted"``
-    :param env: that it is to drive
+    :param env: that it is to drive, with the wrappers of the training
     :param algo: as the zoo calls it; ``None`` finds out
     :param trust: load the model as SB3 does, which runs whatever is pickled in it
     :return: something with SB3's ``predict``
@@ -343,18 +366,24 @@ def load_driver(
     file = find_model(path)
     data = saved_data(file)
     record = _record(file, data)
+    reason = unrebuilt(record.hyperparameters)
+    if reason is not None:
+        raise ModelMismatch(f"'{file}' cannot be driven as it was trained: {reason}")
+    frames = frames_of(record.hyperparameters)
+    if is_sbx(data) and not trust:
+        raise ModelNotTrusted(UNTRUSTED.format(model=file, why="SBX pickles its weights"))
     seen = saved_spaces(file, trust=trust)
-    check_spaces(file, seen, env)
+    check_spaces(file, seen, env, frames)
     model = _as_sb3_does(file, algo or record.algo) if trust else _policy(file, record, algo, seen)
-    return Driver(model, _statistics(file, record, trust))
+    return Driver(model, _statistics(file, record, trust), frames)
 
 
 def _policy(file: Path, record: TrainingRecord, algo: str | None, seen: Spaces) -> Any:
     """Build a policy from plain data, with its weights."""
     data = saved_data(file)
     if algo is not None:
-        _algorithm(algo, data, file)
-        _check_same(file, record.algo or _told_algorithm(data), algo)
+        algorithm_of(algo, data, file)
+        check_same(file, record.algo or told_algorithm(data), algo)
     weights = saved_weights(file)
     with as_mismatch(f"'{file}' does not load", "give"):
         try:
@@ -367,7 +396,7 @@ def _policy(file: Path, record: TrainingRecord, algo: str | None, seen: Spaces) 
 
 def _as_sb3_does(file: Path, algo: str | None) -> Any:
     """Load a model with all that is pickled in it."""
-    name, algorithm = _algorithm(algo, saved_data(file), file)
+    name, algorithm = algorithm_of(algo, saved_data(file), file)
     # On the CPU: for one timestep at a time it is the fastest, and it is always there. The
     # schedules are of no use to a driver, and the saved ones may be from another version.
     # Nor is a replay buffer: SB3 warns of the class that it chose itself for returns over several
@@ -383,8 +412,15 @@ def _statistics(file: Path, record: TrainingRecord, trust: bool) -> Any:
     """Find the statistics that a model learned with, if it learned from normalized observations."""
     from stable_baselines3.common.vec_env import VecNormalize
 
-    if record.statistics is not None or record.statistics_file is None:
+    if record.statistics is not None:
         return record.statistics
+    if record.statistics_file is None:
+        if _normalized(record.hyperparameters.get("normalize")):
+            raise ModelMismatch(
+                f"'{file}' has learned from normalized observations, and their statistics are not "
+                "there; put the vecnormalize.pkl of its training beside its config.yml"
+            )
+        return None
     if not trust:
         why = f"its statistics, '{record.statistics_file}', are pickled"
         raise ModelNotTrusted(UNTRUSTED.format(model=file, why=why))
@@ -393,6 +429,13 @@ def _statistics(file: Path, record: TrainingRecord, trust: bool) -> Any:
         if not isinstance(statistics, VecNormalize):
             raise TypeError(f"a {type(statistics).__name__}")
         return statistics
+
+
+def _normalized(normalize: Any) -> bool:
+    """Read whether a training had normalized observations; strings are the zoo's to evaluate."""
+    if isinstance(normalize, Mapping):
+        return bool(normalize.get("norm_obs", True))
+    return normalize is True
 
 
 def _scripted(env: gym.Env[Any, Any]) -> Any:
@@ -404,25 +447,3 @@ def _scripted(env: gym.Env[Any, Any]) -> Any:
             f"{np.degrees(angles).round(3).tolist()}; leave --range-finders out"
         )
     return ScriptedDriver()
-
-
-def _told_algorithm(data: dict[str, Any]) -> str | None:
-    """Find out the algorithm of a model by what it saved."""
-    if "recurrent" in str(data.get("policy_class")).lower():
-        return "ppo_lstm"
-    return next((algo for key, algo in TELLING_KEYS if key in data), None)
-
-
-def _algorithm(name: str | None, data: dict[str, Any], model: Path) -> tuple[str, Any]:
-    """Find the algorithm of a saved model: its name and its class."""
-    from rl_zoo3.utils import ALGOS
-
-    name = name or _told_algorithm(data)
-    if name is None:
-        raise ModelMismatch(f"'{model}' does not tell its algorithm; say it: --algo ddpg")
-    if name not in ALGOS:
-        raise InvalidOption(
-            f"the RL Zoo has no algorithm '{name}'{near_miss(name, ALGOS)} it has: "
-            f"{', '.join(sorted(ALGOS))}"
-        )
-    return name, ALGOS[name]

@@ -21,6 +21,7 @@ from sb3_torcs import zoo
 from sb3_torcs.errors import StudyError, near_miss
 from sb3_torcs.plain_yaml import read_yaml
 from sb3_torcs.tracks import available_tracks, load_track
+from sb3_torcs.wrapping import unrebuilt
 from sb3_torcs.zoo_data import as_data
 
 __all__ = ["FIELDS", "Study", "Trial", "merged", "read_study", "track_name"]
@@ -31,7 +32,6 @@ SOURCE = ("algo", "env", "conf_file", "entry", "n_timesteps", "eval_tracks")
 
 WORDS = ("algo", "env", "conf_file", "entry")
 KEYS = (*REQUIRED, *SOURCE, "variants", "final_tracks")
-WRAPPERS = ("env_wrapper", "vec_env_wrapper", "frame_stack")
 ROAD = "road"
 SEEDS = 2**32  # that NumPy takes
 MANY = 10_000  # a larger number of seeds is one seed, without its brackets
@@ -275,13 +275,9 @@ def _source(
 
 def _check_evaluable(entry: Mapping[str, Any], place: zoo.Place) -> None:
     """Make sure that evaluations can be driven in the training's environment."""
-    # Wrappers would have to be around the car of an evaluation, too, wherever it drives.
-    for key in WRAPPERS:
-        if key in entry:
-            raise StudyError(
-                f"{place}: {key} is not for studies, whose models have to drive in the bare "
-                "environment; take it away: '" + key + ": null'"
-            )
+    reason = unrebuilt(entry)
+    if reason is not None:
+        raise StudyError(f"{place}: {reason}; or take it away: 'vec_env_wrapper: null'")
 
 
 def _tracks(value: Any, what: str) -> tuple[str, ...]:

@@ -31,6 +31,7 @@ from sb3_torcs.ladder import rung
 from sb3_torcs.model_writing import recipe, write_record
 from sb3_torcs.models import BEST_MODEL, Driver, load_driver
 from sb3_torcs.study_file import FIELDS, Trial, track_name
+from sb3_torcs.wrapping import frames_of
 from sb3_torcs.zoo_training import command_as_text
 
 __all__ = ["Row", "Training", "final_row"]
@@ -177,7 +178,7 @@ class Training:
     def _load(self, folder: Path) -> None:
         env = self.model.get_env()
         if (folder / STATISTICS).is_file():
-            env = VecNormalize.load(str(folder / STATISTICS), env.venv)
+            env = _with_statistics(env, folder / STATISTICS)
         self.model = type(self.model).load(folder / LAST_MODEL, env=env, device="cpu")
         if (folder / MEMORY).is_file():
             with np.load(folder / MEMORY) as memory:
@@ -190,8 +191,9 @@ class Training:
 
     def _race(self, track: str) -> Episode:
         if track not in self._races:
-            self._races[track] = race_environment(self.trial.env_id, self.trial.env_kwargs, track)
-        (episode,) = evaluate(self._races[track], Driver(self.model, self.normalizer))
+            self._races[track] = _race_environment(self.trial, track)
+        driver = Driver(self.model, self.normalizer, frames_of(self.trial.entry))
+        (episode,) = evaluate(self._races[track], driver)
         return episode
 
     def _save_model(self, file: Path | io.BytesIO) -> None:
@@ -254,13 +256,28 @@ def final_row(trial: Trial, model: Path, track: str, progress: Row) -> Row:
     :param progress: the row of the evaluation that the model was kept for
     :return: a row of the results
     """
-    env = race_environment(trial.env_id, trial.env_kwargs, track)
+    env = _race_environment(trial, track)
     try:
         (race,) = evaluate(env, load_driver(model, env, trial.algo))
     finally:
         env.close()
     kept_at = {name: progress[name] for name in ("decisions", "episodes", "wall_s", "cpu_s")}
     return _row(trial, "final", track, race, {**kept_at, "kept": True})
+
+
+def _with_statistics(env: Any, file: Path) -> Any:
+    """Put saved statistics where new ones are, which may be below stacked frames."""
+    if isinstance(env, VecNormalize):
+        return VecNormalize.load(str(file), env.venv)
+    env.venv = _with_statistics(env.venv, file)
+    return env
+
+
+def _race_environment(trial: Trial, track: str) -> Any:
+    """Build the environment of an evaluation; a study's wrappers are those of who started it."""
+    return race_environment(
+        trial.env_id, trial.env_kwargs, track, hyperparameters=trial.entry, trust=True
+    )
 
 
 def _row(trial: Trial, phase: str, track: str, race: Episode, more: Row) -> Row:

@@ -13,7 +13,7 @@ import pytest
 import torch as th
 from rl_zoo3.utils import ALGOS
 from stable_baselines3 import DDPG, DQN, PPO, SAC, TD3
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 from toy import ToyRace
 
 from sb3_torcs import export, policies
@@ -149,6 +149,12 @@ def test_a_file_that_cannot_be_written_is_told(tmp_path):
 def test_a_policy_that_remembers_is_refused(tmp_path):
     model = ALGOS["ppo_lstm"]("MlpLstmPolicy", race(), device="cpu", seed=0)
     with pytest.raises(ModelMismatch, match="remembers what it saw, and an export has no memory"):
+        export_actor(model, tmp_path / "driver.onnx")
+
+
+def test_frames_that_are_normalized_one_by_one_are_refused(tmp_path):
+    model = PPO("MlpPolicy", VecFrameStack(VecNormalize(race()), 2), device="cpu")
+    with pytest.raises(ModelMismatch, match="sees stacked frames that are normalized one by one"):
         export_actor(model, tmp_path / "driver.onnx")
 
 

@@ -1,4 +1,8 @@
+import base64
+import json
 import pickle
+import sys
+import types
 import zipfile
 
 import gymnasium as gym
@@ -6,13 +10,15 @@ import numpy as np
 import pytest
 import yaml
 from gymnasium import spaces
+from rl_zoo3.utils import ALGOS
 from stable_baselines3 import DDPG, PPO, SAC
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import sb3_torcs  # noqa: F401  registers the environments
 from sb3_torcs import model_record, models
 from sb3_torcs.drivers import ScriptedDriver
-from sb3_torcs.errors import InvalidOption, ModelMismatch, ModelNotTrusted
+from sb3_torcs.errors import InvalidOption, ModelMismatch, ModelNotTrusted, PackageMissing
 
 SMALL = {"device": "cpu", "seed": 0}
 
@@ -53,6 +59,37 @@ def test_a_model_without_a_record_is_loaded_by_what_it_saved(env, tmp_path, algo
     driver = models.load_driver(tmp_path / "m.zip", env)
     expected = model.predict(observation(env), deterministic=True)[0]
     np.testing.assert_array_equal(driver.predict(observation(env), deterministic=True)[0], expected)
+
+
+@pytest.mark.parametrize("algo", sorted(ALGOS.keys() - {"ddpg", "dqn", "qrdqn"}))
+def test_a_model_tells_its_algorithm(env, tmp_path, algo):
+    """That of DDPG says that it is of TD3, which is the same with other defaults."""
+    policy = "MlpLstmPolicy" if algo == "ppo_lstm" else "MlpPolicy"
+    kwargs = {"buffer_size": 1} if issubclass(ALGOS[algo], OffPolicyAlgorithm) else {}
+    model = ALGOS[algo](policy, env, policy_kwargs={"net_arch": [4]}, **kwargs, **SMALL)
+    model.save(tmp_path / "m.zip")
+    driver = models.load_driver(tmp_path / "m.zip", env, trust=True)
+    assert type(driver.model) is ALGOS[algo]
+    driver = models.load_driver(tmp_path / "m.zip", env, algo)
+    expected = model.predict(observation(env), deterministic=True)[0]
+    np.testing.assert_array_equal(driver.predict(observation(env), deterministic=True)[0], expected)
+
+
+def test_a_model_of_sbx_needs_trust_and_its_package(env, saved, monkeypatch):
+    """The policy's class is named by a pickle, which is read and not run."""
+    with zipfile.ZipFile(saved[1]) as archive:
+        data = json.loads(archive.read("data"))
+    named = b"\x80\x04\x8c\x10sbx.tqc.policies\x8c\x09TQCPolicy\x93."
+    data["policy_class"] = {":serialized:": base64.b64encode(named).decode()}
+    rewritten(saved[1], data=json.dumps(data).encode())
+    with pytest.raises(ModelNotTrusted, match=r"SBX pickles its weights.*add --trust"):
+        models.load_driver(saved[1], env)
+    monkeypatch.setitem(sys.modules, "sbx", None)
+    with pytest.raises(PackageMissing, match=r"is a model of SBX.*pip install sbx-rl"):
+        models.load_driver(saved[1], env, trust=True)
+    found = types.SimpleNamespace(load=lambda *_, **__: saved[0])
+    monkeypatch.setitem(sys.modules, "sbx", types.SimpleNamespace(TQC=found))
+    assert models.load_driver(saved[1], env, trust=True).model is saved[0]
 
 
 def test_the_record_of_the_zoo_names_the_algorithm_and_the_environment(saved, env):

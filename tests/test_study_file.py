@@ -13,6 +13,7 @@ from sb3_torcs.study_file import merged, read_study
 from sb3_torcs.tracks import available_tracks
 
 STUDIES = sorted((Path(__file__).parent.parent / "examples" / "studies").glob("*.yml"))
+VECTORS = "stable_baselines3.common.vec_env.VecExtractDictObs"
 GOOD = {"name": "s", "env": "TorcsLite-v0", "seeds": 2, "eval_interval": 100}
 
 
@@ -65,7 +66,10 @@ def test_the_shipped_studies_can_be_run(path):
         ({"variants": {"a": {"env_kwargs": {"reward": "blgo"}}}}, "did you mean 'blog'?"),
         ({"variants": {"a": {"n_steps": None}}}, "null takes 'n_steps' away, but it is not there"),
         ({"final_tracks": []}, "final_tracks is []; expected a list of tracks"),
-        ({"variants": {"a": {"frame_stack": 2}}}, "frame_stack is not for studies"),
+        (
+            {"variants": {"a": {"vec_env_wrapper": VECTORS}}},
+            f"vec_env_wrapper {VECTORS} changes vectors of environments",
+        ),
     ],
 )
 def test_a_mistake_is_told_before_anything_starts(tmp_path, capsys, changes, says):

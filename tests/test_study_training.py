@@ -113,8 +113,17 @@ def test_a_training_that_is_killed_after_every_evaluation_learns_the_same(tmp_pa
         np.testing.assert_array_equal(*rings)
 
 
-def test_an_algorithm_without_memory_goes_on_the_same(tmp_path):
-    wanted = trial(tmp_path, PPO)
+BEHIND_WRAPPERS = {
+    **PPO,
+    "env_wrapper": {"sb3_contrib.common.wrappers.TimeFeatureWrapper": {"max_steps": 500}},
+    "normalize": {"norm_obs": True, "norm_reward": False},
+    "frame_stack": 3,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("changes", [PPO, BEHIND_WRAPPERS], ids=["bare", "behind wrappers"])
+def test_an_algorithm_without_memory_goes_on_the_same(tmp_path, changes):
+    wanted = trial(tmp_path, changes)
     undisturbed = Training(wanted)
     undisturbed.run(lambda: None)
     undisturbed.close()

@@ -103,6 +103,7 @@ def _drive(args: argparse.Namespace) -> tuple[list[Episode], Any]:
     from sb3_torcs.cli.recording import Recorder
     from sb3_torcs.evaluation import choose_world, evaluate, time_limit
     from sb3_torcs.models import load_driver
+    from sb3_torcs.wrapping import wrapped
     from sb3_torcs.zoo import check_racing
 
     record = told_record(args.model)
@@ -113,8 +114,10 @@ def _drive(args: argparse.Namespace) -> tuple[list[Episode], Any]:
     check_racing(env_id)
     kwargs = environment_kwargs(args, record)
     recorder = Recorder(env_id, kwargs, time_limit(kwargs))
-    driver = load_driver(args.model, recorder, args.algo, args.trust)
-    result = evaluate(recorder, driver, episodes=args.episodes, seed=args.seed)
+    # Wrappers are around the recorder: what comes through them is what the car did.
+    env = wrapped(recorder, record.hyperparameters, trust=args.trust)
+    driver = load_driver(args.model, env, args.algo, args.trust)
+    result = evaluate(env, driver, episodes=args.episodes, seed=args.seed)
     return result, recorder
 
 

@@ -9,7 +9,7 @@ import shlex
 import signal
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
@@ -193,6 +193,7 @@ def train_run(options: TrainOptions) -> Run:
     import gymnasium as gym
 
     from sb3_torcs import zoo
+    from sb3_torcs.wrapping import wrapped
 
     for word in options.zoo_args:
         if word.partition("=")[0] in OURS:
@@ -203,7 +204,7 @@ def train_run(options: TrainOptions) -> Run:
     entry, changed = _entry(options)
     # Made once, so that what is wrong with it is told before anything starts.
     with contextlib.closing(gym.make(options.env, **changed["env_kwargs"])) as env:
-        resume = _resumed(options, entry, env, changed.get("n_envs", 1))
+        resume = _resumed(options, entry, wrapped(env, changed, trust=True), changed)
     folder = writable_folder(options.folder)
     tensorboard = _for_tensorboard(options.tensorboard or folder / "tensorboard")
     wanted = options.timesteps or zoo.decisions(changed)
@@ -274,22 +275,26 @@ def _changes(zoo_args: Sequence[str]) -> dict[str, Any]:
     return {**known.hyperparams, "env_kwargs": known.env_kwargs}
 
 
-def _resumed(options: TrainOptions, entry: dict[str, Any], env: Any, n_envs: int) -> Path | None:
+def _resumed(
+    options: TrainOptions, entry: dict[str, Any], env: Any, changed: Mapping[str, Any]
+) -> Path | None:
     """
     Find and check the model to go on from; with its memory it needs no new warm-up.
 
     :param options: what to train
     :param entry: of the hyperparameter file; is adapted
     :param env: one of those to train in
-    :param n_envs: how many they are
+    :param changed: what the zoo will make of the entry
     :return: the model's file; ``None`` begins anew
     """
     if options.resume is None:
         return None
     from sb3_torcs.models import check_resumable, find_model
+    from sb3_torcs.wrapping import frames_of
 
     path = find_model(options.resume, prefer_last=True)
-    memory = check_resumable(path, env, options.algo, n_envs, trust=options.trust)
+    n_envs, frames = changed.get("n_envs", 1), frames_of(changed)
+    memory = check_resumable(path, env, options.algo, n_envs, frames=frames, trust=options.trust)
     if "learning_starts" in entry and memory:
         entry["learning_starts"] = 0
     if "n_steps" in entry:
