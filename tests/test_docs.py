@@ -10,6 +10,8 @@ import inspect
 import json
 import re
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import gymnasium as gym
@@ -288,8 +290,6 @@ def parsed(monkeypatch):
 
 def parsed_by_the_zoo(words, monkeypatch):
     """Reads a command line of the zoo's training up to where it would begin."""
-    import sys
-
     import rl_zoo3.train as train
 
     class Parsed(Exception):
@@ -315,6 +315,12 @@ def test_a_command_in_the_docs_parses_and_names_what_exists(page, line, parsed, 
             check(parsed(words), monkeypatch)
         case ["python", "-m", "rl_zoo3.train", *words]:
             check_zoo(parsed_by_the_zoo(words, monkeypatch))
+        case ["python", "-m", "sb3_torcs.rl_zoo", script, *words]:
+            call = [sys.executable, "-m", "sb3_torcs.rl_zoo", script, *words, "--help"]
+            told = subprocess.run(call, capture_output=True, check=True, text=True).stdout
+            assert {word for word in words if word.startswith("-")} <= set(
+                re.split(r"[\s,]+", told)
+            )
         case ["make", target, *_]:
             assert target in TARGETS
         case ["python", script, *_]:
