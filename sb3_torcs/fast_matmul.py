@@ -2,12 +2,17 @@
 
 PyTorch's oneDNN kernels are much faster than its default ones on some processors. The setting
 that selects them also permits 16-bit products, which some processors really use. So it is kept
-only where a measurement on this machine finds it both accurate and faster.
+only where a measurement on this machine finds it both accurate and faster. A virtual machine may
+list instructions that it does not allow, and then the kernel kills the process: a process of its
+own tries it first.
 """
 
 from __future__ import annotations
 
 import functools
+import signal
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,7 +21,7 @@ from typing import Any, NamedTuple
 import torch as th
 from torch.nn import functional
 
-__all__ = ["Probe", "disable", "enable", "probe"]
+__all__ = ["Probe", "disable", "enable", "probe", "run_once"]
 
 TOLERANCE = 1e-5
 """[-] Largest error relative to the largest value. Single precision has about 1e-6, 16 bit 1e-3."""
@@ -26,6 +31,9 @@ MIN_SPEEDUP = 1.05
 
 REPEATS = 15
 """Measurements per kernel; the fastest counts."""
+
+TRIAL_TIME = 60.0
+"""[s] after which the trial in another process counts as failed; most of it is importing torch."""
 
 
 class Probe(NamedTuple):
@@ -68,10 +76,10 @@ def probe(batch_size: int = 64, units: tuple[int, int] = (300, 600)) -> Probe:
     """
     if not _has_setting():
         return Probe(False, "this PyTorch has no oneDNN matmul setting", 0.0, 1.0)
-    generator = th.Generator().manual_seed(0)
-    n_in, n_out = units
-    sizes = ((batch_size, n_in), (n_out, n_in), (batch_size, n_out))
-    tensors = [th.randn(size, generator=generator) for size in sizes]
+    failure = _trial(batch_size, units)
+    if failure is not None:
+        return Probe(False, f"left off: {failure}", 0.0, 1.0)
+    tensors = _tensors(batch_size, units)
     with _setting("none"):
         _linear(*tensors)
     with _setting("bf16"):
@@ -85,6 +93,38 @@ def probe(batch_size: int = 64, units: tuple[int, int] = (300, 600)) -> Probe:
     else:
         reason = f"on: {speedup:.2f} times the default speed, error {error:.1e}"
     return Probe(ok, reason, error, speedup)
+
+
+def _tensors(batch_size: int, units: tuple[int, int]) -> list[th.Tensor]:
+    # Of a layer: its input, its weight, and the gradient of its output.
+    generator = th.Generator().manual_seed(0)
+    n_in, n_out = units
+    sizes = ((batch_size, n_in), (n_out, n_in), (batch_size, n_out))
+    return [th.randn(size, generator=generator) for size in sizes]
+
+
+def _trial(batch_size: int, units: tuple[int, int]) -> str | None:
+    # Why the other kernel cannot be used here at all, found out by a process that may be lost.
+    code = f"from sb3_torcs import fast_matmul as m; m.run_once({batch_size}, {units})"
+    call = [sys.executable, "-c", code]
+    try:
+        ended = subprocess.run(call, capture_output=True, timeout=TRIAL_TIME, check=False)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return f"the trial in another process failed ({type(error).__name__})"
+    if ended.returncode < 0:
+        return f"the kernel kills the process here ({signal.Signals(-ended.returncode).name})"
+    return None if ended.returncode == 0 else f"the trial failed with status {ended.returncode}"
+
+
+def run_once(batch_size: int, units: tuple[int, int]) -> None:
+    """
+    Compute the three products of a layer by the other kernel.
+
+    :param batch_size: rows of the products
+    :param units: their other two sizes
+    """
+    with _setting("bf16"):
+        _linear(*_tensors(batch_size, units))
 
 
 def _matmul() -> Any:

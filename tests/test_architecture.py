@@ -181,7 +181,8 @@ def test_no_clock_stands_in_the_way_of_a_step(path):
 
 @pytest.mark.parametrize("path", FILES, ids=named)
 def test_no_shell_and_no_other_process(path):
-    allowed = STARTS_PROGRAMS | {TRIES_TRACKS, "video.py"}  # which asks ffmpeg if a film is whole
+    # To ask ffmpeg whether a film is whole, and to try a kernel that may kill the process.
+    allowed = STARTS_PROGRAMS | {TRIES_TRACKS, "video.py", "fast_matmul.py"}
     processes = set() if named(path) in allowed else {"subprocess"}
     assert forbidden(path, processes | {"pty", "pexpect", "os.system", "os.popen"}) == []
     text = source(path)

@@ -432,12 +432,30 @@ def test_the_probe_leaves_the_setting_as_it_was(kernel):
 ])  # fmt: skip
 def test_the_kernel_is_taken_only_if_accurate_and_faster(kernel, error, speedup, on):
     """The reason says which of the two it was."""
+    kernel.setattr(fast_matmul, "_trial", lambda batch_size, units: None)
     kernel.setattr(fast_matmul, "_relative_error", lambda tensors: error)
     kernel.setattr(fast_matmul, "_speedup", lambda tensors: speedup)
     found = make_model(fast_matmul=True).policy.fast_matmul_found
     assert found.ok is on
     assert setting() == ("bf16" if on else "none")
     assert found.reason.startswith("on" if on else "left off")
+
+
+def test_a_kernel_that_kills_the_process_is_left_off(kernel, tmp_path):
+    """A virtual machine may list instructions that it does not allow."""
+    python = tmp_path / "python"
+    python.write_text("#!/bin/sh\nkill -ILL $$\n")
+    python.chmod(0o755)
+    kernel.setattr(sys, "executable", str(python))
+    found = fast_matmul.probe(8, (16, 16))
+    assert not found.ok
+    assert found.reason == "left off: the kernel kills the process here (SIGILL)"
+
+
+def test_a_trial_that_cannot_run_leaves_the_kernel_off(kernel):
+    kernel.setattr(sys, "executable", "/nowhere/python")
+    found = fast_matmul.probe(8, (16, 16))
+    assert found.reason == ("left off: the trial in another process failed (FileNotFoundError)")
 
 
 def test_the_error_of_the_default_kernel_is_that_of_single_precision(kernel):
