@@ -40,8 +40,10 @@ COMPUTING = 3  # [s] of computing that a load may take; it takes 0.2
 COMPUTING_PER_ROBOT = 1  # [s] besides; planning takes 0.3 on the longest track
 PATIENCE = 300.0  # [s] until a process that computes nothing is given up
 RANGE_FINDERS = 19  # whose angles the engine wants
-UNSETTLED = "does not come to rest"  # what the engine says of a car that stands nowhere
 PLACES = 40  # along the road, at which a car that is alone is put down
+UNSETTLED = "does not come to rest"  # what the engine says of a car that stands nowhere
+ADVICE = "the game understands the file otherwise than it is written"
+HINT = "look at what was changed last: heights of walls, lengths, names of other segments"
 
 COLUMNS = (  # of the engine's road
     "length", "curvature", "width at the start", "width at the end",
@@ -115,7 +117,7 @@ def check_road(path: Path, road: FloatArray) -> None:
     if len(read) != len(road):
         raise TrackFileError(
             f"{path}: the game lays {len(road)} segments of {road[:, 0].sum():.1f} m in all, and "
-            f"its file says {len(read)} of {read[:, 0].sum():.1f} m; {_ADVICE}"
+            f"its file says {len(read)} of {read[:, 0].sum():.1f} m; {ADVICE}"
         )
     differ = np.abs(road - read) > ROUNDING * np.maximum(1.0, np.abs(read))
     if differ.any():
@@ -123,7 +125,7 @@ def check_road(path: Path, road: FloatArray) -> None:
         raise TrackFileError(
             f"{path}: of segment {row}, {read[:row, 0].sum():.1f} m from the start line, the "
             f"{COLUMNS[column]} is {road[row, column]:g} in the game, and {read[row, column]:g} "
-            f"by its file; {_ADVICE}"
+            f"by its file; {ADVICE}"
         )
 
 
@@ -138,9 +140,6 @@ def _as_read(track: Track) -> FloatArray:
     return np.array(
         [(*s[:8], *s.road[1:3], s.left_wall.friction, s.right_wall.friction) for s in track.steps]
     )
-
-
-_ADVICE = "the game understands the file otherwise than it is written"
 
 
 def _load(path: Path, race: dict[str, Any]) -> FloatArray:
@@ -188,20 +187,17 @@ def _verdict(path: Path, status: int, output: bytes, words: bytes) -> FloatArray
     if status == REFUSED:
         name, message = json.loads(output)
         if UNSETTLED in message:
-            raise TrackFileError(f"{path}: {message}, or the road on the grid is none; {_HINT}")
+            raise TrackFileError(f"{path}: {message}, or the road on the grid is none; {HINT}")
         raise getattr(errors, name)(message)
-    if status in (-signal.SIGXCPU, -signal.SIGKILL):
-        raise TrackFileError(f"{path}: the game's loader does not come to an end with it; {_HINT}")
+    if status == -signal.SIGXCPU:
+        raise TrackFileError(f"{path}: the game's loader does not come to an end with it; {HINT}")
     if status < 0:
         how = signal.Signals(-status).name
-        raise TrackFileError(f"{path}: the game's own code crashes with it ({how}); {_HINT}")
+        raise TrackFileError(f"{path}: the game's own code crashes with it ({how}); {HINT}")
     if status:
         last = words.decode(errors="replace").strip().splitlines()[-1:]
         raise BackendUnavailable(f"{path} cannot be tried in another process: {''.join(last)}")
     return np.frombuffer(output).reshape(-1, len(COLUMNS))
-
-
-_HINT = "look at what was changed last: heights of walls, lengths, names of other segments"
 
 
 @lru_cache
