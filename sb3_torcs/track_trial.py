@@ -15,6 +15,7 @@ import sys
 from collections.abc import Sequence
 from functools import lru_cache
 from importlib.util import find_spec
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -50,8 +51,9 @@ COLUMNS = (  # of the engine's road
     "ground to the left at the start", "ground to the left at the end",
     "ground to the right at the start", "ground to the right at the end",
     "friction", "rolling resistance", "friction of the left wall", "friction of the right wall",
+    "place of the end",
 )  # fmt: skip
-ROUNDING = 1e-4  # [-] the game's single precision; its own tracks differ by 3e-6
+ROUNDING = 1e-4  # [-] the game computes in single precision; its own tracks differ by 1e-5
 
 _tried: set[Any] = set()
 
@@ -110,7 +112,7 @@ def check_road(path: Path, road: FloatArray) -> None:
     Hold the road that the game has laid to the one that was read.
 
     :param path: of the track's file
-    :param road: (n_segments, 12) from the engine
+    :param road: (n_segments, 13) from the engine
     :raises TrackFileError: if they differ, naming where
     """
     read = _as_read(load_track(path))
@@ -135,10 +137,14 @@ def _as_read(track: Track) -> FloatArray:
     Put the steps of a track into the engine's form.
 
     :param track: from a file of the game
-    :return: (n_segments, 12)
+    :return: (n_segments, 13)
     """
+    ends = accumulate(s.length for s in track.steps)
     return np.array(
-        [(*s[:8], *s.road[1:3], s.left_wall.friction, s.right_wall.friction) for s in track.steps]
+        [
+            (*s[:8], *s.road[1:3], s.left_wall.friction, s.right_wall.friction, end)
+            for s, end in zip(track.steps, ends, strict=True)
+        ]
     )
 
 

@@ -194,15 +194,23 @@ class TestRoad:
         with pytest.raises(TrackFileError, match=r"lays 300 segments .* says 301 of 205\d\.\d m"):
             check_road(path, road[1:])
 
-    @pytest.mark.parametrize("column", range(12))
+    @pytest.mark.parametrize("column", range(13))
     def test_a_segment_that_is_another(self, laid, column):
         path, road = laid
         other = road.copy()
-        other[100, column] += 0.01
+        other[100, column] += 0.1
         with pytest.raises(
             TrackFileError, match=rf"segment 100, .*{track_trial.COLUMNS[column]} is"
         ):
             check_road(path, other)
+
+
+def test_a_lap_that_the_game_adds_up_otherwise_is_refused(broken):
+    """In steps of 3 mm, single precision loses 0.4 m of 2,587 m."""
+    changed = (r'(name="profil steps length" val="3" unit=")m', r"\g<1>mm")
+    path = broken("road/aalborg", changed)
+    with pytest.raises(TrackFileError, match=r"the place of the end is .* in the game"):
+        NativeBackend(path)
 
 
 def test_a_file_that_is_rewritten_is_read_anew_whatever_its_times_say(broken):

@@ -37,7 +37,8 @@ std::vector<RoadSegment> road_of(const TrackData& track) {
                         segment->end_width, left.start, left.end, right.start, right.end,
                         segment->surface->friction, segment->surface->rolling_resistance,
                         segment->barrier[LEFT]->surface->friction,
-                        segment->barrier[RIGHT]->surface->friction});
+                        segment->barrier[RIGHT]->surface->friction,
+                        double(segment->from_start) + segment->length});
     }
     return road;
 }

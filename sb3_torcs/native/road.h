@@ -10,8 +10,9 @@ namespace torcs {
 
 // Of one segment: its length [m], curvature [1/m], the widths of the road, of the ground to its
 // left and to its right, each at its beginning and at its end [m], friction and rolling resistance
-// of the road, and the friction of the left and the right wall.
-constexpr int ROAD_COLUMNS = 12;
+// of the road, the friction of the left and the right wall, and where it ends [m], as the game adds
+// it up from the start line.
+constexpr int ROAD_COLUMNS = 13;
 using RoadSegment = std::array<double, ROAD_COLUMNS>;
 
 // From the start line on. The track has passed `check_track`.
