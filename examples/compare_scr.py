@@ -23,7 +23,7 @@ from sb3_torcs.models import driver_record, load_driver
 ROUNDING = 1e-6  # [-] between observations, which are at most 3
 SAME = 1e-4  # [-] between two actions that count as the same decision
 MILLISECOND = 0.001  # [s]
-KEPT = ("car", "action_repeat", "range_finders")  # of a model's training
+KEPT = ("car", "action_repeat", "range_finders", "action", "gearbox")  # of a model's training
 HEADERS = ("track", "equal", "same decisions", "difference", "laps, engine", "laps, game")
 
 

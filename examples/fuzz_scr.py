@@ -97,7 +97,8 @@ def check_state(text: bytes) -> bool:
         assert expected is None, text
         return False
     assert expected == state, text
-    assert parse_engine(text) == (state.lap_time, state.gear, state.engine_speed), text
+    read = (state.lap_time, state.gear, state.engine_speed, state.speed_x)
+    assert parse_engine(text) == read, text
     return True
 
 

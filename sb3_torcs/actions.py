@@ -1,81 +1,236 @@
-"""The three numbers an agent gives, and what the car is told with them."""
+"""The numbers an agent gives, and what the car is told with them."""
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import numpy.typing as npt
 from numba import njit
 
 from sb3_torcs.car import Controls, FloatArray
-from sb3_torcs.errors import InvalidAction
+from sb3_torcs.errors import InvalidAction, InvalidOption, near_miss
 
 __all__ = [
+    "ACTIONS",
     "ACTION_HIGH",
     "ACTION_LOW",
     "ACTUATORS",
+    "GEARBOXES",
+    "GEARS",
+    "PEDALS",
     "SHIFT_DOWN",
     "SHIFT_UP",
+    "ActionLayout",
+    "ActionName",
+    "GearboxName",
+    "action_layout",
     "automatic_gear",
+    "checked_gearbox",
     "controls_from_action",
+    "launch_clutch",
+    "layout_of_width",
+    "used_gearbox",
 ]
 
-ACTUATORS = ("steering", "throttle", "brake")
-ACTION_LOW = (-1.0, 0.0, 0.0)
-ACTION_HIGH = (1.0, 1.0, 1.0)
+ActionName = Literal["pedals", "pedal", "manual"]
+ACTIONS: tuple[str, ...] = get_args(ActionName)
+"""Names of the layouts of an action, see :func:`action_layout`."""
+
+GearboxName = Literal["automatic", "road_speed"]
+GEARBOXES: tuple[str, ...] = get_args(GearboxName)
+"""
+What chooses the gears of an agent that does not. Both shift up when the engine would turn faster
+than 93 % of its limit, and down when it would turn slower than 82 % in the lower gear.
+
+``"automatic"`` goes by the engine's own speed, which jumps while the wheels spin: then it hunts
+between two gears. ``"road_speed"`` goes by the speed that the engine would have if no wheel
+slipped; and in first gear it slips the clutch, four fifths pressed at rest and less the faster the
+car is, so that the engine has its power from the start.
+"""
+
+GEARS = 6
+"""Forward gears of a car that says nothing else."""
 
 _FLOATS = "efd"  # codes of the dtypes that tolist() turns into Python's floats
+_COUNTS = {2: "two", 3: "three", 5: "five"}
 
 SHIFT_UP = 8500.0 * 2.0 * math.pi / 60.0
 """[rad/s] ``car1-trb1`` gives its best power at 8,000 rpm and is limited at 9,152."""
 SHIFT_DOWN = 7500.0 * 2.0 * math.pi / 60.0
 """[rad/s] Shift down when the lower gear would turn the engine no faster than this."""
+LAUNCH_CLUTCH = 0.8
+"""[-] Clutch of a standing car, by road speed. TORCS passes all torque up to two thirds of it."""
+CLUTCH_STEPS = 128.0
+"""In which it is pressed, so that who reads the speed in six digits presses the very same."""
 
 
-def controls_from_action(action: npt.NDArray[np.floating]) -> Controls:
+@njit(cache=True)
+def launch_clutch(engine_speed: float, shift_up: float) -> float:
+    """
+    Slip the clutch in first gear. Compiled, and callable from compiled code.
+
+    :param engine_speed: what it would be if no wheel slipped, not negative [rad/s]
+    :param shift_up: at which the second gear comes [rad/s]
+    :return: the clutch in [0, 1], 1 is pressed
+    """
+    launch = LAUNCH_CLUTCH * max(1.0 - engine_speed / shift_up, 0.0)
+    return math.floor(launch * CLUTCH_STEPS + 0.5) / CLUTCH_STEPS
+
+
+class ActionLayout(NamedTuple):
+    """How an action is read."""
+
+    names: tuple[str, ...]  # of its numbers
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    read: Callable[[Sequence[float]], tuple[float, float, float, int | None, float]]
+    """From numbers within their limits to the fields of :class:`~sb3_torcs.car.Controls`."""
+
+
+def _read_pedals(numbers: Sequence[float]) -> tuple[float, float, float, int | None, float]:
+    steering, throttle, brake = numbers
+    return steering, throttle, brake, None, 0.0
+
+
+def _read_pedal(numbers: Sequence[float]) -> tuple[float, float, float, int | None, float]:
+    steering, pedal = numbers
+    return steering, pedal if pedal > 0.0 else 0.0, -pedal if pedal < 0.0 else 0.0, None, 0.0
+
+
+def _read_manual(numbers: Sequence[float]) -> tuple[float, float, float, int | None, float]:
+    steering, throttle, brake, gear, clutch = numbers
+    return steering, throttle, brake, math.floor(gear + 0.5), clutch
+
+
+PEDALS = ActionLayout(
+    ("steering", "throttle", "brake"), (-1.0, 0.0, 0.0), (1.0, 1.0, 1.0), _read_pedals
+)
+"""The layout of the original post."""
+
+ACTUATORS, ACTION_LOW, ACTION_HIGH = PEDALS[:3]
+
+_PEDAL = ActionLayout(("steering", "pedal"), (-1.0, -1.0), (1.0, 1.0), _read_pedal)
+_MANUAL = ("steering", "throttle", "brake", "gear", "clutch")
+
+
+def action_layout(action: str, gears: int = GEARS) -> ActionLayout:
+    """
+    Find a layout of the action.
+
+    :param action: ``"pedals"``: steering in [-1, 1], throttle and brake in [0, 1].
+        ``"pedal"``: steering and one pedal, both in [-1, 1]; the pedal is throttle above 0 and
+        brake below it. ``"manual"``: steering, throttle, brake, a gear from -1 (reverse) over 0
+        (neutral) to the highest, rounded to the nearest whole number (halves up), and the clutch
+        in [0, 1], 1 is pressed
+    :param gears: forward gears of the car
+    :return: the layout
+    :raises InvalidOption: if there is no such layout
+    """
+    if action == "pedals":
+        return PEDALS
+    if action == "pedal":
+        return _PEDAL
+    if action == "manual":
+        low, high = (-1.0, 0.0, 0.0, -1.0, 0.0), (1.0, 1.0, 1.0, float(gears), 1.0)
+        return ActionLayout(_MANUAL, low, high, _read_manual)
+    raise InvalidOption(
+        f"action is {action!r}{near_miss(str(action), ACTIONS)} expected one of "
+        f"{', '.join(map(repr, ACTIONS))}"
+    )
+
+
+def layout_of_width(width: int) -> ActionLayout | None:
+    """
+    Tell the layout of an action by how many numbers it has.
+
+    :param width: of the action
+    :return: its layout, or ``None`` if none has so many
+    """
+    layouts = [action_layout(action) for action in ACTIONS]
+    return next((layout for layout in layouts if len(layout.names) == width), None)
+
+
+def checked_gearbox(gearbox: str) -> str:
+    """
+    Check the choice of a gearbox.
+
+    :param gearbox: one of :data:`GEARBOXES`
+    :return: the same
+    :raises InvalidOption: for anything else
+    """
+    if not isinstance(gearbox, str) or gearbox not in GEARBOXES:
+        raise InvalidOption(
+            f"gearbox is {gearbox!r}{near_miss(str(gearbox), GEARBOXES)} expected "
+            f"{' or '.join(map(repr, GEARBOXES))}"
+        )
+    return gearbox
+
+
+def used_gearbox(gearbox: str, action: str) -> str:
+    """
+    Make sure that a gearbox that was chosen is of use.
+
+    :param gearbox: one of :data:`GEARBOXES`
+    :param action: one of :data:`ACTIONS`
+    :return: the gearbox
+    :raises InvalidOption: if there is no such gearbox, or the agent chooses the gears itself
+    """
+    if action == "manual" and gearbox != "automatic":
+        raise InvalidOption(
+            f"gearbox is {gearbox!r}, but action 'manual' chooses the gears itself; leave one of "
+            "the two out"
+        )
+    return checked_gearbox(gearbox)
+
+
+def controls_from_action(
+    action: npt.NDArray[np.floating], layout: ActionLayout = PEDALS
+) -> Controls:
     """
     Turn an agent's action into controls; values outside their range are clipped to it.
 
-    :param action: (3,) steering in [-1, 1], throttle in [0, 1], brake in [0, 1]
-    :return: the controls, with the automatic gearbox
-    :raises InvalidAction: if the shape is not (3,) or a value is not a number
+    :param action: one number for each name of the layout
+    :param layout: how to read it
+    :return: the controls
+    :raises InvalidAction: if the shape is another one or a value is not a number
     """
-    if isinstance(action, np.ndarray) and action.shape == (3,) and action.dtype.char in _FLOATS:
-        steering, throttle, brake = action.tolist()  # one by one takes twice as long
+    names, lows, highs, read = layout
+    shape = (len(names),)
+    if isinstance(action, np.ndarray) and action.shape == shape and action.dtype.char in _FLOATS:
+        numbers = action.tolist()  # one by one takes twice as long
     else:
-        steering, throttle, brake = _three_numbers(action)
-    if not (-1.0 <= steering <= 1.0 and 0.0 <= throttle <= 1.0 and 0.0 <= brake <= 1.0):
-        for name, value in zip(ACTUATORS, (steering, throttle, brake), strict=True):
-            if math.isnan(value):
+        numbers = _numbers(action, names)
+    for place, (number, low, high) in enumerate(zip(numbers, lows, highs, strict=True)):
+        if not low <= number <= high:
+            if math.isnan(number):
                 raise InvalidAction(
-                    f"{name} is nan, expected a number in its range; a network that gives nan has "
-                    "diverged: lower learning_rate or check the rewards and observations"
+                    f"{names[place]} is nan, expected a number in its range; a network that gives "
+                    "nan has diverged: lower learning_rate or check the rewards and observations"
                 )
-        steering = min(max(steering, -1.0), 1.0)
-        throttle = min(max(throttle, 0.0), 1.0)
-        brake = min(max(brake, 0.0), 1.0)
+            numbers[place] = min(max(number, low), high)
     # As Controls(...) does, without the call that a NamedTuple puts in front of it.
-    return tuple.__new__(Controls, (steering, throttle, brake, None))
+    return tuple.__new__(Controls, read(numbers))
 
 
-def _three_numbers(action: Any) -> list[float]:
+def _numbers(action: Any, names: tuple[str, ...]) -> list[float]:
     """Read an action that is no array of floats: a list, whole numbers, or a mistake."""
     try:
         shape: object = np.shape(action)
     except ValueError:  # lists of different lengths
         shape = "of its own"
-    if shape != (3,):
+    if shape != (len(names),):
         raise InvalidAction(
-            f"action has shape {shape}, expected (3,): steering, throttle, brake; "
+            f"action has shape {shape}, expected ({len(names)},): {', '.join(names)}; "
             "take it from env.action_space.sample() or model.predict(observation)"
         )
     try:
         return [float(value) for value in action]
     except (TypeError, ValueError):
         raise InvalidAction(
-            f"action is {action!r}; expected three numbers: steering, throttle, brake"
+            f"action is {action!r}; expected {_COUNTS[len(names)]} numbers: {', '.join(names)}"
         ) from None
 
 
@@ -85,7 +240,7 @@ def automatic_gear(gear: int, engine_speed: float, ratios: FloatArray) -> int:
     Choose the gear by engine speed. Compiled, and callable from compiled code.
 
     :param gear: the present gear, -1 reverse, 0 neutral, 1 and up
-    :param engine_speed: [rad/s]
+    :param engine_speed: the engine's own, or what it would be if no wheel slipped [rad/s]
     :param ratios: (gears + 2,) gear ratios of reverse, neutral, 1 and up
     :return: the gear to ask for; forward gears only
     """

@@ -61,7 +61,8 @@ class Controls(NamedTuple):
     steering: float  # [-] in [-1, 1], 1 is full lock to the left
     throttle: float  # [-] in [0, 1]
     brake: float  # [-] in [0, 1]
-    gear: int | None = None  # [-] None leaves the gearbox to the automatic
+    gear: int | None = None  # [-] -1 reverse, 0 neutral; None leaves it to the gearbox
+    clutch: float = 0.0  # [-] in [0, 1], 1 is pressed; any gearbox presses it, too, while it shifts
 
 
 class Start(NamedTuple):

@@ -15,6 +15,8 @@ __all__ = ["SCRIPTED", "ScriptedDriver"]
 SCRIPTED = "scripted"
 """What the driver is called wherever a driver is named."""
 
+LAYOUTS = ("pedals", "pedal")  # of the actions that it can give
+
 _SCALE = {sensor.name: sensor.scale for sensor in SENSORS}
 _WHERE = feature_slices()
 
@@ -44,9 +46,18 @@ class ScriptedDriver:
     Grip is felt, not known. Wheels that spin and a car that slides cost throttle, a tail that
     swings is caught by the steering; so the same driver laps asphalt and dirt. It has the signature
     of a model, ``predict(observation) -> (action, state)``, and needs the ``"scr"`` range finders.
+
+    :param action: layout of its actions, ``"pedals"`` or ``"pedal"``
+    :raises InvalidOption: for another layout
     """
 
-    def __init__(self) -> None:
+    def __init__(self, action: str = "pedals") -> None:
+        if action not in LAYOUTS:
+            raise InvalidOption(
+                f"the scripted driver has no action {action!r}; expected "
+                f"{' or '.join(map(repr, LAYOUTS))}, with a gearbox that shifts by itself"
+            )
+        self._signed = action == "pedal"
         self._angles = np.radians(RANGE_FINDERS["scr"])
 
     def predict(
@@ -63,7 +74,7 @@ class ScriptedDriver:
         :param state: unused; the driver remembers nothing
         :param episode_start: unused
         :param deterministic: unused; it always is
-        :return: the action, (3,) or (n, 3), and no state
+        :return: the action or actions, and no state
         """
         del state, episode_start, deterministic
         rows = np.asarray(observation, dtype=np.float64)
@@ -83,13 +94,19 @@ class ScriptedDriver:
         position = float(read("track_position")[0])
         if beams[0] < 0.0:  # off the road: back to it, gently
             back = 2.0 * float(read("heading_error")[0]) - 0.5 * position
-            return np.array([min(max(back, -1.0), 1.0), 0.2, 0.0], np.float32)
+            return self._action(back, 0.2)
         speed, sideways = float(read("speed_x")[0]), float(read("speed_y")[0])
         wheels = read("wheel_speeds") * TYRE_RADIUS  # [m/s] of the tyres' treads
         steering = STEERING_GAIN * (self._aim(beams) - SWING_TIME * _swing(wheels, speed))
         steering *= min(CALM_SPEED / max(speed, 1.0), 1.0)
         steering -= CENTRING * position
         pedal = _pedal(float(beams[AHEAD].max()), speed, sideways, wheels)
+        return self._action(steering, pedal)
+
+    def _action(self, steering: float, pedal: float) -> npt.NDArray[np.float32]:
+        """Lay the action out, with a throttle [0, 1] or, negative, brake."""
+        if self._signed:
+            return np.clip(np.array([steering, pedal], np.float32), -1.0, 1.0)
         action = np.array([steering, max(pedal, 0.0), max(-pedal, 0.0)], np.float32)
         return np.clip(action, [-1.0, 0.0, 0.0], [1.0, 1.0, 1.0]).astype(np.float32)
 

@@ -17,12 +17,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.logger import Image, Logger, TensorBoardOutputFormat
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_torcs.actions import ACTUATORS
+from sb3_torcs.actions import ACTIONS, PEDALS, layout_of_width
 from sb3_torcs.car import CarState
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.tracks import Track
@@ -172,7 +173,12 @@ class _Steps:
     count: int = 0
     speed: float = 0.0  # [m/s]
     braking: int = 0
-    saturated: list[int] = field(default_factory=lambda: [0] * len(ACTUATORS))
+    names: tuple[str, ...] = PEDALS.names
+    saturated: list[int] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        """Begin with 0 for each actuator."""
+        self.saturated = [0] * len(self.names)
 
     def add(self, other: _Steps) -> None:
         """Take another's sums over and leave it empty."""
@@ -180,13 +186,13 @@ class _Steps:
         self.speed += other.speed
         self.braking += other.braking
         self.saturated = [a + b for a, b in zip(self.saturated, other.saturated, strict=True)]
-        other.__init__()  # type: ignore[misc]
+        other.__init__(names=self.names)  # type: ignore[misc]
 
     def record(self, logger: Logger) -> None:
         """Write the means down."""
         logger.record("driving/speed", self.speed / self.count)
         logger.record("driving/brake_share", self.braking / self.count)
-        for name, saturated in zip(ACTUATORS, self.saturated, strict=True):
+        for name, saturated in zip(self.names, self.saturated, strict=True):
             logger.record(f"driving/saturation_{name}", saturated / self.count)
 
 
@@ -252,20 +258,22 @@ class DrivingMetricsCallback(BaseCallback):
         self.line_decisions = line_decisions
         self.best_lap_time: float | None = None  # [s] of the training
         self.best_evaluation_lap_time: float | None = None  # [s] of the lines driven
-        self._pending = _Steps()  # not yet recorded
-        self._window = _Steps()  # since the logger's previous row
 
     def _on_training_start(self) -> None:
         space = self.training_env.action_space
-        if space.shape != (len(ACTUATORS),):
+        width = space.shape[0] if isinstance(space, spaces.Box) else 0
+        layout = layout_of_width(width)
+        if layout is None:
             raise InvalidOption(
                 f"the actions of this environment have shape {space.shape}; DrivingMetricsCallback "
-                "is for Torcs-v0 and TorcsLite-v0, whose actions are steering, throttle and brake"
+                "is for Torcs-v0 and TorcsLite-v0, and knows their actions: "
+                f"{', '.join(ACTIONS)}"
             )
-        low, high = (
-            np.asarray(bound, np.float64)
-            for bound in (space.low, space.high)  # type: ignore[attr-defined]
-        )
+        self._layout = layout
+        self._pending = _Steps(names=layout.names)  # not yet recorded
+        self._window = _Steps(names=layout.names)  # since the logger's previous row
+        assert isinstance(space, spaces.Box)
+        low, high = (np.asarray(bound, np.float64) for bound in (space.low, space.high))
         margin = SATURATED * (high - low)
         self._limits = list(zip((low + margin).tolist(), (high - margin).tolist(), strict=True))
         self._evaluations = [
@@ -277,13 +285,13 @@ class DrivingMetricsCallback(BaseCallback):
     def _on_step(self) -> bool:
         # PPO keeps what it drew in "actions", and what the environment got beside it.
         actions = self.locals.get("clipped_actions", self.locals["actions"])
-        pending = self._pending
+        pending, read = self._pending, self._layout.read
         for action, info, done in zip(
             actions.tolist(), self.locals["infos"], self.locals["dones"], strict=True
         ):
             pending.count += 1
             pending.speed += info["car"].speed_x
-            pending.braking += action[2] > BRAKING
+            pending.braking += read(action)[2] > BRAKING
             for index, (low, high) in enumerate(self._limits):
                 if not low < action[index] < high:
                     pending.saturated[index] += 1
@@ -320,7 +328,7 @@ class DrivingMetricsCallback(BaseCallback):
 
     def _record_steps(self) -> None:
         if "driving/speed" not in self.logger.name_to_value:  # the logger wrote a row
-            self._window = _Steps()
+            self._window = _Steps(names=self._layout.names)
         if self._pending.count:
             self._window.add(self._pending)
             self._window.record(self.logger)

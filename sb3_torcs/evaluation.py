@@ -37,7 +37,7 @@ RACE_LAPS = 3  # from the grid in a row: what it takes to *complete* a track
 GAME, WITHOUT_GAME = "Torcs-v0", "TorcsLite-v0"
 RANDOM_TRACK = "random"
 LONGEST_TRACK = 10000.0  # [m] for such a one, whose length is not known beforehand
-KEPT = ("track", "car", "reward", "action_repeat", "range_finders")
+KEPT = ("track", "car", "reward", "action_repeat", "range_finders", "action", "gearbox")
 """What an evaluation takes from the training's environment, unless it is told otherwise."""
 
 
@@ -59,7 +59,7 @@ class Step:
     """One decision of a drive."""
 
     car: CarState  # after it
-    action: npt.NDArray[np.float32]  # (3,)
+    action: npt.NDArray[np.float32]
     reward: float
     info: dict[str, Any]
     done: bool

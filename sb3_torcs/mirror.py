@@ -11,12 +11,10 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
-from sb3_torcs.actions import ACTION_HIGH
 from sb3_torcs.sensors import OBSERVATION_SIZE, feature_slices
 
 __all__ = ["mirror_actions", "mirror_half", "mirror_observations"]
 
-STEERING = 0  # index of the actuator
 SIDED = ("heading_error", "track_position", "speed_y")
 """Sensors that are positive on one side."""
 
@@ -42,8 +40,6 @@ def _signs() -> th.Tensor:
 
 
 _ORDER, _SIGNS = _order(), _signs()
-_ACTION_SIGNS = th.ones(len(ACTION_HIGH))
-_ACTION_SIGNS[STEERING] = -1.0
 
 
 def mirror_observations(observations: th.Tensor) -> th.Tensor:
@@ -59,12 +55,12 @@ def mirror_observations(observations: th.Tensor) -> th.Tensor:
 
 def mirror_actions(actions: th.Tensor) -> th.Tensor:
     """
-    Steer to the other side.
+    Steer to the other side. Steering comes first in every layout of the action.
 
-    :param actions: (n, 3), in the environment's units or scaled to [-1, 1]
-    :return: (n, 3)
+    :param actions: (n, actuators), in the environment's units or scaled to [-1, 1]
+    :return: (n, actuators)
     """
-    return actions * _ACTION_SIGNS.to(actions.device)
+    return th.cat((-actions[..., :1], actions[..., 1:]), dim=-1)
 
 
 def mirror_half(batch: ReplayBufferSamples) -> ReplayBufferSamples:

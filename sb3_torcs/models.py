@@ -446,4 +446,4 @@ def _scripted(env: gym.Env[Any, Any]) -> Any:
             f"the scripted driver looks around with range_finders 'scr', not with "
             f"{np.degrees(angles).round(3).tolist()}; leave --range-finders out"
         )
-    return ScriptedDriver()
+    return ScriptedDriver(env.get_wrapper_attr("action"))

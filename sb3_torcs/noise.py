@@ -294,8 +294,8 @@ def bind(model: OffPolicyAlgorithm) -> list[ActuatorNoise]:
         and np.array_equal(space.high, HIGH)
     ):
         raise InvalidOption(
-            f"the noises of sb3_torcs perturb steering, throttle and brake, not {space}; "
-            "take a noise of stable_baselines3.common.noise for other environments"
+            f"the noises of sb3_torcs perturb steering, throttle and brake, not {space}; make the "
+            "environment with action='pedals', or take a noise of stable_baselines3.common.noise"
         )
     noises = noises_of(model)
     for noise in noises:

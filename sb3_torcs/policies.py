@@ -23,7 +23,7 @@ from stable_baselines3.td3.policies import Actor, TD3Policy
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from sb3_torcs import fast_matmul as matmul
-from sb3_torcs.actions import ACTION_HIGH
+from sb3_torcs.actions import layout_of_width
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.export import export_actor
 from sb3_torcs.networks import HEAD_GAINS, ExactDriver, LateActionCritic, SplitHeadActor
@@ -34,9 +34,6 @@ __all__ = ["SplitHeadPolicy", "export_actor"]
 
 NET_ARCH = (300, 600)
 """Hidden units of both networks in the original post."""
-
-HEADS = ("tanh", "sigmoid", "sigmoid")
-"""Output functions of steering, throttle and brake."""
 
 OWN_KERNEL = frozenset({"fused", "foreach", "capturable", "differentiable"})
 """Options of Adam with which somebody chooses its kernel; then it stays as chosen."""
@@ -53,7 +50,9 @@ class SplitHeadPolicy(TD3Policy):
     :param observation_space: as in ``TD3Policy``
     :param action_space: as in ``TD3Policy``
     :param lr_schedule: as in ``TD3Policy``
-    :param heads: output function of each action, ``"tanh"`` or ``"sigmoid"``
+    :param heads: output function of each action, ``"tanh"`` or ``"sigmoid"``; by default that which
+        fits its range: a tanh where it begins below 0, as steering and a signed pedal do, and a
+        sigmoid where it begins at 0, as throttle and brake do
     :param head_bias: initial value before each output function, by default 0. A sigmoid of 0 is
         half throttle and half brake; ``(0, 0, -2)`` starts with 12 % brake
     :param init_std: standard deviation of the heads' initial weights
@@ -77,7 +76,7 @@ class SplitHeadPolicy(TD3Policy):
         action_space: spaces.Box,
         lr_schedule: Schedule,
         *,
-        heads: Sequence[str] = HEADS,
+        heads: Sequence[str] | None = None,
         head_bias: Sequence[float] | None = None,
         init_std: float = 1e-4,
         layer_norm: bool = False,
@@ -89,8 +88,9 @@ class SplitHeadPolicy(TD3Policy):
     ) -> None:
         net_arch = kwargs.pop("net_arch", None)
         net_arch = list(NET_ARCH) if net_arch is None else net_arch
+        heads = heads_for(action_space) if heads is None else heads
         bias = (0.0,) * len(heads) if head_bias is None else tuple(head_bias)
-        _check_heads(heads, bias, get_action_dim(action_space))
+        _check_heads(heads, bias, action_space)
         _check_net_arch(net_arch)
         _check_symmetric(symmetric, observation_space, action_space)
         self.own_kwargs: dict[str, Any] = {
@@ -196,13 +196,24 @@ class SplitHeadPolicy(TD3Policy):
         return {**super()._get_constructor_parameters(), **self.own_kwargs}
 
 
-def _check_heads(heads: Sequence[str], bias: Sequence[float], n_actions: int) -> None:
+def heads_for(action_space: spaces.Box) -> tuple[str, ...]:
+    """
+    Choose output functions by the ranges of the actions.
+
+    :param action_space: of the environment
+    :return: ``"tanh"`` or ``"sigmoid"`` for each action
+    """
+    return tuple("sigmoid" if low == 0.0 else "tanh" for low in action_space.low.flatten())
+
+
+def _check_heads(heads: Sequence[str], bias: Sequence[float], action_space: spaces.Box) -> None:
+    n_actions = get_action_dim(action_space)
     allowed = " or ".join(repr(name) for name in HEAD_GAINS)
     unknown = [head for head in heads if head not in HEAD_GAINS]
     if isinstance(heads, str) or unknown:
         raise InvalidOption(
             f"heads={heads!r}: each head is {allowed}; "
-            f"pass policy_kwargs=dict(heads={HEADS[:n_actions]!r})"
+            f"pass policy_kwargs=dict(heads={heads_for(action_space)!r})"
         )
     if len(heads) != n_actions:
         raise InvalidOption(
@@ -233,12 +244,13 @@ def _check_symmetric(
 ) -> None:
     if not isinstance(symmetric, bool):
         raise InvalidOption(f"symmetric={symmetric!r}: pass True or False")
-    known = (OBSERVATION_SIZE,), (len(ACTION_HIGH),)
-    if symmetric and (observation_space.shape, action_space.shape) != known:
+    ours = observation_space.shape == (OBSERVATION_SIZE,) and layout_of_width(
+        get_action_dim(action_space)
+    )
+    if symmetric and not ours:
         raise InvalidOption(
-            "symmetric=True mirrors the sensors and actuators of Torcs-v0 and TorcsLite-v0, shapes "
-            f"{known[0]} and {known[1]}, not {observation_space} and {action_space}; pass "
-            "symmetric=False"
+            "symmetric=True mirrors the sensors and actuators of Torcs-v0 and TorcsLite-v0, not "
+            f"{observation_space} and {action_space}; pass symmetric=False"
         )
 
 

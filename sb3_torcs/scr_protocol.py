@@ -108,6 +108,7 @@ class EngineReading(NamedTuple):
     lap_time: float  # [s]
     gear: int
     engine_speed: float  # [rad/s]
+    speed_x: float  # [m/s] along the car
 
 
 class _Tag(NamedTuple):
@@ -152,7 +153,7 @@ _pick_numbers = itemgetter(*(word for word in range(_WORDS) if word not in _BEGI
 _GROUP = re.compile(rb"\s*\(([^()]*)\)")
 _STRANGE = re.compile(r"[^A-Za-z0-9_.:+@ -]")
 _SPACE = re.compile(rb"\s*")
-_ENGINE = (b"(curLapTime ", b"(gear ", b"(rpm ")
+_ENGINE = (b"(curLapTime ", b"(gear ", b"(rpm ", b"(speedX ")
 
 
 # ---- From the server -----------------------------------------------------------------------------
@@ -193,11 +194,11 @@ def parse_engine(message: bytes) -> EngineReading:
         for opening in _ENGINE:
             begin = message.index(opening, 0, end) + len(opening)
             words.append(message[begin : message.index(b")", begin)])
-        lap_time, gear, speed = map(float, words)
-        if math.isfinite(lap_time + speed) and gear.is_integer() and b"_" not in message:
-            return EngineReading(lap_time, int(gear), speed / RPM)
+        lap_time, gear, revs, speed = map(float, words)
+        if math.isfinite(lap_time + revs + speed) and gear.is_integer() and b"_" not in message:
+            return EngineReading(lap_time, int(gear), revs / RPM, speed / KMH)
     state = parse_state(message)
-    return EngineReading(state.lap_time, state.gear, state.engine_speed)
+    return EngineReading(state.lap_time, state.gear, state.engine_speed, state.speed_x)
 
 
 def format_state(state: ScrState) -> bytes:

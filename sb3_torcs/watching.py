@@ -42,7 +42,7 @@ class Show:
     :param track: as of :class:`~sb3_torcs.race_file.RaceSetup`
     :param robot: name and index of the one who is looked at; ``None`` for an agent
     :param model: of the agent: what :func:`~sb3_torcs.models.load_driver` loads
-    :param settings: of the agent's environment: ``car``, ``action_repeat``, ``range_finders``
+    :param settings: of the agent's environment: ``car``, ``action_repeat`` and so on
     :param opponents: robots' names and indices, who start behind
     :param laps: to drive
     :param trust: run what is pickled in the model

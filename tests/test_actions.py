@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from sb3_torcs.actions import controls_from_action
+from sb3_torcs.actions import ACTIONS, action_layout, controls_from_action
 from sb3_torcs.car import Controls
-from sb3_torcs.errors import InvalidAction
+from sb3_torcs.errors import InvalidAction, InvalidOption
 
 
 @pytest.mark.parametrize(
@@ -75,3 +75,47 @@ def test_another_shape_is_refused(action):
 def test_what_is_no_number_is_refused(action):
     with pytest.raises(InvalidAction, match="expected three numbers: steering, throttle, brake"):
         controls_from_action(action)
+
+
+@pytest.mark.parametrize(
+    ("pedal", "controls"),
+    [
+        (1.0, Controls(0.5, 1.0, 0.0)),
+        (0.25, Controls(0.5, 0.25, 0.0)),
+        (0.0, Controls(0.5, 0.0, 0.0)),
+        (-0.25, Controls(0.5, 0.0, 0.25)),
+        (-7.0, Controls(0.5, 0.0, 1.0)),
+    ],
+)
+def test_a_signed_pedal_is_throttle_above_0_and_brake_below(pedal, controls):
+    assert controls_from_action(np.array([0.5, pedal]), action_layout("pedal")) == controls
+
+
+@pytest.mark.parametrize(
+    ("number", "gear"),
+    [(-9.0, -1), (-0.6, -1), (-0.5, 0), (0.4, 0), (0.5, 1), (1.5, 2), (5.4, 5), (5.5, 6), (99, 6)],
+)
+def test_a_gear_is_the_nearest_whole_number(number, gear):
+    """Halves go up, so that each gear between has the same share of the range."""
+    action = np.array([0.0, 0.5, 0.0, number, 0.75])
+    controls = controls_from_action(action, action_layout("manual", gears=6))
+    assert controls == Controls(0.0, 0.5, 0.0, gear, 0.75)
+    assert type(controls.gear) is int
+
+
+@pytest.mark.parametrize("action", ACTIONS)
+def test_each_layout_names_its_numbers_where_one_is_wrong(action):
+    layout = action_layout(action)
+    with pytest.raises(InvalidAction, match=rf"expected \({len(layout.names)},\): steering, "):
+        controls_from_action(np.zeros(4), layout)
+    for place, name in enumerate(layout.names):
+        numbers = np.zeros(len(layout.names))
+        numbers[place] = math.nan
+        with pytest.raises(InvalidAction, match=f"^{name} is nan"):
+            controls_from_action(numbers, layout)
+
+
+@pytest.mark.parametrize("action", ["pedal ", "peddal", None, 3, ["pedal"]])
+def test_another_layout_is_refused(action):
+    with pytest.raises(InvalidOption, match="expected one of 'pedals', 'pedal', 'manual'"):
+        action_layout(action)

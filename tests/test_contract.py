@@ -22,9 +22,10 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 import sb3_torcs
+from sb3_torcs.actions import ACTIONS, GEARBOXES
 from sb3_torcs.car import CarState
 from sb3_torcs.drivers import ScriptedDriver
-from sb3_torcs.errors import BackendUnavailable
+from sb3_torcs.errors import BackendUnavailable, InvalidOption
 from sb3_torcs.rewards import Reward
 from sb3_torcs.sensors import encode
 
@@ -96,6 +97,82 @@ def test_stable_baselines3_finds_nothing_to_warn_of(world):
         env = world.make()
         check_sb3(env.unwrapped)
         env.close()
+
+
+@pytest.mark.parametrize("action", ACTIONS)
+def test_both_checkers_accept_every_layout_of_the_action(world, action):
+    """A signed pedal without any warning: both its ranges are symmetric, as SB3 wants them."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        if action != "pedal":
+            warnings.filterwarnings("ignore", message=".*recommend.* symmetric")
+        env = world.make(action=action)
+        check_sb3(env.unwrapped)
+        check_gymnasium(env.unwrapped, skip_render_check=True)
+        env.close()
+
+
+@pytest.mark.parametrize("action", ACTIONS)
+def test_every_layout_gives_the_same_bytes_again_and_in_a_copy(world, action):
+    env = world.make(action=action, gearbox="automatic")
+    assert_equal(rollout(world, 3, 60, action=action), rollout(world, 3, 60, action=action))
+    env.reset(seed=0)
+    asked = env.action_space.high
+    env.step(asked)
+    copy = pickle.loads(pickle.dumps(env.unwrapped))
+    assert_equal([copy.step(asked) for _ in range(5)], [env.step(asked)[:5] for _ in range(5)])
+    env.close()
+
+
+def test_a_signed_pedal_drives_as_both_pedals_do(world):
+    env, other = world.make(), world.make(action="pedal")
+    answers = [env.reset(seed=0)], [other.reset(seed=0)]
+    for pedal in [1.0] * 30 + [-0.5] * 10:
+        both = np.array([0.01, max(pedal, 0.0), max(-pedal, 0.0)], np.float32)
+        answers[0].append(env.step(both))
+        answers[1].append(other.step(np.array([0.01, pedal], np.float32)))
+    assert_equal(*answers)
+
+
+def test_who_shifts_by_hand_drives_in_the_gear_that_was_asked_for(world):
+    """Backwards, too; and a pressed clutch takes the drive away."""
+    env = world.make(action="manual")
+
+    def drive(gear, clutch):
+        env.reset(seed=0)
+        for _ in range(15):
+            car = env.step(np.array([0.0, 0.6, 0.0, gear, clutch], np.float32))[4]["car"]
+        return car
+
+    assert [drive(gear, 0.0).gear for gear in (-1, 0, 1, 2)] == [-1, 0, 1, 2]
+    assert drive(-1, 0.0).speed_x < -1.0
+    assert drive(1, 0.0).speed_x > 1.0
+    assert drive(1, 1.0).speed_x < 0.5  # it rolls down the slope
+    env.close()
+
+
+def time_to(metres, env):
+    """How long a car at full throttle takes [s], and how often it shifts on the way."""
+    _, info = env.reset(seed=0)
+    gears = []
+    while info["distance"] < metres:
+        car = info["car"]
+        gears.append(car.gear)
+        steering = 2.0 * car.heading_error - 0.06 * car.distance_from_axis
+        *_, info = env.step(np.array([steering, 1.0, 0.0], np.float32))
+    env.close()
+    return info["car"].time, int(np.count_nonzero(np.diff(gears)))
+
+
+def test_gears_by_road_speed_do_not_hunt(world):
+    """At full throttle from the grid, the wheels spin in first gear."""
+    drives = {
+        gearbox: time_to(100.0, world.make(track="e-track-5", gearbox=gearbox))
+        for gearbox in GEARBOXES
+    }
+    seconds, shifts = drives["road_speed"]
+    assert shifts <= 3  # first, second and third gear
+    assert seconds < drives["automatic"][0] - 0.5
 
 
 @pytest.mark.parametrize("start", ["grid", "random"])
@@ -321,3 +398,16 @@ def test_a_model_of_one_world_drives_in_the_other():
             observation, *_, info = env.step(driver.predict(observation)[0])
         assert info["distance"] > 50.0
         assert info["end"] == ""
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"action": "pedel"}, "did you mean 'pedal'"),
+        ({"gearbox": "manual"}, "expected 'automatic' or 'road_speed'"),
+        ({"gearbox": "road_speed", "action": "manual"}, "leave one of the two out"),
+    ],
+)
+def test_a_wrong_layout_or_gearbox_is_refused(world, options, message):
+    with pytest.raises(InvalidOption, match=message):
+        world.make(**options)

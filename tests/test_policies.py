@@ -144,12 +144,12 @@ def test_layer_norm_is_in_the_hidden_layers_of_both_networks():
 
 
 def test_other_numbers_of_actions_take_other_heads():
-    """Heads are configurable per action dimension; a mirror image is known of three only."""
+    """Heads are configurable per action dimension; a mirror image is known of ours only."""
     env = DummyVecEnv([ToyRace])
-    env.action_space = spaces.Box(-1, 1, (2,))
-    kwargs = {"heads": ("tanh",) * 2}
+    env.action_space = spaces.Box(-1, 1, (4,))
+    kwargs = {"heads": ("tanh",) * 4}
     model = DDPG("SplitHeadPolicy", env, policy_kwargs=kwargs, buffer_size=10)
-    assert model.predict(OBSERVATIONS)[0].shape == (5, 2)
+    assert model.predict(OBSERVATIONS)[0].shape == (5, 4)
     with pytest.raises(InvalidOption, match="pass symmetric=False"):
         DDPG("SplitHeadPolicy", env, policy_kwargs={**kwargs, "symmetric": True}, buffer_size=10)
 

@@ -88,7 +88,7 @@ def test_a_literal_packet_gives_literal_numbers():
     assert state.wheel_speeds == (67.9393, 68.8267, 71.4009, 71.7363)
     assert state.height == 0.336726
     assert state.focus == (-1.0,) * 5
-    assert parse_engine(LITERAL) == (-0.982, 1, 94.2478)
+    assert parse_engine(LITERAL) == (-0.982, 1, 94.2478, 10.0)
 
 
 def test_a_literal_action_is_written_and_read():
@@ -194,7 +194,12 @@ def test_a_state_comes_back_with_six_digits(state):
     once = parse_state(text)
     for value, expected in zip(once, state, strict=True):
         np.testing.assert_allclose(value, expected, rtol=1e-5)
-    assert parse_engine(text) == (once.lap_time, once.gear, once.engine_speed)
+    assert parse_engine(text) == (
+        once.lap_time,
+        once.gear,
+        once.engine_speed,
+        once.speed_x,
+    )
 
 
 @given(actions)

@@ -8,7 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from sb3_torcs.actions import checked_gearbox
 from sb3_torcs.backends import lite_physics as physics
+from sb3_torcs.backends.lite_car import TOP_GEAR
 from sb3_torcs.backends.lite_rays import RANGE, Edges, road_edges
 from sb3_torcs.backends.lite_road import road_width
 from sb3_torcs.car import CarState, Controls, FloatArray, Start
@@ -28,7 +30,10 @@ class LiteBackend:
     :param track: a name, a path, a :class:`Track`, or ``"random"`` for a new one each episode
     :param car: ``"car1-trb1"``
     :param range_finders: see :func:`sb3_torcs.sensors.range_finder_angles`
+    :param gearbox: see :data:`sb3_torcs.actions.GEARBOXES`
     """
+
+    gears = TOP_GEAR
 
     def __init__(
         self,
@@ -36,6 +41,7 @@ class LiteBackend:
         *,
         car: str = "car1-trb1",
         range_finders: str | Sequence[float] = "scr",
+        gearbox: str = "automatic",
     ) -> None:
         if car not in CARS:
             raise InvalidOption(
@@ -43,6 +49,8 @@ class LiteBackend:
                 "are those of Torcs-v0"
             )
         self.car = car
+        by_road = checked_gearbox(gearbox) == "road_speed"
+        self._gearbox = physics.BY_ROAD_SPEED if by_road else physics.AUTOMATIC
         self.range_finder_angles = range_finder_angles(range_finders)
         self._random = track == "random"
         self._set_track(load_track(track, np.random.default_rng(0) if self._random else None))
@@ -75,17 +83,9 @@ class LiteBackend:
 
     def step(self, controls: Controls, ticks: int) -> CarState:
         """Drive on; see :class:`~sb3_torcs.backends.base.Backend`."""
-        gear = physics.AUTOMATIC if controls.gear is None else controls.gear
-        physics.advance(
-            self._state,
-            self._table,
-            controls.steering,
-            controls.throttle,
-            controls.brake,
-            gear,
-            ticks,
-            self._flying,
-        )
+        steering, throttle, brake, gear, clutch = controls
+        asked = (steering, throttle, brake, self._gearbox if gear is None else gear, clutch)
+        physics.advance(self._state, self._table, asked, ticks, self._flying)
         if not math.isfinite(self._state[physics.X] + self._state[physics.VX]):
             raise CarLost(
                 f"the physics has come to no number on {self.track.name}, the car is nowhere; see "

@@ -11,6 +11,8 @@ import math
 import numpy as np
 from numba import njit
 
+from sb3_torcs.actions import SHIFT_UP, automatic_gear, launch_clutch
+
 GRAVITY = 9.80665  # [m/s²]
 
 # Body
@@ -75,6 +77,8 @@ FINAL_DRIVE = 4.5
 GEARS = np.array([-4.0, 0.0, 3.0, 1.9, 1.4, 1.1, 0.9, 0.77])  # reverse, neutral, 1 to 6
 EFFICIENCY = np.array([0.957, 1.0, 0.955, 0.957, 0.95, 0.983, 0.948, 0.94]) * 0.9625
 TOP_GEAR = 6
+OPEN_CLUTCH = 0.01  # [-] of its way to closed: up to here nothing is passed on
+FULL_TORQUE = 3.0  # [-] a clutch passes all torque from a third of its way on
 SHIFT_TIME = 0.15  # [s] the clutch is open after a change of gear
 DIFFERENTIAL = 300.0  # [N m s/rad] locking torque per difference of wheel speed
 DIFFERENTIAL_MAX = 1500.0  # [N m]
@@ -102,6 +106,21 @@ def engine_torque(engine_speed: float, throttle: float) -> float:
     full = TORQUE[i] + (TORQUE[i + 1] - TORQUE[i]) * (engine_speed / TORQUE_STEP - i)
     braking = ENGINE_BRAKE * (engine_speed - TICKOVER) / (REVS_MAX - TICKOVER)
     return full * (throttle * (1.0 + braking) - braking)
+
+
+@njit(cache=True)
+def road_speed_gear(gear: int, speed: float) -> tuple[int, float]:
+    """
+    Choose gear and clutch by how fast the engine would turn if no wheel slipped.
+
+    :param gear: the present one, -1 reverse, 0 neutral
+    :param speed: along the car [m/s]
+    :return: the gear to ask for, and the clutch in [0, 1]
+    """
+    ratio = GEARS[max(gear, 1) + 1] * FINAL_DRIVE
+    engine_speed = max(speed, 0.0) / RADIUS[2] * ratio
+    launch = launch_clutch(engine_speed, SHIFT_UP) if gear <= 1 else 0.0
+    return automatic_gear(gear, engine_speed, GEARS), launch
 
 
 @njit(cache=True)

@@ -39,6 +39,7 @@ DAMAGE_FACTOR = 0.8  # for a driver of the level "semi-pro"
 ) = range(30)  # fmt: skip
 STATE_SIZE = 30
 AUTOMATIC = -99  # stands for "no gear asked for" in the compiled code
+BY_ROAD_SPEED = -98  # the same, with the other gearbox
 
 
 @njit(cache=True)
@@ -83,23 +84,27 @@ def _spin_up(spin: float, torque: float, brake: float, inertia: float) -> float:
 
 
 @njit(cache=True)
-def _drive(state: Floats, throttle: float) -> tuple[float, float]:
+def _drive(state: Floats, throttle: float, clutch: float) -> tuple[float, float]:
     """Run engine and clutch; return the torque [N m] and inertia [kg m²] at each rear wheel."""
-    gear = int(state[GEAR])
+    gear, closed = int(state[GEAR]), 1.0 - clutch
     ratio = car.GEARS[gear + 1] * car.FINAL_DRIVE
     axle = 0.5 * (state[SPIN_RR] + state[SPIN_RL])
     if state[SHIFT] > 0.0:
         state[SHIFT] -= DT
-    if gear == 0 or state[SHIFT] > 0.0:
-        target = (
-            axle * ratio if gear != 0 else car.TICKOVER + throttle * (car.LIMITER - car.TICKOVER)
-        )
+    shifts = gear != 0 and state[SHIFT] > 0.0
+    if gear == 0 or shifts or closed <= car.OPEN_CLUTCH:
+        target = axle * ratio if shifts else car.TICKOVER + throttle * (car.LIMITER - car.TICKOVER)
         target = min(max(target, car.TICKOVER), car.REVS_MAX)
         state[ENGINE] += (target - state[ENGINE]) * (DT / 0.05)  # the free engine, 50 ms lag
         return 0.0, car.WHEEL_INERTIA_REAR
-    state[ENGINE] = min(max(axle * ratio, car.TICKOVER), car.REVS_MAX)
-    torque = car.engine_torque(state[ENGINE], throttle) * ratio * car.EFFICIENCY[gear + 1]
-    return 0.5 * torque, car.WHEEL_INERTIA_REAR + 0.5 * car.ENGINE_INERTIA * ratio * ratio
+    engine, inertia, passed = axle * ratio, car.ENGINE_INERTIA, 1.0
+    if clutch > 0.0:
+        free = state[ENGINE] + DT * car.engine_torque(state[ENGINE], throttle) / inertia
+        engine = free + (engine - free) * closed**4
+        inertia, passed = inertia * closed, min(car.FULL_TORQUE * closed, 1.0)
+    state[ENGINE] = min(max(engine, car.TICKOVER), car.REVS_MAX)
+    torque = car.engine_torque(state[ENGINE], throttle) * ratio * car.EFFICIENCY[gear + 1] * passed
+    return 0.5 * torque, car.WHEEL_INERTIA_REAR + 0.5 * inertia * ratio * ratio
 
 
 @njit(cache=True)
@@ -231,7 +236,9 @@ def _roll(
 
 
 @njit(cache=True)
-def _substep(state: Floats, track: Floats, steering: float, throttle: float, brake: float) -> None:
+def _substep(
+    state: Floats, track: Floats, steering: float, throttle: float, brake: float, clutch: float
+) -> None:
     """Advance the car by one physics step."""
     yaw, yaw_rate = state[YAW], state[YAW_RATE]
     cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
@@ -239,7 +246,7 @@ def _substep(state: Floats, track: Floats, steering: float, throttle: float, bra
     vy = state[VY] * cos_yaw - state[VX] * sin_yaw
     right, left = _steer(state, steering)
     angles = (right, left, 0.0, 0.0)
-    torque, inertia = _drive(state, throttle)
+    torque, inertia = _drive(state, throttle, clutch)
     lock = car.DIFFERENTIAL * (state[SPIN_RR] - state[SPIN_RL])
     lock = min(max(lock, -car.DIFFERENTIAL_MAX), car.DIFFERENTIAL_MAX)
     torques = (0.0, 0.0, torque - lock, torque + lock)
@@ -287,10 +294,7 @@ def _substep(state: Floats, track: Floats, steering: float, throttle: float, bra
 def advance(
     state: Floats,
     track: Floats,
-    steering: float,
-    throttle: float,
-    brake: float,
-    gear: int,
+    controls: tuple[float, float, float, int, float],
     ticks: int,
     flying: bool,
 ) -> None:
@@ -299,23 +303,26 @@ def advance(
 
     :param state: the state vector
     :param track: ``Track.table``
-    :param steering: [-] in [-1, 1]
-    :param throttle: [-] in [0, 1]
-    :param brake: [-] in [0, 1]
-    :param gear: -1 to 6, or ``AUTOMATIC``
+    :param controls: steering, throttle, brake, gear and clutch as in ``Controls``; the gear may be
+        ``AUTOMATIC`` or ``BY_ROAD_SPEED``
     :param ticks: control ticks of 0.02 s
     :param flying: whether the episode began elsewhere than on the grid
     """
+    steering, throttle, brake, gear, pressed = controls
     for _tick in range(ticks):
-        wanted = gear
+        wanted, clutch = gear, pressed
         if gear == AUTOMATIC:
             wanted = automatic_gear(int(state[GEAR]), state[ENGINE], car.GEARS)
+        elif gear == BY_ROAD_SPEED:
+            speed = state[VX] * math.cos(state[YAW]) + state[VY] * math.sin(state[YAW])
+            wanted, launch = car.road_speed_gear(int(state[GEAR]), speed)
+            clutch = max(pressed, launch)
         if wanted != int(state[GEAR]) and state[SHIFT] <= 0.0:
             state[GEAR] = wanted
             state[SHIFT] = car.SHIFT_TIME if wanted != 0 else 0.0
         for _step in range(SUBSTEPS):
             distance = track[int(state[SEGMENT]), column.START] + state[ALONG]
-            _substep(state, track, steering, throttle, brake)
+            _substep(state, track, steering, throttle, brake, clutch)
             state[STEPS] += 1.0
             locate(state, track)
             _hit_walls(state, track)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sb3_torcs.actions import checked_gearbox
 from sb3_torcs.building import build_command
 from sb3_torcs.car import MANY_LAPS, CarState, Controls, FloatArray, Start, checked_laps, is_count
 from sb3_torcs.errors import BackendUnavailable, InvalidOption, TrackFileError
@@ -48,6 +49,7 @@ def make_engine(
     session: Session = "practice",
     laps: int = 0,
     angles: FloatArray | None = None,
+    gearbox: str = "automatic",
 ) -> Engine:
     """
     Load a race of the real game.
@@ -59,6 +61,7 @@ def make_engine(
     :param session: whose rules and grid count, ``"practice"`` or ``"race"``
     :param laps: of the race; 0 drives on
     :param angles: (19,) of the range finders [rad], left negative
+    :param gearbox: the agent's; see :data:`sb3_torcs.actions.GEARBOXES`
     :return: the engine, not yet started
     :raises InvalidOption: if a driver is named twice, or there is no such session
     :raises BackendUnavailable: if the extension or the game is missing, or not as expected
@@ -85,7 +88,8 @@ def make_engine(
     race = engine_arguments(game, path, entries, car=car, session=session, laps=laps)
     try_race(path, race)
     angles = range_finder_angles("scr") if angles is None else angles
-    engine: Engine = native.Engine(**encoded(race), angles=angles.tolist())
+    road_speed = checked_gearbox(gearbox) == "road_speed"
+    engine: Engine = native.Engine(**encoded(race), angles=angles.tolist(), road_speed=road_speed)
     try:
         check_road(path, engine.road())
     except TrackFileError:
@@ -150,6 +154,7 @@ class NativeBackend:
     :param laps: of the race with opponents, who take fuel for so many; ``None`` drives on
     :param grid_place: of the agent among them, 1 in front; ``None`` is behind them all
     :param sensor_noise: whether sensors err as those of the SCR server's ``-noisy``
+    :param gearbox: see :data:`sb3_torcs.actions.GEARBOXES`
     """
 
     def __init__(
@@ -162,6 +167,7 @@ class NativeBackend:
         laps: int | None = None,
         grid_place: int | None = None,
         sensor_noise: bool = False,
+        gearbox: str = "automatic",
     ) -> None:
         game = find_game()
         entries = starting_list(game, opponents, grid_place)
@@ -176,6 +182,7 @@ class NativeBackend:
             "laps": laps,
             "grid_place": grid_place,
             "sensor_noise": sensor_noise,
+            "gearbox": gearbox,
         }
         self._entries = entries
         path = track_path(game, track)
@@ -187,9 +194,11 @@ class NativeBackend:
             session="race" if opponents else "practice",
             laps=laps if opponents and laps else 0,
             angles=self.range_finder_angles,
+            gearbox=gearbox,
         )
         self.track: Track = load_track(path)
         self._agent = entries.index(AGENT)
+        self.gears = self.engine.gears(self._agent)
         self._noise = sensor_noise
         self._align()
         self._drive: list[Any] = []  # since the reset, so that a copy can follow
@@ -233,7 +242,8 @@ class NativeBackend:
 
     def step(self, controls: Controls, ticks: int) -> CarState:
         """Drive on; see :class:`~sb3_torcs.backends.base.Backend`."""
-        self._state = self.engine.step(*controls, ticks)
+        steering, throttle, brake, gear, clutch = controls
+        self._state = self.engine.step(steering, throttle, brake, gear, ticks, clutch)
         self._drive.append((controls, ticks))
         return self._state
 
@@ -306,7 +316,8 @@ class Fleet:
         :param ticks: as of ``step``
         """
         self._begun[place] = controls, ticks
-        self._fleet.begin(place, *controls, ticks)
+        steering, throttle, brake, gear, clutch = controls
+        self._fleet.begin(place, steering, throttle, brake, gear, ticks, clutch)
 
     def wait(self, place: int) -> CarState:
         """

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_torcs.actions import controls_from_action
+from sb3_torcs.actions import checked_gearbox, controls_from_action
 from sb3_torcs.backends.native import AGENT, starting_list, track_path
 from sb3_torcs.backends.scr_car import CarReader
 from sb3_torcs.backends.scr_gearbox import read_gearbox
@@ -57,6 +57,7 @@ class ScrBackend:
     :param grid_place: of the agent among them, 1 in front; ``None`` is behind them all
     :param host: of a server that runs already; ``None`` starts a game
     :param port: of the driver there; ``None`` is the first one, 3001
+    :param gearbox: see :data:`sb3_torcs.actions.GEARBOXES`
     """
 
     def __init__(
@@ -70,6 +71,7 @@ class ScrBackend:
         grid_place: int | None = None,
         host: str | None = None,
         port: int | None = None,
+        gearbox: str = "automatic",
     ) -> None:
         self._settings: dict[str, Any] = {
             "track": track,
@@ -80,13 +82,15 @@ class ScrBackend:
             "grid_place": grid_place,
             "host": host,
             "port": port,
+            "gearbox": gearbox,
         }
         self._own = host is None
         self._address = (HOST if host is None else host, SCR_PORT if port is None else port)
         game = self._game = find_game()
         self.car = car
         self.range_finder_angles = range_finder_angles(range_finders)
-        self._gearbox = read_gearbox(game.find_car(car))
+        self._gearbox = read_gearbox(game.find_car(car), checked_gearbox(gearbox))
+        self.gears = len(self._gearbox.ratios)
         self.track: Track = load_track(track_path(game, track))
         entries = starting_list(game, opponents, grid_place)
         if self._own:
@@ -300,7 +304,7 @@ class ScrBackend:
                     "wall or in another car there; start elsewhere, or nearer to the middle of the "
                     "road"
                 )
-            client.send(_action(STANDING, 0, lap_time))
+            client.send(_action(STANDING, lap_time))
         raise ServerLost(f"the race at {client.address} ended before it began; call reset again")
 
     def _hold(self, client: ScrClient | Rehearsal, controls: Controls, ticks: int) -> int:
@@ -315,9 +319,9 @@ class ScrBackend:
         for tick in range(ticks):
             if client.over:
                 return tick
-            lap_time, gear, speed = parse_engine(self._message)
-            gear = self._gearbox.choose(gear, speed) if controls.gear is None else controls.gear
-            client.send(_action(controls, gear, lap_time))
+            reading = parse_engine(self._message)
+            asked = self._gearbox.shift(controls, reading) if controls.gear is None else controls
+            client.send(_action(asked, reading.lap_time))
             message = client.receive()
             if message is None:
                 return tick
@@ -342,16 +346,17 @@ class ScrBackend:
             )
 
 
-def _action(controls: Controls, gear: int, lap_time: float) -> bytes:
+def _action(controls: Controls, lap_time: float) -> bytes:
     """
     Write an action.
 
-    :param controls: what was asked for
-    :param gear: chosen
+    :param controls: what was asked for, with a gear
     :param lap_time: of the state that is answered [s]
     """
-    steering, throttle, brake, _ = controls
-    return format_action(ScrAction(steering, throttle, brake, gear, focus=None, lap_time=lap_time))
+    steering, throttle, brake, gear, clutch = controls
+    assert gear is not None, "the gearbox has chosen one"
+    action = ScrAction(steering, throttle, brake, gear, clutch, focus=None, lap_time=lap_time)
+    return format_action(action)
 
 
 def _standing(state: CarState, ticks: int) -> CarState:

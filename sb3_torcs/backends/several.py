@@ -7,6 +7,7 @@ from typing import Any, TypeGuard
 
 import numpy as np
 
+from sb3_torcs.actions import GEARS
 from sb3_torcs.backends.base import Backend
 from sb3_torcs.car import CarState, Controls, Start
 from sb3_torcs.errors import InvalidOption
@@ -39,6 +40,7 @@ class SeveralTracks:
         self._worlds = tuple(worlds)
         self._enter(0)
         self.car = self._world.car
+        self.gears: int = getattr(self._world, "gears", GEARS)
         self.range_finder_angles = self._world.range_finder_angles
 
     def _enter(self, place: int) -> None:

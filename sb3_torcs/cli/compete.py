@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 __all__ = ["add_parser", "run"]
 
-KEPT = ("track", "car", "action_repeat", "range_finders")
+KEPT = ("track", "car", "action_repeat", "range_finders", "action", "gearbox")
 """What is taken from the training, unless the command line says otherwise."""
 
 DESCRIPTION = """\

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from sb3_torcs.actions import ACTION_HIGH, ACTION_LOW, controls_from_action
+from sb3_torcs.actions import GEARS, ActionName, action_layout, controls_from_action
 from sb3_torcs.backends.base import Backend
 from sb3_torcs.car import (
     CONTROL_TICK,
@@ -69,9 +69,10 @@ class RacingInfo(TypedDict):
 
 class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
     """
-    A car on a track, driven by three numbers.
+    A car on a track, driven by a few numbers.
 
     :param backend: the world
+    :param action: which numbers; see :func:`sb3_torcs.actions.action_layout`
     :param reward: a preset, or a mapping from terms to weights; see :mod:`sb3_torcs.rewards`
     :param action_repeat: control ticks of 0.02 s per decision
     :param start: ``"grid"``, or ``"random"``: anywhere on the track, moving
@@ -86,6 +87,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         self,
         backend: Backend,
         *,
+        action: ActionName = "pedals",
         reward: str | Mapping[str, float] = "progress",
         action_repeat: int = 5,
         start: str = "grid",
@@ -111,8 +113,10 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
             "render_fps": 1.0 / (action_repeat * CONTROL_TICK),
         }
         self.observation_space = spaces.Box(OBSERVATION_LOW, OBSERVATION_HIGH, dtype=np.float32)
+        self.action = action
+        self._layout = action_layout(action, getattr(backend, "gears", GEARS))
         self.action_space = spaces.Box(
-            np.array(ACTION_LOW, np.float32), np.array(ACTION_HIGH, np.float32)
+            np.array(self._layout.low, np.float32), np.array(self._layout.high, np.float32)
         )
         self.set_reward(reward)
         self.set_start(start)
@@ -201,7 +205,8 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         """
         Hold an action for ``action_repeat`` control ticks.
 
-        :param action: (3,) steering [-1, 1], throttle [0, 1], brake [0, 1]
+        :param action: what the layout asks for: ``"pedals"`` steering [-1, 1], throttle [0, 1] and
+            brake [0, 1]
         :return: observation, reward, terminated, truncated, info
         :raises InvalidAction: if the action has another shape or is not a number
         """
@@ -219,7 +224,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
             when = "close" if self._closed else "reset"
             remedy = "make a new environment" if self._closed else "call reset first"
             raise EnvClosed(f"step {'after' if self._closed else 'before'} {when}; {remedy}")
-        self._controls = controls_from_action(action)
+        self._controls = controls_from_action(action, self._layout)
         return self._controls
 
     @property

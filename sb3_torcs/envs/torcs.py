@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from sb3_torcs.actions import ActionName, GearboxName, used_gearbox
 from sb3_torcs.backends.base import Backend
 from sb3_torcs.backends.native import NativeBackend, track_path
 from sb3_torcs.backends.scr import ScrBackend
@@ -51,6 +52,10 @@ class TorcsEnv(RacingEnv):
     :param reward: ``"progress"``, ``"blog"``, ``"apex"``, or a dict of weights
     :param action_repeat: control ticks of 0.02 s per decision
     :param range_finders: ``"scr"``, ``"narrow"``, or 19 angles in degrees, left to right
+    :param action: ``"pedals"``: steering, throttle, brake; ``"pedal"``: steering and one signed
+        pedal; or ``"manual"``: steering, throttle, brake, gear, clutch
+    :param gearbox: ``"automatic"``, by engine speed; or ``"road_speed"``, which does not hunt while
+        the wheels spin, and slips the clutch to set off
     :param start: ``"grid"`` or ``"random"``
     :param laps: whole laps after which the episode is truncated; ``None`` drives on
     :param render_mode: ``"rgb_array"`` or ``"human"``; ``"game"`` is another name for
@@ -87,6 +92,8 @@ class TorcsEnv(RacingEnv):
         reward: str | Mapping[str, float] = "progress",
         action_repeat: int = 5,
         range_finders: str | Sequence[float] = "scr",
+        action: ActionName = "pedals",
+        gearbox: GearboxName = "automatic",
         start: str = "grid",
         laps: int | None = None,
         render_mode: str | None = None,
@@ -128,10 +135,12 @@ class TorcsEnv(RacingEnv):
                 address={"host": host, "port": port},
                 car=car,
                 range_finders=range_finders,
+                gearbox=used_gearbox(gearbox, action),
                 opponents=opponents,
                 laps=laps,
                 grid_place=grid_place,
             ),
+            action=action,
             reward=reward,
             action_repeat=action_repeat,
             start=start,

@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from sb3_torcs.actions import ActionName, GearboxName, used_gearbox
 from sb3_torcs.backends.base import Backend
 from sb3_torcs.backends.lite import LiteBackend
 from sb3_torcs.backends.several import SeveralTracks, is_several
@@ -36,7 +37,9 @@ class TorcsLiteEnv(RacingEnv):
 
     Action space
         ``Box([-1, 0, 0], [1, 1, 1], (3,), float32)``: steering (1 is full lock to the left),
-        throttle, brake. What lies outside is clipped; NaN is an error. The gearbox is automatic.
+        throttle, brake. With ``action="pedal"``, ``Box(-1, 1, (2,), float32)``: steering, and one
+        pedal that is throttle above 0 and brake below. With ``action="manual"`` gear and clutch
+        come after the first three. What lies outside is clipped; NaN is an error.
 
     Observation space
         ``Box(29,), float32``: the 29 numbers of the original post, scaled as there;
@@ -64,6 +67,10 @@ class TorcsLiteEnv(RacingEnv):
     :param reward: ``"progress"``, ``"blog"``, ``"apex"``, or a dict of weights
     :param action_repeat: control ticks of 0.02 s per decision
     :param range_finders: ``"scr"``, ``"narrow"``, or 19 angles in degrees, left to right
+    :param action: ``"pedals"``: steering, throttle, brake; ``"pedal"``: steering and one signed
+        pedal; or ``"manual"``: steering, throttle, brake, gear, clutch
+    :param gearbox: ``"automatic"``, by engine speed; or ``"road_speed"``, which does not hunt while
+        the wheels spin, and slips the clutch to set off
     :param start: ``"grid"`` or ``"random"``
     :param laps: whole laps after which the episode is truncated; ``None`` drives on
     :param render_mode: ``"rgb_array"`` or ``"human"``
@@ -79,6 +86,8 @@ class TorcsLiteEnv(RacingEnv):
         reward: str | Mapping[str, float] = "progress",
         action_repeat: int = 5,
         range_finders: str | Sequence[float] = "scr",
+        action: ActionName = "pedals",
+        gearbox: GearboxName = "automatic",
         start: str = "grid",
         laps: int | None = None,
         render_mode: str | None = None,
@@ -94,9 +103,12 @@ class TorcsLiteEnv(RacingEnv):
         if picture != "above":
             raise InvalidOption(f"picture is {picture!r}; expected 'above'")
         _refuse(of_the_game)
-        make: Callable[[Any], Backend] = partial(LiteBackend, car=car, range_finders=range_finders)
+        make: Callable[[Any], Backend] = partial(
+            LiteBackend, car=car, range_finders=range_finders, gearbox=used_gearbox(gearbox, action)
+        )
         super().__init__(
             SeveralTracks(map(make, track)) if is_several(track) else make(track),
+            action=action,
             reward=reward,
             action_repeat=action_repeat,
             start=start,

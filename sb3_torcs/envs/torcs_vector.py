@@ -95,7 +95,7 @@ class TorcsVectorEnv(SyncVectorEnv):
         """
         Hold an action in each race, for ``action_repeat`` control ticks.
 
-        :param actions: (n, 3) steering [-1, 1], throttle [0, 1], brake [0, 1]
+        :param actions: (n, numbers of an action)
         :return: observations, rewards, terminated, truncated, infos
         :raises InvalidAction: if there is not one action per race, or one is none
         """
@@ -105,7 +105,7 @@ class TorcsVectorEnv(SyncVectorEnv):
         if len(rows) != self.num_envs:
             raise InvalidAction(
                 f"{len(rows)} actions for {self.num_envs} races; expected shape "
-                f"({self.num_envs}, 3): take them from envs.action_space.sample()"
+                f"{self.action_space.shape}: take them from envs.action_space.sample()"
             )
         anew = self._begin_anew()
         ticks = self.envs[0].action_repeat

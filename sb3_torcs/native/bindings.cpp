@@ -68,14 +68,15 @@ py::object as_state(const Reading& reading) {
     return state;
 }
 
-Controls controls_of(double steering, double throttle, double brake, std::optional<int> gear) {
-    if (!std::isfinite(steering) || !std::isfinite(throttle) || !std::isfinite(brake))
+Controls controls_of(double steering, double throttle, double brake, std::optional<int> gear,
+                     double clutch) {
+    if (!std::isfinite(steering + throttle + brake + clutch))
         throw Error("InvalidAction",
-                    "steering, throttle and brake are " + std::to_string(steering) + ", " +
-                        std::to_string(throttle) + ", " + std::to_string(brake) +
-                        "; expected finite numbers");
+                    "steering, throttle, brake and clutch are " + std::to_string(steering) + ", " +
+                        std::to_string(throttle) + ", " + std::to_string(brake) + ", " +
+                        std::to_string(clutch) + "; expected finite numbers");
     return {static_cast<float>(steering), static_cast<float>(throttle), static_cast<float>(brake),
-            gear.value_or(AUTOMATIC_GEAR)};
+            gear.value_or(AUTOMATIC_GEAR), static_cast<float>(clutch)};
 }
 
 std::array<double, RANGE_FINDERS> angles_of(const std::vector<double>& angles) {
@@ -204,15 +205,16 @@ PYBIND11_MODULE(_engine, module) {
                          const std::string& plib, const std::string& track,
                          const std::string& session, const std::string& car,
                          const std::vector<std::pair<std::string, int>>& entries, int laps,
-                         const std::vector<double>& angles) {
-                 RaceOptions options{track, session, car, {}, laps};
+                         const std::vector<double>& angles, bool road_speed) {
+                 const Gearbox gearbox = road_speed ? Gearbox::ROAD_SPEED : Gearbox::ENGINE_SPEED;
+                 RaceOptions options{track, session, car, {}, laps, gearbox};
                  for (const auto& [name, index] : entries) options.entries.push_back({name, index});
                  const WithoutPython released;
                  Game& game = Game::open(data, libraries, plib);
                  return std::make_unique<Engine>(game, std::move(options), angles_of(angles));
              }),
              py::kw_only(), "data"_a, "libraries"_a, "plib"_a, "track"_a, "session"_a, "car"_a,
-             "entries"_a, "laps"_a, "angles"_a)
+             "entries"_a, "laps"_a, "angles"_a, "road_speed"_a = false)
         .def("start",
              [](Engine& engine) {
                  const WithoutPython released;
@@ -226,8 +228,8 @@ PYBIND11_MODULE(_engine, module) {
         .def(
             "step",
             [](Engine& engine, double steering, double throttle, double brake,
-               std::optional<int> gear, int ticks) {
-                const Controls controls = controls_of(steering, throttle, brake, gear);
+               std::optional<int> gear, int ticks, double clutch) {
+                const Controls controls = controls_of(steering, throttle, brake, gear, clutch);
                 Reading reading;
                 {
                     const WithoutPython released;
@@ -238,11 +240,12 @@ PYBIND11_MODULE(_engine, module) {
                 }
                 return as_state(reading);
             },
+            "steering"_a, "throttle"_a, "brake"_a, "gear"_a, "ticks"_a, "clutch"_a = 0.0,
             "Hold controls for some ticks; returns the agent's car as the fields of CarState.")
         .def("advance",
              [](Engine& engine, int ticks) {
                  const WithoutPython released;
-                 engine.drive(Controls{0.0f, 0.0f, 1.0f, 0}, ticks);
+                 engine.drive(Controls{0.0f, 0.0f, 1.0f, 0, 0.0f}, ticks);
              })
         .def("read", [](Engine& engine, int car) { return as_state(engine.read(car)); })
         .def("set_noise", &Engine::set_noise)
@@ -272,6 +275,12 @@ PYBIND11_MODULE(_engine, module) {
                  const Engine::Access race(engine);
                  Engine::check_car(*race, car);
                  return std::string(race->car(car).info.car);
+             })
+        .def("gears",
+             [](Engine& engine, int car) {
+                 const Engine::Access race(engine);
+                 Engine::check_car(*race, car);
+                 return race->car(car).priv.gears_number - 1;
              })
         .def("laps",
              [](Engine& engine, int car) {
@@ -320,7 +329,7 @@ PYBIND11_MODULE(_engine, module) {
                                      " columns; expected 3: steering, throttle, brake");
                  std::vector<Controls> list;
                  for (py::ssize_t i = 0; i < rows.shape(0); i++)
-                     list.push_back(controls_of(rows(i, 0), rows(i, 1), rows(i, 2), {}));
+                     list.push_back(controls_of(rows(i, 0), rows(i, 1), rows(i, 2), {}, 0.0));
                  const WithoutPython released;
                  engine.replay(list, sensors);
              })
@@ -334,11 +343,13 @@ PYBIND11_MODULE(_engine, module) {
              "threads"_a)
         .def("begin",
              [](Fleet& fleet, std::size_t place, double steering, double throttle, double brake,
-                std::optional<int> gear, int ticks) {
-                 const Controls controls = controls_of(steering, throttle, brake, gear);
+                std::optional<int> gear, int ticks, double clutch) {
+                 const Controls controls = controls_of(steering, throttle, brake, gear, clutch);
                  const WithoutPython released;
                  fleet.begin(place, controls, ticks);
-             })
+             },
+             "place"_a, "steering"_a, "throttle"_a, "brake"_a, "gear"_a, "ticks"_a,
+             "clutch"_a = 0.0)
         .def("wait",
              [](Fleet& fleet, std::size_t place) {
                  const Reading* reading;

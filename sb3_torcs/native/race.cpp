@@ -24,6 +24,10 @@ constexpr int MANY_LAPS = 1 << 30;
 
 // Beside SHIFT_UP: of the SCR car 7500 rpm.
 constexpr float SHIFT_DOWN = 7500.0f / 9152.0f;
+// Of a standing car. The game's clutch passes all torque up to two thirds, and less from there on.
+constexpr float LAUNCH_CLUTCH = 0.8f;
+// So that a client who reads the speed in six digits presses the very same.
+constexpr float CLUTCH_STEPS = 128.0f;
 
 const char* const SKILLS[] = {"rookie", "amateur", "semi-pro", "pro"};
 constexpr int SEMI_PROFESSIONAL = 2;  // what the game takes for drivers that do not say
@@ -558,20 +562,34 @@ void Race::drive_agent(CarElement& car) {
     car.control.steering = controls.steering;
     car.control.throttle = controls.throttle;
     car.control.brake = controls.brake;
-    car.control.clutch = 0.0f;  // the gearbox presses it while it shifts
-    car.control.gear =
-        controls.gear == AUTOMATIC_GEAR ? automatic_gear(car.priv) : controls.gear;
+    car.control.gear = controls.gear;
+    car.control.clutch = controls.clutch;  // the gearbox presses it, too, while it shifts
+    if (controls.gear == AUTOMATIC_GEAR) shift(car);
 }
 
-int Race::automatic_gear(const CarPrivate& car) {
-    const int gear = car.gear;
-    if (gear < 1) return 1;
-    const float* ratio = car.gear_ratio + car.gear_offset;
-    if (car.engine_speed > SHIFT_UP * car.red_line && gear < car.gears_number - 1)
-        return gear + 1;
-    if (gear > 1 && car.engine_speed * ratio[gear - 1] / ratio[gear] < SHIFT_DOWN * car.red_line)
-        return gear - 1;
-    return gear;
+// Gears by engine speed hunt while wheels spin. By road speed, they go by how fast the engine would
+// turn if no wheel slipped; and in first gear the clutch lets the engine turn faster than the car.
+void Race::shift(CarElement& car) const {
+    const CarPrivate& priv = car.priv;
+    const float* ratio = priv.gear_ratio + priv.gear_offset;
+    const float shift_up = SHIFT_UP * priv.red_line;
+    const int gear = std::max(priv.gear, 1);
+    float engine_speed = priv.engine_speed;
+    if (options_.gearbox == Gearbox::ROAD_SPEED) {
+        const float radius = (*simulated_)[car.index].wheel[REAR_RIGHT].radius;
+        engine_speed = std::max(car.pub.local.vel.x, 0.0f) / radius * ratio[gear];
+        if (gear == 1) {
+            const float launch = LAUNCH_CLUTCH * std::max(1.0f - engine_speed / shift_up, 0.0f);
+            car.control.clutch = std::max(
+                car.control.clutch, std::floor(launch * CLUTCH_STEPS + 0.5f) / CLUTCH_STEPS);
+        }
+    }
+    car.control.gear = gear;
+    if (priv.gear < 1) return;
+    if (engine_speed > shift_up && gear < priv.gears_number - 1)
+        car.control.gear = gear + 1;
+    else if (gear > 1 && engine_speed * ratio[gear - 1] / ratio[gear] < SHIFT_DOWN * priv.red_line)
+        car.control.gear = gear - 1;
 }
 
 // ---- Reading and keeping ------------------------------------------------------------------------

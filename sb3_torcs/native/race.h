@@ -25,17 +25,22 @@ struct Entry {
     int index = 0;
 };
 
+// By what the agent's gears are chosen, where it leaves that to the gearbox.
+enum class Gearbox { ENGINE_SPEED, ROAD_SPEED };
+
 struct RaceOptions {
     std::string track;    // path of its XML
     std::string session;  // of the game's race managers, "practice" or "quickrace"
     std::string car;      // the agent's
     std::vector<Entry> entries;
     int laps = 0;         // 0 drives on
+    Gearbox gearbox = Gearbox::ENGINE_SPEED;
 };
 
 struct Controls {
     float steering, throttle, brake;
     int gear;
+    float clutch;
 };
 
 constexpr int AUTOMATIC_GEAR = -100;
@@ -170,7 +175,7 @@ private:
     void keep_rolling();
     void call_drivers();
     void drive_agent(CarElement& car);
-    static int automatic_gear(const CarPrivate& car);
+    void shift(CarElement& car) const;
 
     // Of race_rules.cpp.
     void manage(CarElement& car);
