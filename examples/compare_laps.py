@@ -12,13 +12,13 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
-from sb3_torcs.driving_metrics import BRAKING
-from sb3_torcs.evaluation import drive, race_environment
-from sb3_torcs.game import find_game
-from sb3_torcs.models import driver_record, load_driver
-from sb3_torcs.robots import race
-from sb3_torcs.track_plot import KMH, edges
-from sb3_torcs.tracks import load_track
+from sb3_torcs.agents.models import driver_record, load_driver
+from sb3_torcs.agents.robots import race
+from sb3_torcs.callbacks.metrics import BRAKING
+from sb3_torcs.evaluation.protocol import drive, race_environment
+from sb3_torcs.torcs.installation import find_game
+from sb3_torcs.tracks.catalogue import load_track
+from sb3_torcs.tracks.plot import KMH, edges
 
 COLOURS = ("tab:blue", "tab:red", "tab:green", "tab:purple", "tab:orange")
 BENDS = 3  # that are shown from above

@@ -15,10 +15,10 @@ from rich.console import Console
 from rich.progress import track as progress
 
 import sb3_torcs  # noqa: F401  (registers the environments)
+from sb3_torcs.agents.models import driver_record, load_driver
 from sb3_torcs.car import Start
 from sb3_torcs.cli.common import table
-from sb3_torcs.evaluation import Driver
-from sb3_torcs.models import driver_record, load_driver
+from sb3_torcs.evaluation.protocol import Driver
 
 ROUNDING = 1e-6  # [-] between observations, which are at most 3
 SAME = 1e-4  # [-] between two actions that count as the same decision

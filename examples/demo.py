@@ -19,12 +19,13 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from sb3_torcs import zoo
-from sb3_torcs.cli.common import positive, seed, writable_folder
-from sb3_torcs.cli.train import TrainOptions, train_run
+from sb3_torcs.agents.models import find_model, load_driver, saved_steps
+from sb3_torcs.cli.common import positive, seed
 from sb3_torcs.errors import OutputNotWritable, Sb3TorcsError
-from sb3_torcs.evaluation import Step, drive
-from sb3_torcs.models import find_model, load_driver, saved_steps
+from sb3_torcs.evaluation.protocol import Step, drive
+from sb3_torcs.files import writable_folder
+from sb3_torcs.training import zoo
+from sb3_torcs.training.run import TrainOptions, train_run
 
 ALGO, ENV, TRACK = "ddpg", "TorcsLite-v0", "aalborg"
 LAPS = 3  # the best of these is shown
@@ -231,8 +232,8 @@ def best_lap(folder: Path) -> tuple[list[Step], slice, float | None]:
 
 
 def draw(folder: Path) -> str:
-    from sb3_torcs.track_plot import plot_track
-    from sb3_torcs.tracks import load_track
+    from sb3_torcs.tracks.catalogue import load_track
+    from sb3_torcs.tracks.plot import plot_track
 
     steps, lap, seconds = best_lap(folder)
     cars = [step.car for step in steps[lap]]
@@ -243,7 +244,7 @@ def draw(folder: Path) -> str:
 
 
 def film(folder: Path) -> str:
-    from sb3_torcs.video import write_video
+    from sb3_torcs.rendering.encoder import write_video
 
     steps, lap, seconds = best_lap(folder)
     with car_and_driver(folder, render_mode="rgb_array") as (env, driver):

@@ -6,7 +6,7 @@ import gymnasium as gym
 from stable_baselines3 import DDPG
 
 import sb3_torcs  # noqa: F401  (registers the environments)
-from sb3_torcs.evaluation import evaluate, time_limit
+from sb3_torcs.evaluation.protocol import evaluate, time_limit
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("model", help="a .zip that DDPG saved")

@@ -15,7 +15,7 @@ from rich.progress import track as progress
 
 from sb3_torcs import _engine
 from sb3_torcs.errors import MessageBroken
-from sb3_torcs.scr_protocol import (
+from sb3_torcs.scr.protocol import (
     ScrAction,
     ScrState,
     format_action,

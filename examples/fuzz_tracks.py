@@ -17,12 +17,12 @@ from pathlib import Path
 
 import numpy as np
 
-from sb3_torcs.backends.lite import LiteBackend
+from sb3_torcs.backends.lite.backend import LiteBackend
 from sb3_torcs.backends.native import NativeBackend
 from sb3_torcs.car import CarState, Controls, Start
 from sb3_torcs.errors import CarLost, InvalidOption, TrackFileError
-from sb3_torcs.game import find_game
-from sb3_torcs.tracks import load_track
+from sb3_torcs.torcs.installation import find_game
+from sb3_torcs.tracks.catalogue import load_track
 
 PATIENCE = 120.0  # [s] for one file; the first one also compiles
 PLACES = 4  # where each world begins to drive

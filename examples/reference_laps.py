@@ -5,12 +5,12 @@ import csv
 from pathlib import Path
 
 import sb3_torcs
-from sb3_torcs.drivers import SCRIPTED, ScriptedDriver
-from sb3_torcs.evaluation import RACE_LAPS, evaluate, race_environment
-from sb3_torcs.game import find_game
-from sb3_torcs.ladder import REFERENCE_FIELDS, REFERENCE_FILE, ROBOTS
-from sb3_torcs.robots import race
-from sb3_torcs.tracks import available_tracks
+from sb3_torcs.agents.robots import race
+from sb3_torcs.agents.scripted import SCRIPTED, ScriptedDriver
+from sb3_torcs.evaluation.ladder import REFERENCE_FIELDS, REFERENCE_FILE, ROBOTS
+from sb3_torcs.evaluation.protocol import RACE_LAPS, evaluate, race_environment
+from sb3_torcs.torcs.installation import find_game
+from sb3_torcs.tracks.catalogue import available_tracks
 
 CAR = "car1-trb1"
 

@@ -5,9 +5,9 @@ import argparse
 import gymnasium as gym
 
 import sb3_torcs  # noqa: F401  (registers the environments)
-from sb3_torcs.drivers import ScriptedDriver
-from sb3_torcs.evaluation import evaluate
-from sb3_torcs.tracks import available_tracks
+from sb3_torcs.agents.scripted import ScriptedDriver
+from sb3_torcs.evaluation.protocol import evaluate
+from sb3_torcs.tracks.catalogue import available_tracks
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--track", help="one track; without it, every bundled one")

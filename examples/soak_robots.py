@@ -21,7 +21,7 @@ from sb3_torcs.backends.native import NativeBackend
 from sb3_torcs.car import CONTROL_TICK, Controls, Start
 from sb3_torcs.cli.common import table
 from sb3_torcs.errors import CarLost, InvalidOption, Sb3TorcsError, TrackFileError
-from sb3_torcs.game import find_game
+from sb3_torcs.torcs.installation import find_game
 
 SPAWN = multiprocessing.get_context("spawn")
 TICKS = 10  # between two thoughts of the agent

@@ -10,10 +10,11 @@ from typing import Any
 from sb3_torcs.car import CarState
 from sb3_torcs.errors import OutputNotWritable
 
-__all__ = ["STATE_FIELDS", "TELEMETRY_FIELDS", "write_telemetry"]
+__all__ = ["CONTROL_FIELDS", "STATE_FIELDS", "TELEMETRY_FIELDS", "write_telemetry"]
 
 STATE_FIELDS = CarState._fields[: CarState._fields.index("wheel_speeds")]
-TELEMETRY_FIELDS = ("robot", "index", *STATE_FIELDS, "steering", "throttle", "brake", "gear_asked")
+CONTROL_FIELDS = ("steering", "throttle", "brake", "gear_asked")
+TELEMETRY_FIELDS = ("robot", "index", *STATE_FIELDS, *CONTROL_FIELDS)
 """Columns of a telemetry file."""
 
 

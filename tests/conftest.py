@@ -14,8 +14,8 @@ import torch._dynamo  # noqa: F401
 
 from sb3_torcs.car import CONTROL_TICK, CarState
 from sb3_torcs.errors import BackendUnavailable
-from sb3_torcs.game import find_game
-from sb3_torcs.tracks import Grid, Segment, Surface, Track
+from sb3_torcs.torcs.installation import find_game
+from sb3_torcs.tracks.track import Grid, Segment, Surface, Track
 
 ASPHALT = Surface("asphalt", 1.2, 0.001, 0.5, 10.0)
 GRASS = Surface("grass", 0.4, 0.01, 0.5, 10.0)

@@ -15,7 +15,7 @@ TRY = """
 import json, sys
 from sb3_torcs.backends.native import AGENT, make_engine
 from sb3_torcs.errors import Sb3TorcsError
-from sb3_torcs.game import find_game
+from sb3_torcs.torcs.installation import find_game
 
 def attempt(track="aalborg", entries=(AGENT,), **options):
     try:

@@ -7,7 +7,7 @@ import threading
 
 import numpy as np
 
-from sb3_torcs.scr_protocol import (
+from sb3_torcs.scr.protocol import (
     IDENTIFIED,
     RESTART,
     SHUTDOWN,

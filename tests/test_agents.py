@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from sb3_torcs import model_record, models
+from sb3_torcs.agents import model_record, models
 from sb3_torcs.cli import main
-from sb3_torcs.ladder import REFERENCE_FILE
+from sb3_torcs.evaluation.ladder import REFERENCE_FILE
 
 MAX_SIZE = 400_000  # [bytes]
 SECTIONS = ("## How it was made", "## What it drives", "## Limits")

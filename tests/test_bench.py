@@ -2,17 +2,21 @@ import os
 
 import pytest
 
-from sb3_torcs import bench, bench_scr, bench_torcs
+from sb3_torcs.bench import environments as bench
+from sb3_torcs.bench import scr as bench_scr
+from sb3_torcs.bench import torcs as bench_torcs
+from sb3_torcs.bench.learning import training_share
+from sb3_torcs.bench.stages import KEYS, stages
 from sb3_torcs.errors import BackendUnavailable
 
 
 def test_every_figure_is_measured_once_or_empty(monkeypatch):
     """The keys are what other tools read."""
     monkeypatch.setattr(bench, "RESETS", 2)
-    stages = bench.stages(0.01)
-    figures = stages["resets"]()
+    measurements = stages(0.01)
+    figures = measurements["resets"]()
     assert list(figures) == ["lite_reset_ms"]
-    assert len(set(bench.KEYS)) == len(bench.KEYS) == 17
+    assert len(set(KEYS)) == len(KEYS) == 17
 
 
 def test_the_environments_are_measured_in_the_same_run(monkeypatch):
@@ -69,7 +73,7 @@ def test_the_game_is_measured_by_its_names():
         "torcs_load_ms",
     ]
     assert min(figures.values()) > 0.0
-    assert set(figures) < set(bench.KEYS)
+    assert set(figures) < set(KEYS)
 
 
 @pytest.mark.usefixtures("short")
@@ -106,12 +110,12 @@ def test_without_the_game_its_figures_stay_empty(monkeypatch):
 
     for name in ("ticks", "resets", "loads", "vector"):
         monkeypatch.setattr(bench_torcs, name, missing)
-    stages = bench.stages(1.0)
-    assert [stages[name]() for name in stages if name.startswith("game")] == [{}] * 4
+    measurements = stages(1.0)
+    assert [measurements[name]() for name in measurements if name.startswith("game")] == [{}] * 4
 
 
 @pytest.mark.slow
 def test_environment_and_callbacks_are_a_small_part_of_a_training_step():
     """Whoever trains waits for the networks, not for the simulator."""
-    share = bench.training_share(100)["training_env_share"]
+    share = training_share(100)["training_env_share"]
     assert 0.0 < share <= 0.1

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from sb3_torcs.building import build_command
+from sb3_torcs.torcs.building import build_command
 
 ROOT = Path(__file__).parent.parent
 

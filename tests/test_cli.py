@@ -17,11 +17,17 @@ from fake_game import write_game
 from stable_baselines3 import DDPG
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_torcs import __version__, bench, building, evaluation, game_process, model_record, models
+from sb3_torcs import __version__
+from sb3_torcs.agents import model_record, models
+from sb3_torcs.bench.stages import KEYS
 from sb3_torcs.cli import VERBS, common, doctor, evaluate, main, recording, train
-from sb3_torcs.cli.train import TrainOptions
 from sb3_torcs.errors import BackendUnavailable, InvalidOption
+from sb3_torcs.evaluation import protocol as evaluation
 from sb3_torcs.telemetry import TELEMETRY_FIELDS
+from sb3_torcs.torcs import building
+from sb3_torcs.torcs import process as game_process
+from sb3_torcs.training import run as training_run
+from sb3_torcs.training.run import TrainOptions
 
 NAMES = [verb.__name__.rpartition(".")[2].replace("_", "-") for verb in VERBS]
 PNG = b"\x89PNG"
@@ -268,7 +274,7 @@ def test_tracks_lists_only_those_that_are_named(capsys):
 
 
 def test_a_track_is_drawn(capsys, tmp_path):
-    pytest.importorskip("sb3_torcs.track_plot")
+    pytest.importorskip("sb3_torcs.tracks.plot")
     picture = tmp_path / "new" / "aalborg.png"
     assert run(capsys, "tracks", "aalborg", "--plot", str(picture))[0] == 0
     assert picture.read_bytes()[:4] == PNG
@@ -490,7 +496,7 @@ def test_a_stretch_is_filmed_in_real_time(recorded, tmp_path):
 
 
 def test_a_stretch_is_drawn(recorded, tmp_path):
-    pytest.importorskip("sb3_torcs.track_plot")
+    pytest.importorskip("sb3_torcs.tracks.plot")
     recorded.draw_line(tmp_path / "line.png")
     assert (tmp_path / "line.png").read_bytes()[:4] == PNG
 
@@ -525,7 +531,7 @@ def test_an_output_that_takes_no_more_is_told():
 )
 def test_a_mistake_is_told_before_anything_starts(tmp_path, changes, message):
     with pytest.raises(Exception) as caught:
-        train.train(options(tmp_path, **changes))
+        training_run.train(options(tmp_path, **changes))
     assert message in str(caught.value)
     assert not (tmp_path / "logs").exists()
 
@@ -564,7 +570,7 @@ def test_numbers_of_steps_have_to_be_positive(capsys):
 def test_the_words_for_the_zoo_say_what_was_asked():
     asked = TrainOptions(eval_episodes=2, seed=7)
     training = {"track": "aalborg", "start": "random", "max_episode_steps": 200, "laps": 2}
-    words = train._zoo_words(asked, 100000, training)
+    words = training_run._zoo_words(asked, 100000, training)
     pairs = dict(itertools.pairwise(words))
     assert (pairs["--seed"], pairs["--eval-freq"], pairs["--eval-episodes"]) == ("7", "2500", "2")
     assert (pairs["--num-threads"], pairs["--device"]) == ("1", "cpu")
@@ -573,9 +579,10 @@ def test_the_words_for_the_zoo_say_what_was_asked():
 
 def test_the_evaluation_is_on_the_track_that_the_zoo_s_own_words_name(monkeypatch, tmp_path):
     asked = []
-    monkeypatch.setattr(train, "_run_zoo", lambda _, words, *rest: asked.extend(words) or 1 / 0)
+    noted = lambda _, words, *rest: asked.extend(words) or 1 / 0  # noqa: E731
+    monkeypatch.setattr(training_run, "_run_zoo", noted)
     with pytest.raises(ZeroDivisionError):
-        train.train(options(tmp_path, zoo_args=("--env-kwargs", "track:'corkscrew'")))
+        training_run.train(options(tmp_path, zoo_args=("--env-kwargs", "track:'corkscrew'")))
     assert asked[asked.index("--eval-env-kwargs") + 1] == "track:'corkscrew'"
 
 
@@ -583,7 +590,7 @@ def test_the_command_that_goes_on_means_the_same_options():
     asked = TrainOptions(
         entry="as the post", timesteps=5, seed=3, progress=False, zoo_args=("--save-freq", "2")
     )
-    words = shlex.split(train._command(asked))
+    words = shlex.split(training_run._command(asked))
     assert words[:2] == ["sb3-torcs", "train"]
     assert words[-3:] == ["--", "--save-freq", "2"]
     assert words[2:-3] == [
@@ -618,7 +625,7 @@ def test_a_training_leaves_models_and_logs(capsys, tmp_path):
 
 @pytest.mark.slow
 def test_the_same_seed_trains_the_same_model(tmp_path):
-    folders = [train.train(options(tmp_path, progress=False)) for _ in range(2)]
+    folders = [training_run.train(options(tmp_path, progress=False)) for _ in range(2)]
     assert [folder.name for folder in folders] == ["TorcsLite-v0_1", "TorcsLite-v0_2"]
     first, second = (DDPG.load(folder / "TorcsLite-v0.zip") for folder in folders)
     for one, other in zip(first.policy.parameters(), second.policy.parameters(), strict=True):
@@ -669,7 +676,7 @@ def test_a_training_in_processes_that_is_ended_from_outside_keeps_what_it_learne
 
 @pytest.mark.slow
 def test_the_shipped_hyperparameters_train(tmp_path):
-    run_folder = train.train(TrainOptions(timesteps=150, folder=tmp_path, progress=False))
+    run_folder = training_run.train(TrainOptions(timesteps=150, folder=tmp_path, progress=False))
     assert (run_folder / "best_model.zip").is_file()
 
 
@@ -678,8 +685,8 @@ def test_the_shipped_hyperparameters_train(tmp_path):
 def test_those_of_the_real_game_train_and_go_on(tmp_path):
     """With returns over several steps, whose memory SB3 makes anew in its own way."""
     options = TrainOptions(env="Torcs-v0", timesteps=1100, folder=tmp_path, progress=False)
-    first = train.train(options)
-    second = train.train(dataclasses.replace(options, timesteps=100, resume=first))
+    first = training_run.train(options)
+    second = training_run.train(dataclasses.replace(options, timesteps=100, resume=first))
     model = DDPG.load(second / "best_model.zip", replay_buffer_class=None)
     assert (model.n_steps, model.replay_buffer.n_steps) == (3, 3)
 
@@ -753,7 +760,7 @@ def test_the_doctor_misses_what_only_the_games_own_program_needs(
 ):
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.setattr(game_process, "__file__", str(tmp_path / "game_process.py"))
+    monkeypatch.setattr(game_process, "__file__", str(tmp_path / "torcs/process.py"))
     ok, found = doctor_says(capsys)
     assert ok, "both environments drive without"
     assert found["film"]["found"].startswith("no Xvfb; type: `sb3-torcs install-torcs --film`")
@@ -805,13 +812,13 @@ def quick_bench(monkeypatch):
     def stages(seconds):
         return {"one": lambda: {"lite_ticks_per_s": 1000.0 * seconds}}
 
-    monkeypatch.setattr(bench, "stages", stages)
+    monkeypatch.setattr("sb3_torcs.bench.stages.stages", stages)
 
 
 def test_the_bench_prints_every_figure_and_null_for_what_it_cannot_measure(capsys, quick_bench):
     status, out, _ = run(capsys, "bench", "--json", "--seconds", "25")
     figures = json.loads(out)
-    assert (status, tuple(figures)) == (0, bench.KEYS)
+    assert (status, tuple(figures)) == (0, KEYS)
     assert [name for name, value in figures.items() if value is not None] == ["lite_ticks_per_s"]
     assert figures["lite_ticks_per_s"] == 25000.0
 

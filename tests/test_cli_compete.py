@@ -11,9 +11,9 @@ import pytest
 from scr_loopback import Loopback
 
 from sb3_torcs.cli import main
-from sb3_torcs.game import find_game
-from sb3_torcs.race_file import RaceSetup
-from sb3_torcs.scr_game import open_ports, start_server
+from sb3_torcs.scr.server import open_ports, start_server
+from sb3_torcs.torcs.installation import find_game
+from sb3_torcs.torcs.race_setup import RaceSetup
 
 pytestmark = pytest.mark.usefixtures("game")
 

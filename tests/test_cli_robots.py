@@ -14,7 +14,7 @@ import pytest
 from fake_game import write_game
 
 from sb3_torcs.cli import main
-from sb3_torcs.race_results import Lap, RobotResult
+from sb3_torcs.torcs.race_results import Lap, RobotResult
 
 
 def run(capsys, *words):
@@ -38,9 +38,9 @@ def engine(fake, monkeypatch):
         asked.update(robots=robots, track=track, laps=laps, session=session, telemetry=telemetry)
         return asked["results"]
 
-    module = types.ModuleType("sb3_torcs.robots")
+    module = types.ModuleType("sb3_torcs.agents.robots")
     module.race = race
-    monkeypatch.setitem(sys.modules, "sb3_torcs.robots", module)
+    monkeypatch.setitem(sys.modules, "sb3_torcs.agents.robots", module)
     asked["results"] = [
         RobotResult(
             "racer", 3, "small", [Lap(50.5, 0), Lap(49.25, 7)], 99.75, 1, 7, False, 2, 49.25

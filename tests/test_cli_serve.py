@@ -15,7 +15,7 @@ import pytest
 from third_party import ThirdParty
 
 from sb3_torcs.cli import main
-from sb3_torcs.display import VirtualDisplay
+from sb3_torcs.torcs.display import VirtualDisplay
 
 pytestmark = pytest.mark.usefixtures("game")
 

@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 from processes import children
 
-from sb3_torcs import driving, watching
+from sb3_torcs.agents import remote as driving
 from sb3_torcs.cli import main
-from sb3_torcs.display import VirtualDisplay
-from sb3_torcs.scr_game import start_server
+from sb3_torcs.evaluation import watching
+from sb3_torcs.scr.server import start_server
+from sb3_torcs.torcs.display import VirtualDisplay
 
 pytestmark = pytest.mark.usefixtures("game", "nothing_is_left")
 

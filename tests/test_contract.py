@@ -23,8 +23,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 import sb3_torcs
 from sb3_torcs.actions import ACTIONS, GEARBOXES
+from sb3_torcs.agents.scripted import ScriptedDriver
 from sb3_torcs.car import CarState
-from sb3_torcs.drivers import ScriptedDriver
 from sb3_torcs.errors import BackendUnavailable, InvalidOption
 from sb3_torcs.rewards import Reward
 from sb3_torcs.sensors import encode

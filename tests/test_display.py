@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from sb3_torcs.display import VirtualDisplay, find_display
 from sb3_torcs.errors import BackendUnavailable, DisplayUnavailable
+from sb3_torcs.torcs.display import VirtualDisplay, find_display
 
 SIZE = (160, 120)
 
@@ -92,7 +92,7 @@ class TestTheVirtualDisplay:
 
     def test_it_goes_with_the_process_that_has_it(self):
         code = (
-            "from sb3_torcs.display import VirtualDisplay\n"
+            "from sb3_torcs.torcs.display import VirtualDisplay\n"
             f"display = VirtualDisplay({SIZE})\n"
             "print(display.name, display.pid, flush=True)\n"
             "input()\n"

@@ -20,17 +20,18 @@ from gymnasium.utils.env_checker import check_env as check_gymnasium
 from stable_baselines3.common.vec_env import VecEnv
 
 import sb3_torcs  # noqa: F401  registers the environments
-from sb3_torcs import cli, rewards, zoo
+from sb3_torcs import cli, rewards
+from sb3_torcs.agents.models import shipped_agents
+from sb3_torcs.callbacks.metrics import DrivingMetricsCallback
 from sb3_torcs.cli import install_torcs
-from sb3_torcs.cli.train import TrainOptions
-from sb3_torcs.driving_metrics import DrivingMetricsCallback
 from sb3_torcs.envs.torcs import TorcsEnv
 from sb3_torcs.envs.torcs_lite import TorcsLiteEnv
-from sb3_torcs.models import shipped_agents
 from sb3_torcs.noise import BLOG
 from sb3_torcs.sensors import RANGE_FINDERS, sensor_table
-from sb3_torcs.study_file import read_study
-from sb3_torcs.tracks import BUNDLED_FOLDER, load_track
+from sb3_torcs.studies.config import read_study
+from sb3_torcs.tracks.catalogue import BUNDLED_FOLDER, load_track
+from sb3_torcs.training import zoo
+from sb3_torcs.training.run import TrainOptions
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
@@ -326,6 +327,8 @@ def test_a_command_in_the_docs_parses_and_names_what_exists(page, line, parsed, 
         case ["python", script, *_]:
             assert (ROOT / script).is_relative_to(ROOT / "examples")
             assert (ROOT / script).is_file()
+        case ["pip", "install", what] | ["SB3_TORCS_WITHOUT_ENGINE=1", "pip", "install", what]:
+            assert what == "."
         case ["sudo", "apt", "install", *packages]:
             tools = {"git", "make", "g++", "python3-dev", "python3-venv"}
             assert set(packages) <= {*tools, *install_torcs.FILM_PACKAGES}

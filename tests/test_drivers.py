@@ -8,9 +8,9 @@ import pytest
 from conftest import car_state
 
 import sb3_torcs  # noqa: F401
-from sb3_torcs.drivers import ScriptedDriver
+from sb3_torcs.agents.scripted import ScriptedDriver
 from sb3_torcs.errors import InvalidOption
-from sb3_torcs.evaluation import evaluate
+from sb3_torcs.evaluation.protocol import evaluate
 from sb3_torcs.sensors import encode
 
 BUNDLED = ["aalborg", "alpine-1", "corkscrew", "g-track-1"]

@@ -15,7 +15,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 import sb3_torcs  # noqa: F401
-from sb3_torcs.driving_metrics import (
+from sb3_torcs.callbacks.metrics import (
     MONITOR_KWARGS,
     DrivenLine,
     DrivingMetricsCallback,
@@ -209,7 +209,7 @@ def test_measuring_changes_nothing_that_is_learned():
 @pytest.mark.parametrize("vec_env_cls", [DummyVecEnv, SubprocVecEnv])
 def test_a_line_that_is_drawn_changes_no_later_evaluation(vec_env_cls, monkeypatch):
     """Of several tracks the evaluation draws one for each race."""
-    monkeypatch.setattr("sb3_torcs.driving_metrics.line_image", lambda line: line)
+    monkeypatch.setattr("sb3_torcs.callbacks.metrics.line_image", lambda line: line)
 
     def races(*callbacks):
         tracks = ["aalborg", "alpine-1", "corkscrew", "g-track-1"]
@@ -246,7 +246,7 @@ def test_the_scale_of_the_noise_is_logged(oval):
 @pytest.mark.parametrize("metrics_first", [True, False])
 def test_a_line_is_drawn_once_after_each_evaluation(metrics_first, monkeypatch):
     """Also after the very last one, wherever the callback stands in the list."""
-    monkeypatch.setattr("sb3_torcs.driving_metrics.line_image", lambda line: line)
+    monkeypatch.setattr("sb3_torcs.callbacks.metrics.line_image", lambda line: line)
     model = DDPG("MlpPolicy", lite(), learning_starts=1000, **small())
     pictures = Pictures()
     model.set_logger(Logger(None, [pictures]))
@@ -259,7 +259,7 @@ def test_a_line_is_drawn_once_after_each_evaluation(metrics_first, monkeypatch):
 
 
 def test_no_lap_is_driven_when_nobody_would_see_it(monkeypatch):
-    monkeypatch.setattr("sb3_torcs.driving_metrics.drive_lap", None)
+    monkeypatch.setattr("sb3_torcs.callbacks.metrics.drive_lap", None)
     model = DDPG("MlpPolicy", lite(), learning_starts=1000, **small())
     model.set_logger(Logger(None, [Rows()]))
     evaluation = EvalCallback(lite(), n_eval_episodes=1, eval_freq=20, verbose=0)
@@ -305,7 +305,7 @@ def test_a_driven_lap_that_never_ends_is_given_up(oval):
 
 
 def test_the_picture_shows_the_line_in_colours(oval):
-    pytest.importorskip("sb3_torcs.track_plot")
+    pytest.importorskip("sb3_torcs.tracks.plot")
     turn = np.linspace(0.0, 1.0, 50)
     fast = DrivenLine(oval, 300.0 * turn, 0.0 * turn, 20.0 + 30.0 * turn, 300.0, None)
     picture = line_image(fast)

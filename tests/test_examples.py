@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sb3_torcs.agents.models import AGENTS
 from sb3_torcs.errors import OutputNotWritable
-from sb3_torcs.models import AGENTS
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 

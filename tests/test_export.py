@@ -16,11 +16,12 @@ from stable_baselines3 import DDPG, DQN, PPO, SAC, TD3
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 from toy import ToyRace
 
-from sb3_torcs import export, policies
+from sb3_torcs.agents.models import Driver
 from sb3_torcs.errors import ModelMismatch, OutputNotWritable, PackageMissing
-from sb3_torcs.export import export_actor
-from sb3_torcs.models import Driver
 from sb3_torcs.noise import SetPointNoise, bind
+from sb3_torcs.policies import export
+from sb3_torcs.policies import split_head as policies
+from sb3_torcs.policies.export import export_actor
 
 OBSERVATIONS = np.random.default_rng(0).uniform(-1, 1, (200, 29)).astype(np.float32)
 

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from test_display import gone_within, runs, traces
 
-from sb3_torcs import film as film_module
+from sb3_torcs.agents.text_mode import run
 from sb3_torcs.errors import (
     DisplayUnavailable,
     GameFailed,
@@ -25,11 +25,12 @@ from sb3_torcs.errors import (
     InvalidOption,
     OutputNotWritable,
 )
-from sb3_torcs.film import HEADER, Film, read_frame, side_by_side
-from sb3_torcs.game_process import GameProcess
-from sb3_torcs.game_window import window_arguments
-from sb3_torcs.race_file import RaceSetup
-from sb3_torcs.text_mode import run
+from sb3_torcs.rendering import game_video as film_module
+from sb3_torcs.rendering.game_video import HEADER, Film, read_frame, side_by_side
+from sb3_torcs.torcs.process import GameProcess
+from sb3_torcs.torcs.race_setup import RaceSetup
+from sb3_torcs.torcs.window import window_arguments
+from sb3_torcs.tracks.trial import check_track
 
 SIZE = (160, 120)
 FPS = 5  # that the physics meets exactly: 100 of its steps
@@ -48,7 +49,7 @@ def nothing_is_left(tmp_path, monkeypatch):
 
 def filmed(game, race=LAP, size=SIZE, **options):
     def start(window):
-        return GameProcess(game, race, **window_arguments(game, window))
+        return GameProcess(game, race, check=check_track, **window_arguments(game, window))
 
     return Film(start, size=size, **{"fps": FPS, **options})
 
@@ -186,7 +187,7 @@ class TestFaults:
         """As when it cannot load a driver: it ends as if all were well."""
 
         def start(window):
-            return GameProcess(game, LAP, descriptors=[window.frames])
+            return GameProcess(game, LAP, check=check_track, descriptors=[window.frames])
 
         with Film(start, size=SIZE) as film, pytest.raises(GameFailed, match="exit status 0"):
             list(film.frames())
@@ -222,7 +223,7 @@ class TestFaults:
         code = (
             "import sys; sys.path.insert(0, 'tests')\n"
             "from test_film import filmed\n"
-            "from sb3_torcs.game import find_game\n"
+            "from sb3_torcs.torcs.installation import find_game\n"
             "film = filmed(find_game(), fps=100)\n"
             "frame = next(film.frames())\n"
             "display = film.display\n"

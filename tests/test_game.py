@@ -8,7 +8,6 @@ import fake_game
 import pytest
 from fake_game import write_game
 
-from sb3_torcs import game as game_module
 from sb3_torcs.errors import (
     BackendUnavailable,
     GameIncomplete,
@@ -17,7 +16,8 @@ from sb3_torcs.errors import (
     UnknownCar,
     UnknownRobot,
 )
-from sb3_torcs.game import RobotEntry, find_game, torcs_folders
+from sb3_torcs.torcs import installation as game_module
+from sb3_torcs.torcs.installation import RobotEntry, find_game, torcs_folders
 
 
 @pytest.fixture

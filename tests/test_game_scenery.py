@@ -8,9 +8,9 @@ import pytest
 from processes import children
 
 from sb3_torcs.cli import main
-from sb3_torcs.display import VirtualDisplay
 from sb3_torcs.errors import GameFailed, SceneryMissing
-from sb3_torcs.game_scenery import find_scenery
+from sb3_torcs.torcs.display import VirtualDisplay
+from sb3_torcs.torcs.scenery import find_scenery
 
 GAME = {"render_mode": "rgb_array", "picture": "game", "render_size": (160, 120)}
 CORNER = {"distance": 600.0, "speed": 20.0}

@@ -29,7 +29,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecVide
 from sb3_torcs.envs.torcs import TorcsEnv
 from sb3_torcs.envs.torcs_lite import OF_THE_GAME, TorcsLiteEnv
 from sb3_torcs.errors import DisplayUnavailable, EnvClosed, GameFailed, InvalidOption
-from sb3_torcs.game_window import VIEWS
+from sb3_torcs.torcs.window import VIEWS
 
 TORCS = "sb3_torcs:Torcs-v0"
 SIZE = (160, 120)

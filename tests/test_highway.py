@@ -11,8 +11,16 @@ import numpy as np
 import pytest
 
 from sb3_torcs.car import CarState
-from sb3_torcs.highway import RaceCar, Road, RoadNetwork, lane_index, road_network, to_highway
-from sb3_torcs.tracks import Segment, Surface, Track, load_track
+from sb3_torcs.rendering.highway import (
+    RaceCar,
+    Road,
+    RoadNetwork,
+    lane_index,
+    road_network,
+    to_highway,
+)
+from sb3_torcs.tracks.catalogue import load_track
+from sb3_torcs.tracks.track import Segment, Surface, Track
 
 ASPHALT, GRASS = Surface("asphalt", 1.0, 0.001, 0.5, 10.0), Surface("grass", 0.6, 0.01, 0.5, 10.0)
 
@@ -146,7 +154,7 @@ def test_the_velocity_holds_the_sliding():
 
 def test_importing_leaves_the_environment_variables_and_the_output_alone():
     code = (
-        "import os, gymnasium; before = dict(os.environ); import sb3_torcs.highway; "
+        "import os, gymnasium; before = dict(os.environ); import sb3_torcs.rendering.highway; "
         "assert dict(os.environ) == before, set(os.environ) ^ set(before)"
     )
     clean = {k: v for k, v in os.environ.items() if k != "PYGAME_HIDE_SUPPORT_PROMPT"}

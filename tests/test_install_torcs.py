@@ -7,8 +7,8 @@ import os
 import pytest
 from fake_game import write_game, write_program
 
-from sb3_torcs import game as game_module
 from sb3_torcs.cli import main
+from sb3_torcs.torcs import installation as game_module
 
 COMMON = """
 import os, pathlib, shutil, signal, sys

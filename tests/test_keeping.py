@@ -23,10 +23,17 @@ from stable_baselines3.common.save_util import load_from_pkl
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from toy import ToyRace
 
-from sb3_torcs import models, zoo_training
+from sb3_torcs.agents import models
 from sb3_torcs.cli import main
 from sb3_torcs.errors import InvalidOption
-from sb3_torcs.keeping import REPLAY_BUFFER, STATISTICS, UNFINISHED, KeepCallback, WholeFiles
+from sb3_torcs.training import manager as zoo_training
+from sb3_torcs.training.keeping import (
+    REPLAY_BUFFER,
+    STATISTICS,
+    UNFINISHED,
+    KeepCallback,
+    WholeFiles,
+)
 
 ENTRY = {
     "n_timesteps": 60, "policy": "MlpPolicy", "learning_starts": 20, "buffer_size": 1000,

@@ -6,7 +6,7 @@ import csv
 
 import pytest
 
-from sb3_torcs.cli.train import TrainOptions, train
+from sb3_torcs.training.run import TrainOptions, train
 
 EPISODES = 25  # at either end of the training
 

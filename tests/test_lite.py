@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from conftest import segment
 
-from sb3_torcs.backends import lite_car as figures
-from sb3_torcs.backends import lite_physics as physics
-from sb3_torcs.backends.lite import LiteBackend
-from sb3_torcs.backends.lite_rays import RANGE, cast, road_edges
+from sb3_torcs.backends.lite import car as figures
+from sb3_torcs.backends.lite import physics
+from sb3_torcs.backends.lite.backend import LiteBackend
+from sb3_torcs.backends.lite.rays import RANGE, cast, road_edges
 from sb3_torcs.car import Controls, Start
 from sb3_torcs.errors import CarLost, InvalidOption
-from sb3_torcs.tracks import Grid, Track
+from sb3_torcs.tracks.track import Grid, Track
 
 RNG = np.random.default_rng(0)
 GAS, COAST, BRAKE = Controls(0.0, 1.0, 0.0), Controls(0.0, 0.0, 0.0), Controls(0.0, 0.0, 1.0)
@@ -229,7 +229,7 @@ def test_no_beam_slips_between_two_segments(oval):
 
 def test_beams_agree_with_a_slow_and_obvious_ray_march():
     """The oracle: walk along the beam in steps of 1 cm until the road is left."""
-    from sb3_torcs.tracks import load_track
+    from sb3_torcs.tracks.catalogue import load_track
 
     track = load_track("aalborg")
     rng = np.random.default_rng(3)

@@ -15,7 +15,7 @@ from toy import ToyRace
 
 from sb3_torcs.callbacks import MirrorCallback
 from sb3_torcs.errors import InvalidOption
-from sb3_torcs.mirror import mirror_actions, mirror_observations
+from sb3_torcs.policies.mirror import mirror_actions, mirror_observations
 from sb3_torcs.sensors import encode, feature_slices
 
 STRAIGHT = 4050.0  # [m] of forza, where nearly a kilometre of straight road begins

@@ -21,9 +21,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from torch import nn
 
 import sb3_torcs  # noqa: F401  (registers the environments)
-from sb3_torcs import model_file, model_policy, models
+from sb3_torcs.agents import model_file, model_policy, models
+from sb3_torcs.agents.model_writing import RecordCallback, recipe, write_driver
 from sb3_torcs.errors import InvalidAction, ModelMismatch, ModelNotTrusted
-from sb3_torcs.model_writing import RecordCallback, recipe, write_driver
 from sb3_torcs.policies import SplitHeadPolicy
 
 OBSERVATIONS = np.linspace(-0.5, 0.5, 4 * 29, dtype=np.float32).reshape(4, 29)

@@ -14,12 +14,12 @@ import pytest
 from game_copy import python
 
 from sb3_torcs.actions import controls_from_action
+from sb3_torcs.agents.scripted import ScriptedDriver
 from sb3_torcs.backends.native import AGENT, Fleet, NativeBackend, make_engine
 from sb3_torcs.car import Controls, Start
-from sb3_torcs.drivers import ScriptedDriver
 from sb3_torcs.errors import CarLost, InvalidOption
-from sb3_torcs.game import find_game
 from sb3_torcs.sensors import encode
+from sb3_torcs.torcs.installation import find_game
 
 ALONE = [AGENT]
 # The car settles on its springs, and rolls while it does: on a slope by a few centimetres. At the
@@ -32,7 +32,7 @@ DRIVE = """
 import hashlib, sys
 import numpy as np
 from sb3_torcs.backends.native import AGENT, make_engine
-from sb3_torcs.game import find_game
+from sb3_torcs.torcs.installation import find_game
 
 def drive(track, entries, seed, ticks=300):
     engine = make_engine(find_game(), track, entries, session="race" if entries[1:] else "practice")

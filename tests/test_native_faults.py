@@ -37,7 +37,7 @@ from sb3_torcs.errors import (
     UnknownCar,
     UnknownRobot,
 )
-from sb3_torcs.game import MODULES, SURFACES, find_game
+from sb3_torcs.torcs.installation import MODULES, SURFACES, find_game
 
 INSTALL = "sb3-torcs install-torcs"
 SMALL = "g-track-1"  # loads in no time
@@ -48,7 +48,7 @@ import json, math, os, sys, threading, numpy as np
 from sb3_torcs import errors
 from sb3_torcs.backends.native import AGENT, Fleet, NativeBackend, make_engine
 from sb3_torcs.car import Controls, Start
-from sb3_torcs.game import find_game
+from sb3_torcs.torcs.installation import find_game
 
 def engine(track="g-track-1", entries=(AGENT,), **options):
     return make_engine(find_game(), track, list(entries), **options)
@@ -251,7 +251,7 @@ class TestOtherVersions:
         compiled(MODULE.format(body=body, name="track"), libraries / "modules/track/track.so")
         code = (
             "from sb3_torcs.backends.native import check_layout\n"
-            "from sb3_torcs.game import find_game\n"
+            "from sb3_torcs.torcs.installation import find_game\n"
             "from sb3_torcs.errors import LayoutMismatch\n"
             "try: check_layout(find_game())\nexcept LayoutMismatch as error: print(error)"
         )
@@ -775,7 +775,7 @@ class TestGoodManners:
     def test_without_the_extension_it_says_how_to_build_it(self, monkeypatch):
         monkeypatch.setitem(sys.modules, "sb3_torcs._engine", None)
         monkeypatch.delattr("sb3_torcs._engine", raising=False)
-        with pytest.raises(BackendUnavailable, match="make native"):
+        with pytest.raises(BackendUnavailable, match="pip install"):
             make_engine(find_game(), SMALL, [AGENT])
 
 

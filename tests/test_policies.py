@@ -16,12 +16,11 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from torch import nn
 from toy import ToyRace
 
-from sb3_torcs import fast_matmul
-from sb3_torcs.bench_policy import PlainSplitHeadPolicy, measure, updater
+from sb3_torcs.bench.policy import PlainSplitHeadPolicy, measure, updater
 from sb3_torcs.errors import InvalidOption
-from sb3_torcs.mirror import mirror_actions, mirror_observations
-from sb3_torcs.optimizers import LeanAdam
-from sb3_torcs.policies import SplitHeadPolicy
+from sb3_torcs.policies import SplitHeadPolicy, fast_matmul
+from sb3_torcs.policies.mirror import mirror_actions, mirror_observations
+from sb3_torcs.policies.optimizers import LeanAdam
 
 SMALL = [16, 24]
 OBSERVATIONS = np.random.default_rng(0).uniform(-1, 1, (5, 29)).astype(np.float32)

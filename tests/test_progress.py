@@ -8,10 +8,10 @@ from conftest import ScriptedBackend
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_torcs.driving_metrics import DrivingMetricsCallback
+from sb3_torcs.callbacks.metrics import DrivingMetricsCallback
+from sb3_torcs.callbacks.progress import RacingProgressCallback, spoken_time
 from sb3_torcs.envs.racing import RacingEnv
 from sb3_torcs.errors import InvalidOption
-from sb3_torcs.progress import RacingProgressCallback, spoken_time
 
 OFF = {"distance_from_axis": 6.0, "distance_raced": 70.0}
 
@@ -70,7 +70,7 @@ def test_a_reader_that_leaves_does_not_end_the_training(oval, kind):
 def test_lines_come_at_their_interval(oval, monkeypatch):
     """The clock is scripted: one second per look."""
     ticks = iter(range(10_000))
-    monkeypatch.setattr("sb3_torcs.progress.time.monotonic", lambda: float(next(ticks)))
+    monkeypatch.setattr("sb3_torcs.callbacks.progress.time.monotonic", lambda: float(next(ticks)))
     stream = io.StringIO()
     learned(oval, stream=stream)
     lines = stream.getvalue().splitlines()

@@ -12,11 +12,11 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import sb3_torcs  # noqa: F401  (registers the environments)
-from sb3_torcs import driving
-from sb3_torcs.driving_metrics import drive_lap
-from sb3_torcs.evaluation import evaluate
-from sb3_torcs.models import Driver, load_driver
-from sb3_torcs.scr_protocol import RESTART
+from sb3_torcs.agents import remote as driving
+from sb3_torcs.agents.models import Driver, load_driver
+from sb3_torcs.callbacks.metrics import drive_lap
+from sb3_torcs.evaluation.protocol import evaluate
+from sb3_torcs.scr.protocol import RESTART
 
 
 class Counting:

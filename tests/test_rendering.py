@@ -13,10 +13,11 @@ from test_highway import stadium, state
 
 from sb3_torcs.car import Controls
 from sb3_torcs.errors import EnvClosed, InvalidOption
-from sb3_torcs.hud import lap_clock
-from sb3_torcs.rendering import BEAM_END, CAR_HEIGHT, Viewer
-from sb3_torcs.scenery import GRASS_FAR, ROAD, Scenery, colour
-from sb3_torcs.tracks import Surface, load_track
+from sb3_torcs.rendering.hud import lap_clock
+from sb3_torcs.rendering.scenery import GRASS_FAR, ROAD, Scenery, colour
+from sb3_torcs.rendering.viewer import BEAM_END, CAR_HEIGHT, Viewer
+from sb3_torcs.tracks.catalogue import load_track
+from sb3_torcs.tracks.track import Surface
 
 ANGLES = np.radians(np.linspace(-90.0, 90.0, 19))
 COASTING = Controls(0.0, 0.0, 0.0)
@@ -221,7 +222,7 @@ import os
 before = dict(os.environ)
 from test_highway import stadium, state
 from test_rendering import ANGLES, COASTING
-from sb3_torcs.rendering import Viewer
+from sb3_torcs.rendering.viewer import Viewer
 from sb3_torcs.errors import EnvClosed, InvalidOption
 import pygame
 track = stadium(0.025)
@@ -254,7 +255,7 @@ def test_a_window_that_nobody_can_see_says_what_to_do_and_draws_on():
     run_python(
         PRELUDE + "import logging\n"
         "said = []\n"
-        "logger = logging.getLogger('sb3_torcs.rendering')\n"
+        "logger = logging.getLogger('sb3_torcs.rendering.viewer')\n"
         "logger.addFilter(lambda record: said.append(record.getMessage()))\n"
         "viewer = Viewer(mode='human', fps=1000)\n"
         "viewer.frame(track, car, COASTING, ANGLES)\n"
@@ -284,7 +285,7 @@ def test_a_window_shows_the_picture_and_ends_cleanly_when_it_is_closed():
 
 def test_nothing_graphical_is_imported_before_the_first_picture():
     run_python(
-        "import sys, sb3_torcs, sb3_torcs.envs.racing, sb3_torcs.backends.lite\n"
+        "import sys, sb3_torcs, sb3_torcs.envs.racing, sb3_torcs.backends.lite.backend\n"
         "loaded = {'pygame', 'highway_env', 'matplotlib', 'pandas'} & set(sys.modules)\n"
         "assert not loaded, loaded"
     )

@@ -8,9 +8,9 @@ import pytest
 from rliable.metrics import aggregate_iqm
 
 from sb3_torcs.cli import main
-from sb3_torcs.study_estimates import estimate, iqm, share
-from sb3_torcs.study_file import FIELDS
-from sb3_torcs.study_report import read_results, write_report
+from sb3_torcs.studies.config import FIELDS
+from sb3_torcs.studies.estimates import estimate, iqm, share
+from sb3_torcs.studies.report import read_results, write_report
 
 LAPS = (97.0, 84.0, 83.5)
 

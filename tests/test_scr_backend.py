@@ -23,14 +23,12 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_torcs.actions import GEARBOXES
+from sb3_torcs.agents.remote import Agent
+from sb3_torcs.agents.scripted import ScriptedDriver
 from sb3_torcs.backends import scr
 from sb3_torcs.backends.native import NativeBackend
 from sb3_torcs.backends.scr import ScrBackend
-from sb3_torcs.backends.scr_car import CarReader
-from sb3_torcs.backends.scr_gearbox import read_gearbox
 from sb3_torcs.car import Controls, Start
-from sb3_torcs.drivers import ScriptedDriver
-from sb3_torcs.driving import Agent
 from sb3_torcs.errors import (
     CarFileError,
     EngineForked,
@@ -42,11 +40,13 @@ from sb3_torcs.errors import (
     UnknownCar,
     UnknownRobot,
 )
-from sb3_torcs.game import find_game
-from sb3_torcs.race_file import RaceSetup
-from sb3_torcs.scr_game import open_ports, start_server
-from sb3_torcs.scr_protocol import RESTART, SHUTDOWN, ScrState
-from sb3_torcs.tracks import load_track
+from sb3_torcs.scr.car_reader import CarReader
+from sb3_torcs.scr.gearbox import read_gearbox
+from sb3_torcs.scr.protocol import RESTART, SHUTDOWN, ScrState
+from sb3_torcs.scr.server import open_ports, start_server
+from sb3_torcs.torcs.installation import find_game
+from sb3_torcs.torcs.race_setup import RaceSetup
+from sb3_torcs.tracks.catalogue import load_track
 
 pytestmark = pytest.mark.usefixtures("game")
 
@@ -340,7 +340,7 @@ import gymnasium as gym
 from numba.core.dispatcher import Dispatcher
 from scr_loopback import Loopback
 import sb3_torcs.actions, sb3_torcs.sensors
-from sb3_torcs.driving import Agent
+from sb3_torcs.agents.remote import Agent
 
 def loaded():
     compiled = {

@@ -12,8 +12,8 @@ from scr_loopback import COUNTDOWN, Errant, Loopback
 
 from sb3_torcs.car import Start
 from sb3_torcs.errors import ServerLost, ServerNotFound
-from sb3_torcs.scr_client import ScrClient
-from sb3_torcs.scr_protocol import ScrAction, format_action, parse_state
+from sb3_torcs.scr.client import ScrClient
+from sb3_torcs.scr.protocol import ScrAction, format_action, parse_state
 
 ANGLES = np.radians(np.arange(-90.0, 91.0, 10.0))
 

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from sb3_torcs import _engine
 from sb3_torcs.car import Start
 from sb3_torcs.errors import MessageBroken
-from sb3_torcs.scr_protocol import (
+from sb3_torcs.scr.protocol import (
     ScrAction,
     ScrState,
     format_action,

@@ -23,9 +23,10 @@ import pytest
 
 from sb3_torcs import _engine
 from sb3_torcs.backends.native import AGENT, make_engine
-from sb3_torcs.game_process import GameProcess
-from sb3_torcs.race_file import RaceSetup
-from sb3_torcs.scr_game import open_ports, start_server
+from sb3_torcs.scr.server import open_ports, start_server
+from sb3_torcs.torcs.process import GameProcess
+from sb3_torcs.torcs.race_setup import RaceSetup
+from sb3_torcs.tracks.trial import check_track
 
 PATIENCE = 20.0  # [s] for an answer on a busy machine
 INIT = "SCR(init " + " ".join(str(angle) for angle in range(-90, 91, 10)) + ")"
@@ -983,9 +984,9 @@ def newest(client, state):
 
 START_AND_WAIT = """
 import sys, time
-from sb3_torcs.game import find_game
-from sb3_torcs.race_file import RaceSetup
-from sb3_torcs.scr_game import open_ports, start_server
+from sb3_torcs.torcs.installation import find_game
+from sb3_torcs.torcs.race_setup import RaceSetup
+from sb3_torcs.scr.server import open_ports, start_server
 sockets = open_ports(1)
 game = start_server(find_game(), RaceSetup("aalborg", [("scr_server", 0)]), sockets)
 print(game.pid, game.folder, sockets[0].getsockname()[1], flush=True)
@@ -1019,7 +1020,7 @@ class TestAlone:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
             with contextlib.suppress(OSError):  # then somebody else has it: just as well
                 taken.bind(("0.0.0.0", 3001))
-            with GameProcess(game, RaceSetup("aalborg", [DRIVER])) as process:
+            with GameProcess(game, RaceSetup("aalborg", [DRIVER]), check=check_track) as process:
                 until = time.monotonic() + PATIENCE
                 while process.poll() is None and time.monotonic() < until:
                     time.sleep(0.01)
@@ -1030,7 +1031,7 @@ class TestAlone:
     def test_a_deadline_that_is_none(self, game, deadline):
         variables = {"SB3_TORCS_SCR_DEADLINE": deadline}
         race = RaceSetup("aalborg", [DRIVER])
-        with GameProcess(game, race, environment=variables) as process:
+        with GameProcess(game, race, check=check_track, environment=variables) as process:
             until = time.monotonic() + PATIENCE
             while process.poll() is None and time.monotonic() < until:
                 time.sleep(0.01)

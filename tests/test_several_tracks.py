@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv
 
 import sb3_torcs  # noqa: F401  # registers the ids
 from sb3_torcs.errors import InvalidOption, TrackNotFound
-from sb3_torcs.tracks import load_track
+from sb3_torcs.tracks.catalogue import load_track
 
 TRACKS = ("aalborg", "alpine-1", "g-track-1")
 GAS = np.array([0.0, 1.0, 0.0], np.float32)

@@ -15,13 +15,13 @@ from pathlib import Path
 import pytest
 import yaml
 
-from sb3_torcs import study as study_module
 from sb3_torcs.cli import main
 from sb3_torcs.cli.study import Board
 from sb3_torcs.errors import RayUnavailable, StudyError
-from sb3_torcs.study import MARK, PRIVATE, SESSION, run_study, run_trial
-from sb3_torcs.study_file import FIELDS, read_study
-from sb3_torcs.study_folder import StudyFolder
+from sb3_torcs.studies import runner as study_module
+from sb3_torcs.studies.config import FIELDS, read_study
+from sb3_torcs.studies.runner import MARK, PRIVATE, SESSION, run_study, run_trial
+from sb3_torcs.studies.storage import StudyFolder
 
 CLOCKS = ("wall_s", "cpu_s")
 

@@ -9,8 +9,8 @@ import yaml
 
 from sb3_torcs.cli import main
 from sb3_torcs.errors import StudyError
-from sb3_torcs.study_file import merged, read_study
-from sb3_torcs.tracks import available_tracks
+from sb3_torcs.studies.config import merged, read_study
+from sb3_torcs.tracks.catalogue import available_tracks
 
 STUDIES = sorted((Path(__file__).parent.parent / "examples" / "studies").glob("*.yml"))
 VECTORS = "stable_baselines3.common.vec_env.VecExtractDictObs"

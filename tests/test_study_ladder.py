@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from sb3_torcs.drivers import SCRIPTED
-from sb3_torcs.evaluation import Episode, merit
-from sb3_torcs.ladder import REFERENCE_FILE, ROBOTS, reference_laps, rung
-from sb3_torcs.tracks import available_tracks
+from sb3_torcs.agents.scripted import SCRIPTED
+from sb3_torcs.evaluation.ladder import REFERENCE_FILE, ROBOTS, reference_laps, rung
+from sb3_torcs.evaluation.protocol import Episode, merit
+from sb3_torcs.tracks.catalogue import available_tracks
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 

@@ -9,9 +9,9 @@ import yaml
 
 from sb3_torcs.cli import main
 from sb3_torcs.errors import StudyError
-from sb3_torcs.evaluation import Episode
-from sb3_torcs.study_file import read_study
-from sb3_torcs.study_training import Training, final_row
+from sb3_torcs.evaluation.protocol import Episode
+from sb3_torcs.studies.config import read_study
+from sb3_torcs.studies.trial import Training, final_row
 
 CLOCKS = ("wall_s", "cpu_s")
 TINY = {

@@ -15,7 +15,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, VectorEnv
 
 import sb3_torcs
-from sb3_torcs.drivers import ScriptedDriver
+from sb3_torcs.agents.scripted import ScriptedDriver
 from sb3_torcs.envs.torcs_vector import TorcsVectorEnv
 from sb3_torcs.errors import (
     CarLost,

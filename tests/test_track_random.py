@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from sb3_torcs.track_random import SPARE, random_track
-from sb3_torcs.tracks import closing_gap
+from sb3_torcs.tracks.generator import SPARE, random_track
+from sb3_torcs.tracks.track import closing_gap
 
 SEEDS = range(60)
 

@@ -13,16 +13,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sb3_torcs import track_trial
-from sb3_torcs.backends.lite import LiteBackend
+from sb3_torcs.backends.lite.backend import LiteBackend
 from sb3_torcs.backends.native import NativeBackend
 from sb3_torcs.backends.scr import ScrBackend
 from sb3_torcs.errors import BackendUnavailable, TrackFileError
-from sb3_torcs.game import find_game
-from sb3_torcs.game_process import GameProcess
-from sb3_torcs.race_file import RaceSetup
-from sb3_torcs.track_trial import check_road, engine_arguments, try_race
-from sb3_torcs.tracks import load_track
+from sb3_torcs.torcs.installation import find_game
+from sb3_torcs.torcs.process import GameProcess
+from sb3_torcs.torcs.race_setup import RaceSetup
+from sb3_torcs.tracks import trial as track_trial
+from sb3_torcs.tracks.catalogue import load_track
+from sb3_torcs.tracks.trial import check_road, check_track, engine_arguments, try_race
 
 FIRST_SEGMENT = r'(?s)(Track Segments">.*?<section name=")[^"]*'
 ID_OF_NOTHING = r'\g<0><section name="nowhere"><attnum name="id" val="-7"/></section>'
@@ -138,7 +138,7 @@ def test_the_game_s_own_process_is_not_started_with_it(broken, monkeypatch, spoi
     monkeypatch.setattr(track_trial, "COMPUTING", 1)
     path = spoil(broken)
     with pytest.raises(TrackFileError, match=str(path)):
-        GameProcess(find_game(), RaceSetup(path, [("inferno", 3)], laps=1))
+        GameProcess(find_game(), RaceSetup(path, [("inferno", 3)], laps=1), check=check_track)
     with pytest.raises(TrackFileError, match=str(path)):
         ScrBackend(path).reset(np.random.default_rng(0), None)
 

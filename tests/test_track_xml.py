@@ -6,10 +6,11 @@ import math
 
 import pytest
 
-from sb3_torcs import torcs_params
 from sb3_torcs.errors import TrackFileError
-from sb3_torcs.track_xml import read_track_xml
-from sb3_torcs.tracks import BUNDLED_FOLDER, closed, closing_gap, load_track
+from sb3_torcs.tracks import torcs_xml
+from sb3_torcs.tracks.catalogue import BUNDLED_FOLDER, load_track
+from sb3_torcs.tracks.torcs_xml import read_track_xml
+from sb3_torcs.tracks.track import closed, closing_gap
 
 HEAD = """<?xml version="1.0" encoding="UTF-8"?>
 <!DOCTYPE params SYSTEM "params.dtd" [
@@ -98,7 +99,7 @@ VERSION_3 = (
 @pytest.fixture
 def read(tmp_path, monkeypatch):
     """Write a track into an installation that has only the shared surfaces, and read it."""
-    monkeypatch.setattr(torcs_params, "torcs_folders", list)
+    monkeypatch.setattr(torcs_xml, "torcs_folders", list)
     shared = tmp_path / "data" / "tracks"
     shared.mkdir(parents=True)
     (shared / "surfaces.xml").write_text(SURFACES)

@@ -9,17 +9,13 @@ import numpy as np
 import pytest
 from conftest import segment
 
-from sb3_torcs import tracks
 from sb3_torcs.errors import InvalidOption, TrackFileError, TrackNotFound
-from sb3_torcs.track_file import read_track_file, write_track_file
-from sb3_torcs.track_plot import edges, plot_track
-from sb3_torcs.tracks import (
-    Track,
-    available_tracks,
-    closed,
-    closing_gap,
-    load_track,
-)
+from sb3_torcs.tracks import catalogue
+from sb3_torcs.tracks import track as tracks
+from sb3_torcs.tracks.catalogue import available_tracks, load_track
+from sb3_torcs.tracks.compact import read_track_file, write_track_file
+from sb3_torcs.tracks.plot import edges, plot_track
+from sb3_torcs.tracks.track import Track, closed, closing_gap
 
 BUNDLED = ["aalborg", "alpine-1", "corkscrew", "g-track-1"]
 
@@ -44,7 +40,7 @@ def write(folder, text, name="ring.csv"):
 @pytest.fixture(autouse=True)
 def no_installed_torcs(monkeypatch):
     """Only what the package brings counts here, whatever this machine has."""
-    monkeypatch.setattr(tracks, "torcs_folders", list)
+    monkeypatch.setattr(catalogue, "torcs_folders", list)
 
 
 class TestGeometry:
@@ -219,7 +215,7 @@ class TestLoading:
             folder = tmp_path / "tracks" / "road" / name
             folder.mkdir(parents=True)
             write(folder, xml, f"{name}.xml")
-        monkeypatch.setattr(tracks, "torcs_folders", lambda: [tmp_path])
+        monkeypatch.setattr(catalogue, "torcs_folders", lambda: [tmp_path])
         sources = {entry.name: entry.source for entry in available_tracks()}
         assert sources == {**dict.fromkeys(BUNDLED, "bundled"), "loop": "torcs"}
         assert load_track("loop").length == pytest.approx(100.0 * math.pi)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sb3_torcs.errors import InvalidOption, OutputNotWritable
-from sb3_torcs.video import write_video
+from sb3_torcs.rendering.encoder import write_video
 
 
 def frames(count=5, size=(32, 48)):

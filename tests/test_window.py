@@ -19,12 +19,13 @@ import numpy as np
 import pytest
 from test_display import gone_within, runs
 
-from sb3_torcs import game_window
-from sb3_torcs.display import VirtualDisplay
 from sb3_torcs.errors import GameFailed, GameIncomplete, InvalidOption
-from sb3_torcs.game_process import GameProcess
-from sb3_torcs.game_window import VIEWS, Window, window_arguments, window_files
-from sb3_torcs.race_file import RaceSetup
+from sb3_torcs.torcs import window as game_window
+from sb3_torcs.torcs.display import VirtualDisplay
+from sb3_torcs.torcs.process import GameProcess
+from sb3_torcs.torcs.race_setup import RaceSetup
+from sb3_torcs.torcs.window import VIEWS, Window, window_arguments, window_files
+from sb3_torcs.tracks.trial import check_track
 
 SIZE = (320, 240)
 LAP = RaceSetup("aalborg", [("inferno", 3)], laps=1)
@@ -45,7 +46,7 @@ def nothing_is_left(tmp_path, monkeypatch):
 
 def shown(game, display, race=LAP, **options):
     window = Window(SIZE, display=display.name, **options)
-    return GameProcess(game, race, **window_arguments(game, window))
+    return GameProcess(game, race, check=check_track, **window_arguments(game, window))
 
 
 class XKeyEvent(ctypes.Structure):
@@ -151,8 +152,8 @@ def race_of_another_process():
     code = (
         "import sys; sys.path.insert(0, 'tests')\n"
         "from test_window import shown, Viewer\n"
-        "from sb3_torcs.display import VirtualDisplay\n"
-        "from sb3_torcs.game import find_game\n"
+        "from sb3_torcs.torcs.display import VirtualDisplay\n"
+        "from sb3_torcs.torcs.installation import find_game\n"
         f"display = VirtualDisplay({SIZE})\n"
         "process = shown(find_game(), display)\n"
         "Viewer(display.name).wait_for_a_race()\n"
@@ -264,7 +265,7 @@ class TestTheWindow:
 
     def test_without_a_display_it_says_so(self, game):
         window = Window(SIZE, display=":2999")
-        with GameProcess(game, LAP, **window_arguments(game, window)) as process:
+        with GameProcess(game, LAP, check=check_track, **window_arguments(game, window)) as process:
             with pytest.raises(GameFailed, match="failed to open display ':2999'"):
                 process.wait(20)
 
@@ -276,7 +277,7 @@ class TestTheWindow:
             # No process has this number: as if the owner were gone.
             gone = {"SB3_TORCS_OWNER": "999999999", "SB3_TORCS_FOLDER": str(precious)}
             arguments["environment"] |= gone
-            with GameProcess(game, LAP, **arguments) as process:
+            with GameProcess(game, LAP, check=check_track, **arguments) as process:
                 with pytest.raises(GameFailed, match="exit status 1"):
                     process.wait(20)
                 assert process.folder.exists()

@@ -18,12 +18,12 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
 import sb3_torcs  # noqa: F401  (registers the environments)
-from sb3_torcs import driving
+from sb3_torcs.agents import remote as driving
+from sb3_torcs.agents.models import Driver, load_driver
+from sb3_torcs.agents.wrapping import wrapped
 from sb3_torcs.cli import main
 from sb3_torcs.errors import ModelMismatch, ModelNotTrusted, PackageMissing
-from sb3_torcs.evaluation import evaluate
-from sb3_torcs.models import Driver, load_driver
-from sb3_torcs.wrapping import wrapped
+from sb3_torcs.evaluation.protocol import evaluate
 
 # RescaleAction says so of its own limits.
 pytestmark = pytest.mark.filterwarnings("ignore:.*precision lowered by casting:UserWarning")
@@ -170,7 +170,7 @@ def test_what_cannot_be_put_around_is_told(path, error, says):
 
 
 def test_what_only_ends_or_writes_down_a_training_is_left_out():
-    names = ["gymnasium.wrappers.TimeLimit", "sb3_torcs.zoo.UninterruptedWorker"]
+    names = ["gymnasium.wrappers.TimeLimit", "sb3_torcs.training.zoo.UninterruptedWorker"]
     entry = {"env_wrapper": [{names[0]: {"max_episode_steps": 3}}, names[1]]}
     with lite(max_episode_steps=9) as env:
         (race,) = evaluate(wrapped(env, entry), Driver(PPO("MlpPolicy", env, device="cpu")))

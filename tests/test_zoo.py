@@ -7,8 +7,8 @@ import yaml
 from stable_baselines3 import DDPG
 
 import sb3_torcs  # noqa: F401  registers the environments
-from sb3_torcs import zoo
 from sb3_torcs.errors import ZooConfigError
+from sb3_torcs.training import zoo
 
 SHIPPED = sorted(zoo.shipped_folder().glob("*.yml"))
 ENTRIES = [(path, name) for path in SHIPPED for name in zoo.read_config(path)]

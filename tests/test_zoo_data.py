@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 import yaml
 
-from sb3_torcs import zoo, zoo_data
 from sb3_torcs.cli import main
 from sb3_torcs.errors import StudyError, ZooConfigError
 from sb3_torcs.plain_yaml import read_yaml
-from sb3_torcs.study_file import read_study
+from sb3_torcs.studies.config import read_study
+from sb3_torcs.training import zoo, zoo_data
 
 ENTRY = {"n_timesteps": 10, "policy": "MlpPolicy"}
 STUDY = {"name": "small", "seeds": 1, "eval_interval": 5, "env": "TorcsLite-v0", "n_timesteps": 10}

@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 
 from sb3_torcs.car import CarState, Controls, FloatArray, Start
-from sb3_torcs.tracks import Track
+from sb3_torcs.tracks.track import Track
 
 __all__ = ["Backend"]
 

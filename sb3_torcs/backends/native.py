@@ -11,15 +11,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sb3_torcs.actions import checked_gearbox
-from sb3_torcs.building import build_command
 from sb3_torcs.car import MANY_LAPS, CarState, Controls, FloatArray, Start, checked_laps, is_count
 from sb3_torcs.errors import BackendUnavailable, InvalidOption, TrackFileError
-from sb3_torcs.game import Game, find_game
-from sb3_torcs.race_file import SCR_SERVER, SESSIONS, RaceSetup, Session
 from sb3_torcs.sensors import range_finder_angles
-from sb3_torcs.track_trial import check_road, engine_arguments, try_race
-from sb3_torcs.track_trial_child import encoded
-from sb3_torcs.tracks import Track, load_track
+from sb3_torcs.torcs.building import build_command
+from sb3_torcs.torcs.installation import Game, find_game
+from sb3_torcs.torcs.race_setup import SCR_SERVER, SESSIONS, RaceSetup, Session
+from sb3_torcs.torcs.trial_child import encoded
+from sb3_torcs.tracks.catalogue import load_track
+from sb3_torcs.tracks.track import Track
+from sb3_torcs.tracks.trial import check_road, engine_arguments, try_race
 
 if TYPE_CHECKING:
     from sb3_torcs._engine import Engine

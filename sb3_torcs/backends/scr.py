@@ -13,19 +13,20 @@ import numpy as np
 
 from sb3_torcs.actions import checked_gearbox, controls_from_action
 from sb3_torcs.backends.native import AGENT, starting_list, track_path
-from sb3_torcs.backends.scr_car import CarReader
-from sb3_torcs.backends.scr_gearbox import read_gearbox
-from sb3_torcs.backends.scr_rehearsal import Rehearsal
 from sb3_torcs.car import CONTROL_TICK, MANY_LAPS, CarState, Controls, Start, is_count
 from sb3_torcs.errors import EngineForked, GameFailed, GameTimeout, InvalidOption, ServerLost
-from sb3_torcs.game import find_game
-from sb3_torcs.game_process import GameProcess, compiled_library
-from sb3_torcs.race_file import SCR_SERVER, RaceSetup
-from sb3_torcs.scr_client import ScrClient
-from sb3_torcs.scr_game import SCR_PORT, open_ports, start_server
-from sb3_torcs.scr_protocol import ScrAction, format_action, parse_engine, parse_state
+from sb3_torcs.scr.car_reader import CarReader
+from sb3_torcs.scr.client import ScrClient
+from sb3_torcs.scr.gearbox import read_gearbox
+from sb3_torcs.scr.protocol import ScrAction, format_action, parse_engine, parse_state
+from sb3_torcs.scr.rehearsal import Rehearsal
+from sb3_torcs.scr.server import SCR_PORT, open_ports, start_server
 from sb3_torcs.sensors import encode, range_finder_angles
-from sb3_torcs.tracks import Track, load_track
+from sb3_torcs.torcs.installation import find_game
+from sb3_torcs.torcs.process import GameProcess, compiled_library
+from sb3_torcs.torcs.race_setup import SCR_SERVER, RaceSetup
+from sb3_torcs.tracks.catalogue import load_track
+from sb3_torcs.tracks.track import Track
 
 __all__ = ["ScrBackend"]
 

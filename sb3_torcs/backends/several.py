@@ -11,7 +11,7 @@ from sb3_torcs.actions import GEARS
 from sb3_torcs.backends.base import Backend
 from sb3_torcs.car import CarState, Controls, Start
 from sb3_torcs.errors import InvalidOption
-from sb3_torcs.tracks import Track
+from sb3_torcs.tracks.track import Track
 
 __all__ = ["SeveralTracks", "is_several"]
 

@@ -54,18 +54,18 @@ def run(args: argparse.Namespace) -> int:
     """
     from tqdm import tqdm
 
-    from sb3_torcs import bench
+    from sb3_torcs.bench.stages import KEYS, stages
     from sb3_torcs.errors import InvalidOption
 
     if not args.seconds > 0.0:
         raise InvalidOption(f"--seconds is {args.seconds:g}; expected more than 0")
-    figures: dict[str, float | None] = dict.fromkeys(bench.KEYS)
-    stages = bench.stages(args.seconds)
+    figures: dict[str, float | None] = dict.fromkeys(KEYS)
+    measurements = stages(args.seconds)
     with (
         quiet_output(args.json),
-        tqdm(total=len(stages), file=sys.stderr, leave=False, disable=None) as bar,
+        tqdm(total=len(measurements), file=sys.stderr, leave=False, disable=None) as bar,
     ):
-        for name, measure in stages.items():
+        for name, measure in measurements.items():
             bar.set_description(name)
             figures.update(measure())
             bar.update()

@@ -6,17 +6,12 @@ import argparse
 import contextlib
 import json
 import math
-import os
 import sys
-import tempfile
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sb3_torcs.errors import OutputNotWritable
-
 if TYPE_CHECKING:
-    from sb3_torcs.models import TrainingRecord
+    from sb3_torcs.agents.models import TrainingRecord
 
 __all__ = [
     "MODEL_HELP",
@@ -28,8 +23,6 @@ __all__ = [
     "seed",
     "table",
     "told_record",
-    "writable_file",
-    "writable_folder",
 ]
 
 MODEL_HELP = "a saved .zip, a run's folder, a shipped agent, or 'scripted'"
@@ -44,8 +37,8 @@ def told_record(driver: str) -> TrainingRecord:
     :param driver: as typed
     :return: what is known
     """
-    from sb3_torcs.drivers import SCRIPTED
-    from sb3_torcs.models import driver_record
+    from sb3_torcs.agents.models import driver_record
+    from sb3_torcs.agents.scripted import SCRIPTED
 
     record = driver_record(driver)
     if not record.known and driver != SCRIPTED:
@@ -94,44 +87,6 @@ def seed(text: str) -> int:
     if number >= 2**32:
         raise argparse.ArgumentTypeError(f"{text!r}: expected a whole number below 2**32")
     return number
-
-
-def writable_folder(folder: str | Path) -> Path:
-    """
-    Make a folder, and make sure that files can be put there.
-
-    :param folder: that results should go to
-    :return: the folder
-    :raises OutputNotWritable: if it cannot be made or written
-    """
-    path = Path(os.path.expanduser(folder))
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=path):
-            pass
-    except OSError as error:
-        raise OutputNotWritable(
-            f"cannot write to the folder '{path}': {error.strerror or error}; give another one"
-        ) from error
-    return path
-
-
-def writable_file(file: str | Path, suffixes: tuple[str, ...]) -> Path:
-    """
-    Make sure that a file can be written.
-
-    :param file: that a result should go to
-    :param suffixes: kinds that can be written, e.g. ``(".png",)``
-    :return: its path
-    :raises OutputNotWritable: if its folder cannot be written, or its kind is another
-    """
-    path = Path(os.path.expanduser(file))
-    if path.suffix.lower() not in suffixes:
-        raise OutputNotWritable(f"'{path}' should end in {' or '.join(suffixes)}")
-    if path.is_dir():
-        raise OutputNotWritable(f"'{path}' is a folder; give a file in it")
-    writable_folder(path.parent)
-    return path
 
 
 @contextlib.contextmanager

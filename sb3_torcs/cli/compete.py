@@ -16,7 +16,7 @@ from sb3_torcs.cli.common import (
 )
 
 if TYPE_CHECKING:
-    from sb3_torcs.driving import Agent
+    from sb3_torcs.agents.remote import Agent
 
 __all__ = ["add_parser", "run"]
 
@@ -65,8 +65,8 @@ def run(args: argparse.Namespace) -> int:
     with quiet_output(args.json):  # loading takes seconds; whoever waits is told at once for what
         print(f"{args.model} gets ready to drive in the race at {where}", flush=True)
 
-    from sb3_torcs.driving import Agent
-    from sb3_torcs.models import driver_name, one_track
+    from sb3_torcs.agents.models import driver_name, one_track
+    from sb3_torcs.agents.remote import Agent
 
     record = told_record(args.model)
     settings = record.kept(KEPT)

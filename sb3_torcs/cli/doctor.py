@@ -13,10 +13,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from sb3_torcs.building import build_command
 from sb3_torcs.cli.common import print_json, quiet_output
 from sb3_torcs.errors import BackendUnavailable, Sb3TorcsError
-from sb3_torcs.game import find_game, linker_knows
+from sb3_torcs.torcs.building import build_command
+from sb3_torcs.torcs.installation import find_game, linker_knows
 
 __all__ = ["Check", "add_parser", "checks", "run"]
 
@@ -161,7 +161,7 @@ def _compile_cache() -> Check:
 
 
 def _bundled_tracks() -> Check:
-    from sb3_torcs.tracks import available_tracks
+    from sb3_torcs.tracks.catalogue import available_tracks
 
     names = [track.name for track in available_tracks() if track.source == "bundled"]
     fix = None if names else "pip install --force-reinstall sb3-torcs"
@@ -218,7 +218,7 @@ def _game() -> Check:
 
 def _tracks() -> Check:
     """Read the game's own tracks, every one."""
-    from sb3_torcs.tracks import load_track
+    from sb3_torcs.tracks.catalogue import load_track
 
     tracks = find_game().tracks()
     try:
@@ -264,7 +264,7 @@ def _torcs() -> Check:
 
 def _game_program() -> Check:
     """See whether the game's own program runs: the engine of this process does without."""
-    from sb3_torcs.text_mode import missing_libraries
+    from sb3_torcs.torcs.libraries import missing_libraries
 
     try:
         game = find_game()
@@ -281,7 +281,7 @@ def _game_program() -> Check:
 
 def _game_libraries() -> Check:
     """Look for what we built for the inside of the game's own program."""
-    from sb3_torcs.game_process import compiled_library
+    from sb3_torcs.torcs.process import compiled_library
 
     try:
         files = [compiled_library(name) for name in GAME_LIBRARIES]
@@ -300,7 +300,7 @@ def _window() -> Check:
 
 def _film() -> Check:
     """Look for the display that nobody sees."""
-    from sb3_torcs.display import INSTALL, PROGRAM
+    from sb3_torcs.torcs.display import INSTALL, PROGRAM
 
     program = shutil.which(PROGRAM)
     if program is not None:

@@ -15,12 +15,12 @@ from sb3_torcs.cli.common import (
     seed,
     table,
     told_record,
-    writable_file,
 )
+from sb3_torcs.files import writable_file
 
 if TYPE_CHECKING:
-    from sb3_torcs.evaluation import Episode
-    from sb3_torcs.models import TrainingRecord
+    from sb3_torcs.agents.models import TrainingRecord
+    from sb3_torcs.evaluation.protocol import Episode
 
 __all__ = ["add_parser", "environment_kwargs", "run"]
 
@@ -100,11 +100,11 @@ def run(args: argparse.Namespace) -> int:
 
 def _drive(args: argparse.Namespace) -> tuple[list[Episode], Any]:
     """Build the environment, load the driver, drive."""
+    from sb3_torcs.agents.models import load_driver
+    from sb3_torcs.agents.wrapping import wrapped
     from sb3_torcs.cli.recording import Recorder
-    from sb3_torcs.evaluation import choose_world, evaluate, time_limit
-    from sb3_torcs.models import load_driver
-    from sb3_torcs.wrapping import wrapped
-    from sb3_torcs.zoo import check_racing
+    from sb3_torcs.evaluation.protocol import choose_world, evaluate, time_limit
+    from sb3_torcs.training.zoo import check_racing
 
     record = told_record(args.model)
     env_id = args.env
@@ -129,8 +129,8 @@ def environment_kwargs(args: argparse.Namespace, record: TrainingRecord) -> dict
     :param record: of the training
     :return: keyword arguments of the environment
     """
-    from sb3_torcs.evaluation import KEPT
-    from sb3_torcs.models import one_track
+    from sb3_torcs.agents.models import one_track
+    from sb3_torcs.evaluation.protocol import KEPT
 
     kwargs = record.kept(KEPT)
     given = {name: getattr(args, name, None) for name in KEPT}

@@ -14,9 +14,9 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import IO, Any
 
-from sb3_torcs.cli.common import writable_folder
 from sb3_torcs.errors import BackendUnavailable, InstallFailed
-from sb3_torcs.game import HOME_VARIABLE, Game, find_game, user_folder
+from sb3_torcs.files import writable_folder
+from sb3_torcs.torcs.installation import HOME_VARIABLE, Game, find_game, user_folder
 
 __all__ = ["add_parser", "run"]
 
@@ -303,7 +303,7 @@ def _verify(game: Game) -> None:
 
     :param game: the installation
     """
-    from sb3_torcs.text_mode import missing_libraries
+    from sb3_torcs.torcs.libraries import missing_libraries
 
     missing = missing_libraries(game)
     if missing:

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sb3_torcs.car import CarState, Controls
-from sb3_torcs.telemetry import STATE_FIELDS, write_telemetry
+from sb3_torcs.telemetry import CONTROL_FIELDS, STATE_FIELDS, write_telemetry
 
 __all__ = ["Decision", "Recorder", "Stretch", "best_stretch"]
 
@@ -114,10 +114,11 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
         :param path: of the CSV file
         :param driver: its name
         """
+        state, controls = len(STATE_FIELDS), len(CONTROL_FIELDS)
         write_telemetry(
             path,
             (
-                (driver, number, *decision.car[: len(STATE_FIELDS)], *decision.controls)
+                (driver, number, *decision.car[:state], *decision.controls[:controls])
                 for number, decisions in enumerate(self.episodes, 1)
                 for decision in decisions
             ),
@@ -129,7 +130,7 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
 
         :param path: of the picture
         """
-        from sb3_torcs.track_plot import plot_track
+        from sb3_torcs.tracks.plot import plot_track
 
         stretch = best_stretch(self.episodes)
         cars = [d.car for d in self.episodes[stretch.episode][stretch.first : stretch.last]]
@@ -144,7 +145,7 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
 
         :param path: of the video
         """
-        from sb3_torcs.video import write_video
+        from sb3_torcs.rendering.encoder import write_video
 
         stretch = best_stretch(self.episodes)
         repeat = self.get_wrapper_attr("action_repeat")

@@ -30,7 +30,7 @@ def run(args: argparse.Namespace) -> int:
     :param args: from the command line
     :return: the exit status
     """
-    from sb3_torcs.study_report import write_report
+    from sb3_torcs.studies.report import write_report
 
     folder = Path(os.path.expanduser(args.folder))
     print(write_report(folder, Path(os.path.expanduser(args.output)) if args.output else folder))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from sb3_torcs.cli.common import table
 
 if TYPE_CHECKING:
-    from sb3_torcs.race_results import RobotResult
+    from sb3_torcs.torcs.race_results import RobotResult
 
 __all__ = ["results_as_json", "show_results"]
 

@@ -7,12 +7,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sb3_torcs.cli.common import natural, positive, print_json, quiet_output, table, writable_file
+from sb3_torcs.cli.common import natural, positive, print_json, quiet_output, table
 from sb3_torcs.cli.results import results_as_json, show_results
+from sb3_torcs.files import writable_file
 
 if TYPE_CHECKING:
-    from sb3_torcs.game import Game
-    from sb3_torcs.race_results import RobotResult
+    from sb3_torcs.torcs.installation import Game
+    from sb3_torcs.torcs.race_results import RobotResult
 
 __all__ = ["add_parser", "run"]
 
@@ -57,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
     :return: the exit status
     """
     from sb3_torcs.errors import InvalidOption
-    from sb3_torcs.game import find_game
+    from sb3_torcs.torcs.installation import find_game
 
     game = find_game()
     if args.name is None:
@@ -124,14 +125,14 @@ def _drive(
     """
     from rich.console import Console
 
-    from sb3_torcs.race_file import session_for
+    from sb3_torcs.torcs.race_setup import session_for
 
     session = session_for(robots)
     with Console(stderr=True).status(f"{len(robots)} on {track}, {args.laps} laps"):
         if args.game:
-            from sb3_torcs.text_mode import run as run_game
+            from sb3_torcs.agents.text_mode import run as run_game
 
             return run_game(game, track, robots, args.laps, session)
-        from sb3_torcs.robots import race
+        from sb3_torcs.agents.robots import race
 
         return race(robots, track, args.laps, session=session, telemetry=telemetry)

@@ -13,8 +13,8 @@ from sb3_torcs.cli.results import show_results
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from sb3_torcs.game_process import GameProcess
-    from sb3_torcs.race_file import RaceSetup
+    from sb3_torcs.torcs.process import GameProcess
+    from sb3_torcs.torcs.race_setup import RaceSetup
 
 __all__ = ["add_parser", "run"]
 
@@ -76,13 +76,13 @@ def run(args: argparse.Namespace) -> int:
     :param args: from the command line
     :return: the exit status
     """
-    from sb3_torcs.display import find_display
     from sb3_torcs.errors import InvalidOption
-    from sb3_torcs.game import find_game
-    from sb3_torcs.game_results import read_results
-    from sb3_torcs.game_window import Window
-    from sb3_torcs.race_file import SCR_DRIVERS, SCR_SERVER, RaceSetup, session_for
-    from sb3_torcs.scr_game import open_ports, start_server
+    from sb3_torcs.scr.server import open_ports, start_server
+    from sb3_torcs.torcs.display import find_display
+    from sb3_torcs.torcs.installation import find_game
+    from sb3_torcs.torcs.race_setup import SCR_DRIVERS, SCR_SERVER, RaceSetup, session_for
+    from sb3_torcs.torcs.results import read_results
+    from sb3_torcs.torcs.window import Window
 
     if args.drivers > SCR_DRIVERS:
         raise InvalidOption(f"--drivers is {args.drivers}; expected 1 to {SCR_DRIVERS}")
@@ -149,7 +149,7 @@ def _interrupt(process: GameProcess, race: RaceSetup, cars: Sequence[str]) -> No
     :param cars: of the drivers, in their order
     """
     from sb3_torcs.errors import GameFailed
-    from sb3_torcs.game_results import read_results
+    from sb3_torcs.torcs.results import read_results
 
     process.end_race()
     # A game that was still loading, or was paused, has none; nor does a closed terminal show any.

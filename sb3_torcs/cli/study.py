@@ -9,10 +9,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sb3_torcs.cli.common import positive, print_json, quiet_output, writable_folder
+from sb3_torcs.cli.common import positive, print_json, quiet_output
+from sb3_torcs.files import writable_folder
 
 if TYPE_CHECKING:
-    from sb3_torcs.study_file import Study, Trial
+    from sb3_torcs.studies.config import Study, Trial
 
 __all__ = ["Board", "add_parser", "run"]
 
@@ -54,9 +55,9 @@ def run(args: argparse.Namespace) -> int:
     :param args: from the command line
     :return: the exit status
     """
-    from sb3_torcs.study import require_ray, run_study
-    from sb3_torcs.study_file import read_study
-    from sb3_torcs.study_folder import StudyFolder
+    from sb3_torcs.studies.config import read_study
+    from sb3_torcs.studies.runner import require_ray, run_study
+    from sb3_torcs.studies.storage import StudyFolder
 
     require_ray(args.address)
     study = read_study(args.file)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from sb3_torcs.cli.common import print_json, table, writable_file
+from sb3_torcs.cli.common import print_json, table
+from sb3_torcs.files import writable_file
 
 __all__ = ["add_parser", "run"]
 
@@ -37,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
     import numpy as np
 
     from sb3_torcs.errors import InvalidOption
-    from sb3_torcs.tracks import available_tracks, load_track
+    from sb3_torcs.tracks.catalogue import available_tracks, load_track
 
     tracks = [load_track(name, np.random.default_rng(0)) for name in args.names]
     if args.plot is not None:
@@ -47,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
                 "type e.g.: sb3-torcs tracks aalborg --plot aalborg.png"
             )
         path = writable_file(args.plot, (".png",))
-        from sb3_torcs.track_plot import plot_track
+        from sb3_torcs.tracks.plot import plot_track
 
         plot_track(tracks[0], path)
     summaries = [track.summary() for track in tracks] if tracks else available_tracks()

@@ -6,13 +6,14 @@ import argparse
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from sb3_torcs.cli.common import MODEL_HELP, TRUST_HELP, positive, told_record, writable_file
+from sb3_torcs.cli.common import MODEL_HELP, TRUST_HELP, positive, told_record
 from sb3_torcs.cli.results import show_results
+from sb3_torcs.files import writable_file
 
 if TYPE_CHECKING:
-    from sb3_torcs.game import Game
-    from sb3_torcs.models import TrainingRecord
-    from sb3_torcs.watching import Show
+    from sb3_torcs.agents.models import TrainingRecord
+    from sb3_torcs.evaluation.watching import Show
+    from sb3_torcs.torcs.installation import Game
 
 __all__ = ["add_parser", "run"]
 
@@ -36,7 +37,7 @@ def add_parser(subparsers: Any) -> None:
     """
     :param subparsers: of the command
     """
-    from sb3_torcs.game_window import VIEWS
+    from sb3_torcs.torcs.window import VIEWS
 
     parser = subparsers.add_parser(
         "watch",
@@ -80,8 +81,8 @@ def run(args: argparse.Namespace) -> int:
     :return: the exit status
     """
     from sb3_torcs.errors import InvalidOption
-    from sb3_torcs.game import find_game
-    from sb3_torcs.watching import film_shows
+    from sb3_torcs.evaluation.watching import film_shows
+    from sb3_torcs.torcs.installation import find_game
 
     for option in ("beside", "fps"):
         if getattr(args, option) is not None and args.film is None:
@@ -123,9 +124,9 @@ def _shows(game: Game, names: Sequence[str], args: argparse.Namespace) -> list[S
     :param names: of models or robots
     :param args: from the command line
     """
+    from sb3_torcs.agents.models import TrainingRecord, one_track
     from sb3_torcs.errors import InvalidOption
-    from sb3_torcs.models import TrainingRecord, one_track
-    from sb3_torcs.watching import Show
+    from sb3_torcs.evaluation.watching import Show
 
     known = game.robots()
     robots = [game.parse_robot(n) if n.partition(":")[0] in known else None for n in names]
@@ -174,9 +175,9 @@ def _in_window(show: Show, args: argparse.Namespace) -> None:
     :param show: the race
     :param args: from the command line
     """
-    from sb3_torcs.display import find_display
-    from sb3_torcs.game_window import Window
-    from sb3_torcs.watching import show_in_window
+    from sb3_torcs.evaluation.watching import show_in_window
+    from sb3_torcs.torcs.display import find_display
+    from sb3_torcs.torcs.window import Window
 
     display = find_display("`--film FILE.mp4` films the race without one")
     window = Window(size=args.size, view=args.view, display=display, driver=show.driver_name)

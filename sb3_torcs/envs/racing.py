@@ -31,7 +31,7 @@ from sb3_torcs.car import (
 from sb3_torcs.errors import CarLost, EnvClosed, InvalidOption
 from sb3_torcs.rewards import Reward
 from sb3_torcs.sensors import OBSERVATION_HIGH, OBSERVATION_LOW, encode
-from sb3_torcs.tracks import Track
+from sb3_torcs.tracks.track import Track
 
 __all__ = ["RacingEnv", "RacingInfo"]
 
@@ -273,7 +273,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         if self.car is None:
             raise EnvClosed("render before reset; call reset first")
         if self._viewer is None:
-            from sb3_torcs.rendering import Viewer  # graphics load only when somebody looks
+            from sb3_torcs.rendering.viewer import Viewer  # graphics load only when somebody looks
 
             self._viewer = Viewer(mode=self.render_mode, fps=self.metadata["render_fps"])
         angles = self.backend.range_finder_angles

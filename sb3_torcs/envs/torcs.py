@@ -18,9 +18,9 @@ from sb3_torcs.backends.several import SeveralTracks, is_several
 from sb3_torcs.car import is_count
 from sb3_torcs.envs.racing import RacingEnv
 from sb3_torcs.errors import EnvClosed, InvalidOption, near_miss
-from sb3_torcs.game import find_game
-from sb3_torcs.game_scenery import find_scenery
-from sb3_torcs.game_window import Window
+from sb3_torcs.torcs.installation import find_game
+from sb3_torcs.torcs.scenery import find_scenery
+from sb3_torcs.torcs.window import Window
 
 __all__ = ["TorcsEnv"]
 
@@ -165,7 +165,7 @@ class TorcsEnv(RacingEnv):
         assert isinstance(self.backend, NativeBackend), "the constructor refuses others"
         appearance = self.backend.engine.appearance()
         if self._viewer is None:
-            from sb3_torcs.game_view import GameView  # loaded only when somebody looks
+            from sb3_torcs.rendering.game_camera import GameView  # loaded only when somebody looks
 
             self._viewer = GameView(find_game(), self.backend.race_setup(), self._window)
         try:

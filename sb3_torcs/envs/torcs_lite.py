@@ -9,11 +9,11 @@ from typing import Any
 
 from sb3_torcs.actions import ActionName, GearboxName, used_gearbox
 from sb3_torcs.backends.base import Backend
-from sb3_torcs.backends.lite import LiteBackend
+from sb3_torcs.backends.lite.backend import LiteBackend
 from sb3_torcs.backends.several import SeveralTracks, is_several
 from sb3_torcs.envs.racing import RacingEnv
 from sb3_torcs.errors import InvalidOption
-from sb3_torcs.tracks import Track
+from sb3_torcs.tracks.track import Track
 
 __all__ = ["OF_THE_GAME", "TorcsLiteEnv"]
 

@@ -47,7 +47,7 @@ public:
     }
 
 private:
-    // As game_process.py names them: whatever else the variable says, nothing else is removed.
+    // As torcs/process.py names them: whatever else the variable says, nothing else is removed.
     static constexpr const char* FOLDER_PREFIX = "sb3-torcs-game-";
 
     [[noreturn]] void end() {

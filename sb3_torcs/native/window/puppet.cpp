@@ -2,7 +2,7 @@
 // of the game's own moves them.
 //
 // A picture shows a moment and nothing of what was before it, so that it does not matter which
-// moments were drawn before: see also the settings in game_view.py.
+// moments were drawn before: see also the settings in rendering/game_camera.py.
 
 #include <algorithm>
 #include <cerrno>

@@ -1,0 +1,106 @@
+"""Which algorithm a saved model is of, and the class that loads it."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from typing import Any
+
+from sb3_torcs.agents.model_file import referenced_class
+from sb3_torcs.errors import InvalidOption, ModelMismatch, PackageMissing, near_miss
+
+__all__ = ["algorithm_of", "check_same", "is_sbx", "told_algorithm"]
+
+SAVED_AS = {"ddpg": "td3"}  # a model of one does not tell that it is not of the other
+
+# What only one family of algorithms saves; the first that is there names it. DDPG saves what TD3
+# does, and either class drives the other's models.
+TELLING_KEYS = (
+    ("top_quantiles_to_drop_per_net", "tqc"),
+    ("line_search_shrinking_factor", "trpo"),
+    ("clip_range", "ppo"),
+    ("exploration_fraction", "dqn"),
+    ("target_entropy", "sac"),
+    ("target_policy_noise", "td3"),
+    ("vf_coef", "a2c"),
+)
+
+
+def told_algorithm(data: dict[str, Any]) -> str | None:
+    """
+    Find out the algorithm of a model by what it saved.
+
+    :param data: of :func:`~sb3_torcs.agents.model_file.saved_data`
+    :return: as the zoo calls it; ``None`` if that cannot be told
+    """
+    from rl_zoo3.utils import ALGOS
+
+    if "recurrent" in str(data.get("policy_class")).lower():
+        return "ppo_lstm"
+    family = referenced_class(data.get("policy_class")).split(".")[1:2]  # as in sb3_contrib.ars
+    if family and family[0] in ALGOS:
+        return family[0]
+    return next((algo for key, algo in TELLING_KEYS if key in data), None)
+
+
+def algorithm_of(name: str | None, data: dict[str, Any], model: Path) -> tuple[str, Any]:
+    """
+    Find the algorithm of a saved model.
+
+    :param name: as the zoo calls it; ``None`` finds out
+    :param data: of :func:`~sb3_torcs.agents.model_file.saved_data`
+    :param model: the file, for messages
+    :return: its name and its class
+    :raises ModelMismatch: if that cannot be found out
+    :raises InvalidOption: if there is no such algorithm
+    :raises PackageMissing: if it is one of SBX, and that is not installed
+    """
+    from rl_zoo3.utils import ALGOS
+
+    name = name or told_algorithm(data)
+    if name is None:
+        raise ModelMismatch(f"'{model}' does not tell its algorithm; say it: --algo ddpg")
+    if name not in ALGOS:
+        raise InvalidOption(
+            f"the RL Zoo has no algorithm '{name}'{near_miss(name, ALGOS)} it has: "
+            f"{', '.join(sorted(ALGOS))}"
+        )
+    return name, _sbx_algorithm(name, model) if is_sbx(data) else ALGOS[name]
+
+
+def is_sbx(data: dict[str, Any]) -> bool:
+    """
+    Tell whether a model is of SBX, which has SB3's algorithms in JAX.
+
+    :param data: of :func:`~sb3_torcs.agents.model_file.saved_data`
+    :return: whether it is
+    """
+    return referenced_class(data.get("policy_class")).startswith("sbx.")
+
+
+def _sbx_algorithm(name: str, model: Path) -> Any:
+    """Find an algorithm of SBX, which is there only if somebody has installed it."""
+    try:
+        sbx = importlib.import_module("sbx")
+    except ImportError as error:
+        raise PackageMissing(
+            f"'{model}' is a model of SBX, which does not import ({error}); type: pip install "
+            "sbx-rl"
+        ) from error
+    found = {word.lower(): word for word in vars(sbx)}.get(name)
+    if found is None:
+        raise InvalidOption(f"SBX has no algorithm '{name}'; give the --algo that '{model}' is of")
+    return getattr(sbx, found)
+
+
+def check_same(model: Path, saved: str | None, algo: str) -> None:
+    """
+    Make sure that a model is one of this algorithm.
+
+    :param model: the file, for the message
+    :param saved: the algorithm that it is of, if that is known
+    :param algo: that it should be of
+    :raises ModelMismatch: if it is not
+    """
+    if saved is not None and SAVED_AS.get(saved, saved) != SAVED_AS.get(algo, algo):
+        raise ModelMismatch(f"'{model}' is a model of {saved}, not of {algo}; give --algo {saved}")

@@ -1,0 +1,201 @@
+"""Writing down, in a model that learns, how it learns: each file that is saved of it then tells."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import stable_baselines3 as sb3
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_torcs import __version__
+from sb3_torcs.agents.model_file import IDLE, saved_data, saved_weights
+from sb3_torcs.agents.model_policy import (
+    plain,
+    plain_policy,
+    plain_space,
+    readable_policy,
+    readable_space,
+)
+from sb3_torcs.agents.model_record import (
+    RECORD,
+    VERSION,
+    TrainingRecord,
+    record_beside,
+    record_within,
+)
+from sb3_torcs.errors import ModelNotTrusted
+
+__all__ = ["RecordCallback", "recipe", "write_driver", "write_record"]
+
+Recipe = Mapping[str, Any]
+
+
+def recipe(
+    algo: str | None, env_id: str | None, hyperparameters: Mapping[str, Any]
+) -> dict[str, Any]:
+    """
+    Compose what a training was asked for.
+
+    :param algo: as the zoo calls it
+    :param env_id: of the environment, if it has one
+    :param hyperparameters: the entry of the hyperparameter file, changes applied
+    :return: the first part of a record
+    """
+    kwargs = _plain_part(hyperparameters.get("env_kwargs") or {})
+    entry = {**_plain_part(hyperparameters), **({"env_kwargs": kwargs} if kwargs else {})}
+    return {"algo": algo, "env_id": env_id, "env_kwargs": kwargs, "hyperparameters": entry}
+
+
+class RecordCallback(BaseCallback):
+    """
+    Writes down in the model how it learns, so that ``sb3-torcs`` drives it as it has learned.
+
+    ``sb3-torcs train`` and ``study`` do so by themselves; a script of one's own gives the callback
+    to ``learn``, before those that save the model.
+
+    :param asked: what the training was asked for, of :func:`recipe`; ``None`` looks at the
+        environment, which knows what ``gym.make`` was given
+    :param verbose: as in ``BaseCallback``
+    """
+
+    def __init__(self, asked: Recipe | None = None, verbose: int = 0) -> None:
+        super().__init__(verbose)
+        self._asked = asked
+
+    def _on_training_start(self) -> None:
+        write_record(self.model, self._asked or _recipe_of_environment(self.model))
+
+    def _on_step(self) -> bool:
+        if self.model.get_vec_normalize_env() is not None:
+            getattr(self.model, RECORD)["statistics"] = _statistics(self.model)
+        return True
+
+
+def write_record(model: BaseAlgorithm, asked: Recipe) -> None:
+    """
+    Write down in a model how it learns; whatever saves it from now on saves that, too.
+
+    :param model: that learns
+    :param asked: what the training was asked for, of :func:`recipe`
+    """
+    record = {
+        "version": VERSION,
+        **asked,
+        "observation_space": plain_space(model.observation_space),
+        "action_space": plain_space(model.action_space),
+        "policy": plain_policy(model),
+        "statistics": _statistics(model),
+        "start_time": model.start_time,  # tells whether a record is of the last training
+        "packages": {
+            "sb3_torcs": __version__,
+            "stable_baselines3": sb3.__version__,
+            "torch": str(th.__version__),
+            "numpy": np.__version__,
+            "gymnasium": gym.__version__,
+        },
+    }
+    setattr(model, RECORD, record)
+
+
+def write_driver(model: Path, driver: Path) -> None:
+    """
+    Write a small file of what drives of a model, with its record.
+
+    What only learning needs is left out: weights of the critics and of targets are NaN, and the
+    optimizers are empty, which a zip makes small. Stock SB3 still loads the file and predicts the
+    same to the bit; a training that goes on from it fails with the first update.
+
+    :param model: the file of the whole
+    :param driver: the file to write
+    :raises ModelMismatch: if the model cannot be read
+    """
+    data, weights = saved_data(model), saved_weights(model)
+    data[RECORD] = {**_record_in(model, data), "driver_only": True}
+    for name, tensor in weights.items():
+        if name.startswith(IDLE) and tensor.is_floating_point():
+            tensor.fill_(float("nan"))
+    with zipfile.ZipFile(model) as source, zipfile.ZipFile(driver, "w") as target:
+        for name in source.namelist():
+            content = source.read(name)
+            if name == "data":
+                content = json.dumps(data).encode()
+            elif name == "policy.pth":
+                content = _torch_file(weights)
+            elif name.endswith("optimizer.pth"):
+                state = th.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+                content = _torch_file({**state, "state": {}})
+            # No date: the same model makes the same file.
+            target.writestr(zipfile.ZipInfo(name), content, zipfile.ZIP_DEFLATED, 9)
+
+
+def _torch_file(value: Any) -> bytes:
+    """Return what ``torch.save`` writes."""
+    file = io.BytesIO()
+    th.save(value, file)
+    return file.getvalue()
+
+
+def _record_in(model: Path, data: Mapping[str, Any]) -> Recipe:
+    """Take the record of a saved model, or compose it from what lies beside the model."""
+    if record_within(model, data) is not None:
+        written: Recipe = data[RECORD]
+        return written
+    record = record_beside(model) or TrainingRecord()
+    seen, does = (readable_space(data[name]) for name in ("observation_space", "action_space"))
+    if seen is None or does is None or record.statistics_file is not None:
+        raise ModelNotTrusted(f"'{model}' has pickled spaces or statistics; train it anew")
+    return {
+        "version": VERSION,
+        **recipe(record.algo, record.env_id, record.hyperparameters),
+        "observation_space": plain_space(seen),
+        "action_space": plain_space(does),
+        "policy": readable_policy(data),
+        "statistics": None,
+        "start_time": data.get("start_time"),
+    }
+
+
+def _recipe_of_environment(model: BaseAlgorithm) -> Recipe:
+    """Find out what a script has made: ``gym.make`` keeps what it was given."""
+    env = model.get_env()
+    assert env is not None
+    (spec,) = env.get_attr("spec", 0)
+    name = type(model).__name__
+    algo = "ppo_lstm" if name == "RecurrentPPO" else name.lower()
+    if spec is None:
+        return recipe(algo, None, {})
+    kwargs = {name: value for name, value in spec.kwargs.items() if name != "render_mode"}
+    return recipe(algo, spec.id, {"env_kwargs": kwargs})
+
+
+def _plain_part(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Leave out what is no plain data."""
+    found = {}
+    for name, value in values.items():
+        with contextlib.suppress(TypeError):
+            found[name] = plain(value)
+    return found
+
+
+def _statistics(model: BaseAlgorithm) -> dict[str, Any] | None:
+    """Describe the statistics of the observations, if the model learns from normalized ones."""
+    normalizer = model.get_vec_normalize_env()
+    if normalizer is None or not normalizer.norm_obs:
+        return None
+    found: Any = normalizer.obs_rms  # one: no environment of racing has a dictionary
+    return {
+        "mean": found.mean.tolist(),
+        "var": found.var.tolist(),
+        "epsilon": float(normalizer.epsilon),
+        "clip_obs": float(normalizer.clip_obs),
+    }

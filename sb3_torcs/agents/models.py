@@ -1,0 +1,449 @@
+"""Loading a saved model: which algorithm it is, how it was trained, whether it fits."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import pickle
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+
+from sb3_torcs.agents.model_algorithm import algorithm_of, check_same, is_sbx, told_algorithm
+from sb3_torcs.agents.model_file import (
+    as_mismatch,
+    check_finite,
+    saved_data,
+    saved_weights,
+)
+from sb3_torcs.agents.model_policy import Spaces, build_policy, readable_policy, readable_space
+from sb3_torcs.agents.model_record import TrainingRecord, record_beside, record_within
+from sb3_torcs.agents.scripted import SCRIPTED, ScriptedDriver
+from sb3_torcs.agents.wrapping import frames_of, stacked_space, unrebuilt
+from sb3_torcs.errors import (
+    InvalidOption,
+    ModelMismatch,
+    ModelNotTrusted,
+    near_miss,
+)
+from sb3_torcs.sensors import range_finder_angles
+
+__all__ = [
+    "Driver",
+    "TrainingRecord",
+    "check_resumable",
+    "check_spaces",
+    "driver_name",
+    "driver_record",
+    "find_model",
+    "load_driver",
+    "one_track",
+    "saved_spaces",
+    "saved_steps",
+    "shipped_agents",
+    "training_record",
+]
+
+BEST_MODEL = "best_model.zip"
+AGENTS = Path(__file__).parent
+
+UNTRUSTED = (
+    "'{model}' cannot be driven from plain data alone: {why}. Loading the rest runs whatever code "
+    "is pickled in it; if you know who made it, add --trust (from Python: trust=True)"
+)
+
+
+class Driver:
+    """
+    A saved model at the wheel, with the statistics of the observations that it learned with.
+
+    :param model: an algorithm or a policy of Stable-Baselines3
+    :param statistics: something with VecNormalize's ``normalize_obs``; ``None`` if the model
+        learned from the observations as they are
+    :param frames: newest observations that it sees at once, as behind ``VecFrameStack``; ``None``
+        if it sees one as it is
+    """
+
+    def __init__(self, model: Any, statistics: Any = None, frames: int | None = None) -> None:
+        self.model = model
+        self.statistics = statistics
+        self.frames = frames
+
+    def predict(
+        self,
+        observation: npt.NDArray[np.float32],
+        state: Any = None,
+        episode_start: npt.NDArray[np.bool_] | None = None,
+        deterministic: bool = False,
+    ) -> tuple[npt.NDArray[np.float32], Any]:
+        """
+        Choose an action.
+
+        :param observation: as the environment gives it
+        :param state: as the call before returned it; ``None`` begins
+        :param episode_start: (1,) whether an episode begins here
+        :param deterministic: whether to leave out chance
+        :return: the action, and what is to be remembered
+        """
+        if self.statistics is not None:
+            observation = self.statistics.normalize_obs(observation)
+        if self.frames is None:
+            action, state = self.model.predict(observation, state, episode_start, deterministic)
+            return action, state
+        stack, state = (None, None) if state is None else state
+        stack = self._stacked(observation, stack, episode_start)
+        action, state = self.model.predict(stack, state, episode_start, deterministic)
+        return action, (stack, state)
+
+    def _stacked(
+        self,
+        observation: npt.NDArray[np.float32],
+        before: npt.NDArray[np.float32] | None,
+        episode_start: npt.NDArray[np.bool_] | None,
+    ) -> npt.NDArray[np.float32]:
+        """Put the newest observation behind those before it, which are 0 before an episode."""
+        assert self.frames is not None
+        size = observation.shape[-1]
+        if before is None:
+            before = np.zeros((*observation.shape[:-1], self.frames * size), observation.dtype)
+        elif episode_start is not None:
+            before = np.where(np.reshape(episode_start, (*before.shape[:-1], 1)), 0.0, before)
+        return np.concatenate([before[..., size:], observation], axis=-1, dtype=observation.dtype)
+
+
+def find_model(path: str | Path, *, prefer_last: bool = False) -> Path:
+    """
+    Find a saved model.
+
+    :param path: of a ``.zip`` file, with or without its suffix, or of a run's folder; or the name
+        of a shipped agent, e.g. ``"ddpg-aalborg"``
+    :param prefer_last: of a folder take the last model rather than the best one
+    :return: the file
+    :raises InvalidOption: if there is none
+    """
+    given = Path(os.path.expanduser(path))
+    if given.is_file():
+        return given
+    if Path(f"{given}.zip").is_file():
+        return Path(f"{given}.zip")
+    if not given.is_dir() and str(path) in shipped_agents():
+        given = AGENTS / str(path)
+    if not given.is_dir():
+        known = [*(file.name for file in given.parent.glob("*.zip")), *shipped_agents()]
+        raise InvalidOption(
+            f"there is no model '{given}'{near_miss(given.name, known)} give the .zip that a "
+            "training saved, the folder of its run, or a shipped agent: "
+            f"{', '.join(shipped_agents())}"
+        )
+    best = given / BEST_MODEL
+    last = [
+        file for file in (given / f"{sub.name}.zip" for sub in given.iterdir()) if file.is_file()
+    ]
+    order = [*last, best] if prefer_last else [best, *last]
+    for candidate in order:
+        if candidate.is_file():
+            return candidate
+    raise InvalidOption(f"the folder '{given}' holds no model; give the .zip that a training saved")
+
+
+def shipped_agents() -> list[str]:
+    """
+    List the agents that come with the package.
+
+    :return: their names
+    """
+    return sorted(path.parent.name for path in AGENTS.glob(f"*/{BEST_MODEL}"))
+
+
+def training_record(model: Path) -> TrainingRecord:
+    """
+    Find out how a model was trained: by its own file, or by what the zoo laid beside it.
+
+    :param model: the file
+    :return: what is known
+    :raises ModelMismatch: if something of it cannot be read
+    """
+    return _record(model, saved_data(model))
+
+
+def _record(model: Path, data: dict[str, Any]) -> TrainingRecord:
+    return record_within(model, data) or record_beside(model) or TrainingRecord()
+
+
+def driver_record(driver: str | Path) -> TrainingRecord:
+    """
+    Read how that was trained which is to drive.
+
+    :param driver: as in :func:`find_model`, or ``"scripted"``, of whom nothing is known
+    :return: what is known
+    """
+    return TrainingRecord() if str(driver) == SCRIPTED else training_record(find_model(driver))
+
+
+def driver_name(driver: str | Path) -> str:
+    """
+    Name what is to drive, for boards and tables.
+
+    :param driver: as in :func:`find_model`, or ``"scripted"``
+    :return: a shipped agent's name, e.g. ``"ddpg-aalborg"``, else that of the file; of its folder
+        if the file is called as in every run
+    """
+    given = Path(os.path.expanduser(driver))
+    if given.name == BEST_MODEL or given.name == Path(BEST_MODEL).stem:
+        given = given.absolute().parent
+    return given.absolute().name.removesuffix(".zip")
+
+
+def one_track(track: Any) -> Any:
+    """
+    Make sure that a drive has one track, where a training may have had several.
+
+    :param track: of the record, or what was given instead
+    :return: the same
+    :raises InvalidOption: if it is a list
+    """
+    if isinstance(track, list):
+        raise InvalidOption(
+            f"the model was trained on {len(track)} tracks, {', '.join(track)}; say which one it "
+            f"shall drive on: --track {track[0]}"
+        )
+    return track
+
+
+def saved_steps(model: Path) -> int:
+    """
+    Return how many decisions the last training of a model had.
+
+    :param model: the file
+    :return: ``num_timesteps``
+    """
+    return int(saved_data(model)["num_timesteps"])
+
+
+def saved_spaces(model: Path, *, trust: bool = False) -> Spaces:
+    """
+    Return what a model sees and does.
+
+    :param model: the file
+    :param trust: unpickle it, if it cannot be read otherwise
+    :return: the observation space and the action space
+    :raises ModelNotTrusted: if it cannot be read otherwise
+    """
+    data = saved_data(model)
+    known = _record(model, data).spaces
+    if known is not None:
+        return known
+    wanted = {name: data[name] for name in ("observation_space", "action_space")}
+    seen, does = (readable_space(item) for item in wanted.values())
+    if seen is not None and does is not None:
+        return seen, does
+    if not trust:
+        raise ModelNotTrusted(UNTRUSTED.format(model=model, why="its spaces are pickled"))
+    from stable_baselines3.common.save_util import json_to_data
+
+    with as_mismatch(f"'{model}' does not tell what it sees and does", "give"):
+        loaded = json_to_data(json.dumps(wanted))
+        return loaded["observation_space"], loaded["action_space"]
+
+
+def check_spaces(
+    model: Path,
+    saved: Spaces,
+    env: gym.Env[Any, Any],
+    frames: int | None = None,
+) -> None:
+    """
+    Make sure that a model fits an environment.
+
+    :param model: the file, for the message
+    :param saved: what the model sees and does
+    :param env: that it is to drive
+    :param frames: observations that the model is to see at once
+    :raises ModelMismatch: if the layouts differ
+    """
+    given = (stacked_space(env.observation_space, frames), env.action_space)
+    for what, has, needs in zip(("observations", "actions"), saved, given, strict=True):
+        if has == needs:
+            continue
+        record = training_record(model)
+        hint = f" (it was trained on {record.env_id})" if record.env_id else ""
+        name = env.spec.id if env.spec else "the environment"
+        raise ModelMismatch(
+            f"'{model}'{hint} has {what} {_layout(has)}, but {name} has {_layout(needs)}; give the "
+            "--env that it was trained on, or train a model for this one: sb3-torcs train "
+            f"--env {name}"
+        )
+
+
+def check_resumable(
+    model: Path,
+    env: gym.Env[Any, Any],
+    algo: str,
+    n_envs: int,
+    *,
+    frames: int | None = None,
+    trust: bool = False,
+) -> bool:
+    """
+    Make sure that a training can go on from a model.
+
+    :param model: the file; its memory and its record lie beside it
+    :param env: that the training is to go on in
+    :param algo: that is to learn, as the zoo calls it
+    :param n_envs: number of environments in which it is to learn
+    :param frames: observations that it is to see at once
+    :param trust: whether the model need not tell how it was trained
+    :return: whether there is a memory to go on with
+    :raises ModelMismatch: if they do not belong together
+    :raises ModelNotTrusted: if nothing tells that a training made it
+    """
+    from stable_baselines3.common.save_util import load_from_pkl
+
+    data = saved_data(model)
+    record = training_record(model)
+    if record.driver_only:
+        raise ModelMismatch(
+            f"'{model}' holds what drives and not what learns: its critics and optimizers were "
+            "left out; train anew, with the hyperparameters in the config.yml beside it"
+        )
+    if not record.known and not trust:
+        raise ModelNotTrusted(
+            f"'{model}' does not tell that `sb3-torcs train` or the RL Zoo made it. To go on from "
+            "a model runs whatever code is pickled in it and in the replay buffer beside it; if "
+            "you know who made them, add --trust"
+        )
+    check_spaces(model, saved_spaces(model, trust=True), env, frames)
+    check_same(model, record.algo or told_algorithm(data), algo)
+    seen, angles = record.env_kwargs.get("range_finders", "scr"), "range_finder_angles"
+    sees = env.get_wrapper_attr(angles) if env.has_wrapper_attr(angles) else None
+    if record.env_id and sees is not None and not np.allclose(range_finder_angles(seen), sees):
+        raise ModelMismatch(
+            f"'{model}' has learned with range_finders {seen!r}, and would go on with others; give "
+            "the --env, --entry or --conf-file of before"
+        )
+    memory = model.parent / "replay_buffer.pkl"
+    if not memory.is_file():
+        return False
+    said = f"'{memory}' is no memory that can be gone on with"
+    with as_mismatch(said, "remove it, or give"), memory.open("rb") as file:
+        buffer = load_from_pkl(file)
+        if buffer.n_envs != n_envs:
+            raise ValueError(f"of {buffer.n_envs} cars at once, not {n_envs}")
+    return True
+
+
+def _layout(space: spaces.Space[Any]) -> str:
+    """Say in a few words what a space is."""
+    if isinstance(space, spaces.Box):
+        low, high = float(np.min(space.low)), float(np.max(space.high))
+        return f"{space.shape} {space.dtype} within [{low:g}, {high:g}]"
+    return str(space)
+
+
+def load_driver(
+    path: str | Path, env: gym.Env[Any, Any], algo: str | None = None, trust: bool = False
+) -> Any:
+    """
+    Load what is to drive. Nothing that the file holds is run, unless it is trusted.
+
+    :param path: of a saved model or its run's folder, or ``"scripted"``
+    :param env: that it is to drive, with the wrappers of the training
+    :param algo: as the zoo calls it; ``None`` finds out
+    :param trust: load the model as SB3 does, which runs whatever is pickled in it
+    :return: something with SB3's ``predict``
+    :raises InvalidOption: if there is no such file or algorithm
+    :raises ModelMismatch: if the file is no model, or one for another environment
+    :raises ModelNotTrusted: if the model takes more than plain data and known classes
+    """
+    if str(path) == SCRIPTED:
+        return _scripted(env)
+    file = find_model(path)
+    data = saved_data(file)
+    record = _record(file, data)
+    reason = unrebuilt(record.hyperparameters)
+    if reason is not None:
+        raise ModelMismatch(f"'{file}' cannot be driven as it was trained: {reason}")
+    frames = frames_of(record.hyperparameters)
+    if is_sbx(data) and not trust:
+        raise ModelNotTrusted(UNTRUSTED.format(model=file, why="SBX pickles its weights"))
+    seen = saved_spaces(file, trust=trust)
+    check_spaces(file, seen, env, frames)
+    model = _as_sb3_does(file, algo or record.algo) if trust else _policy(file, record, algo, seen)
+    return Driver(model, _statistics(file, record, trust), frames)
+
+
+def _policy(file: Path, record: TrainingRecord, algo: str | None, seen: Spaces) -> Any:
+    """Build a policy from plain data, with its weights."""
+    data = saved_data(file)
+    if algo is not None:
+        algorithm_of(algo, data, file)
+        check_same(file, record.algo or told_algorithm(data), algo)
+    weights = saved_weights(file)
+    with as_mismatch(f"'{file}' does not load", "give"):
+        try:
+            policy = build_policy(record.policy or readable_policy(data), seen)
+        except ModelNotTrusted as error:
+            raise ModelNotTrusted(UNTRUSTED.format(model=file, why=error)) from None
+        policy.load_state_dict(weights)
+        return policy
+
+
+def _as_sb3_does(file: Path, algo: str | None) -> Any:
+    """Load a model with all that is pickled in it."""
+    name, algorithm = algorithm_of(algo, saved_data(file), file)
+    # On the CPU: for one timestep at a time it is the fastest, and it is always there. The
+    # schedules are of no use to a driver, and the saved ones may be from another version.
+    # Nor is a replay buffer: SB3 warns of the class that it chose itself for returns over several
+    # steps.
+    kwargs = {"device": "cpu", "buffer_size": 1, "replay_buffer_class": None}
+    with as_mismatch(f"'{file}' does not load as {name}", "give an --algo that fits, or"):
+        model = algorithm.load(io.BytesIO(file.read_bytes()), **kwargs)
+        check_finite(file, model.policy.state_dict())
+        return model
+
+
+def _statistics(file: Path, record: TrainingRecord, trust: bool) -> Any:
+    """Find the statistics that a model learned with, if it learned from normalized observations."""
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    if record.statistics is not None:
+        return record.statistics
+    if record.statistics_file is None:
+        if _normalized(record.hyperparameters.get("normalize")):
+            raise ModelMismatch(
+                f"'{file}' has learned from normalized observations, and their statistics are not "
+                "there; put the vecnormalize.pkl of its training beside its config.yml"
+            )
+        return None
+    if not trust:
+        why = f"its statistics, '{record.statistics_file}', are pickled"
+        raise ModelNotTrusted(UNTRUSTED.format(model=file, why=why))
+    with as_mismatch(f"'{record.statistics_file}' holds no statistics of VecNormalize", "give"):
+        statistics = pickle.loads(record.statistics_file.read_bytes())
+        if not isinstance(statistics, VecNormalize):
+            raise TypeError(f"a {type(statistics).__name__}")
+        return statistics
+
+
+def _normalized(normalize: Any) -> bool:
+    """Read whether a training had normalized observations; strings are the zoo's to evaluate."""
+    if isinstance(normalize, Mapping):
+        return bool(normalize.get("norm_obs", True))
+    return normalize is True
+
+
+def _scripted(env: gym.Env[Any, Any]) -> Any:
+    """Let the driver without a network see what it is made for."""
+    angles = env.get_wrapper_attr("range_finder_angles")
+    if not np.allclose(angles, range_finder_angles("scr")):
+        raise InvalidOption(
+            f"the scripted driver looks around with range_finders 'scr', not with "
+            f"{np.degrees(angles).round(3).tolist()}; leave --range-finders out"
+        )
+    return ScriptedDriver(env.get_wrapper_attr("action"))

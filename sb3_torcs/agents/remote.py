@@ -1,0 +1,108 @@
+"""An agent that drives in the game itself, behind the SCR protocol, outside of any training."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from sb3_torcs.agents.models import driver_record, load_driver
+from sb3_torcs.agents.wrapping import wrapped
+
+__all__ = ["Agent"]
+
+
+class Agent:
+    """
+    A saved model at the wheel.
+
+    :param model: what :func:`~sb3_torcs.agents.models.load_driver` loads
+    :param settings: of ``Torcs-v0`` with ``backend="scr"``: ``host``, ``port``, ``track`` and so on
+    :param algo: of the model, if that cannot be found out
+    :param trust: run what is pickled in the model
+    :param name: of the driver, for the game's boards and results
+    :raises ModelMismatch: if the model does not fit
+    :raises ModelNotTrusted: if it takes more than plain data
+    """
+
+    def __init__(
+        self,
+        model: str,
+        settings: Mapping[str, Any],
+        algo: str | None = None,
+        trust: bool = False,
+        name: str = "",
+    ) -> None:
+        bare = gym.make("sb3_torcs:Torcs-v0", backend="scr", max_episode_steps=-1, **settings)
+        self.env = wrapped(bare, driver_record(model).hyperparameters, trust=trust)
+        self.driver = load_driver(model, self.env, algo, trust)
+        self.backend.driver_name = name
+        self.error: BaseException | None = None
+        """What went wrong, where the agent drives in a thread."""
+        with self.backend.rehearsal():  # a race has no time for what is done for the first time
+            self._race(None)
+        self._forget()
+
+    @property
+    def backend(self) -> Any:
+        """The connection."""
+        return self.env.get_wrapper_attr("backend")
+
+    def drive(self, aftermath: float | None = None) -> None:
+        """
+        Drive to the end of the race; if it begins anew, also in that.
+
+        :param aftermath: drive on for so long after leaving the road, standing and so on, and then
+            stop [s]; ``None`` drives on whatever happens
+        :raises ServerLost: if the server is gone
+        """
+        try:
+            self._race(aftermath)
+            while self.backend.restarted:
+                self._race(aftermath)
+        finally:
+            self.env.close()
+
+    def _forget(self) -> None:
+        """Begin to count anew."""
+        self.lap_times: list[float] = []
+        """[s] of each whole lap."""
+        self.distance = 0.0
+        """[m] driven."""
+        self.end: str | None = None
+        """Why the drive ended, as in ``info``; ``None`` while it goes on, or if the race ended."""
+        self.end_time: float | None = None
+        """[s] of the race when that was."""
+
+    def _race(self, aftermath: float | None) -> None:
+        """Drive until the race ends, or as ``drive`` says."""
+        self._forget()
+        observation, _ = self.env.reset()
+        state, episode_start = None, np.ones(1, dtype=bool)
+        while not self.backend.over and not self._has_enough(aftermath):
+            predict = self.driver.predict
+            action, state = predict(observation, state, episode_start, deterministic=True)
+            episode_start = np.zeros(1, dtype=bool)
+            observation, _, terminated, _, info = self.env.step(action)
+            self._note(info, terminated)
+
+    def _note(self, info: dict[str, Any], terminated: bool) -> None:
+        """
+        Keep what is told afterwards.
+
+        :param info: of a step
+        :param terminated: whether an episode would be over
+        """
+        self.time = info["car"].time
+        self.distance = info["distance"]
+        if info["lap_time"]:
+            self.lap_times.append(info["lap_time"])
+        if terminated and self.end is None:
+            self.end, self.end_time = info["end"], self.time
+
+    def _has_enough(self, aftermath: float | None) -> bool:
+        if aftermath is None or self.end_time is None:
+            return False
+        return bool(self.time > self.end_time + aftermath)

@@ -1,0 +1,140 @@
+"""What stands between a world and a model, put there again as in the training.
+
+The RL Zoo's order is: ``env_wrapper``, ``vec_env_wrapper``, ``normalize``, ``frame_stack``. The
+first changes the environment, and is put around it here. The last two change what a model sees, so
+they belong to the driver (:class:`sb3_torcs.agents.models.Driver`).
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import gymnasium as gym
+from gymnasium import spaces
+
+from sb3_torcs.agents.model_file import as_mismatch
+from sb3_torcs.errors import ModelMismatch, ModelNotTrusted, PackageMissing
+
+__all__ = ["frames_of", "stacked_space", "unrebuilt", "wrapped"]
+
+TRUSTED_PACKAGES = ("sb3_torcs", "gymnasium", "stable_baselines3", "sb3_contrib", "rl_zoo3")
+"""Whose wrappers a record may name: importing them, and putting them around, does no harm."""
+
+LEFT_OUT = {"TimeLimit", "Monitor", "RecordVideo", "RecordEpisodeStatistics", "UninterruptedWorker"}
+"""Wrappers that end or write down a training, and change nothing that is seen or done."""
+
+PASSING_ON = {"VecMonitor", "VecCheckNan", "VecNormalize", "VecVideoRecorder"}
+"""Wrappers of vectors that give on what they get, or whose statistics are kept with the model."""
+
+
+def wrapped(
+    env: gym.Env[Any, Any], hyperparameters: Mapping[str, Any], *, trust: bool = False
+) -> gym.Env[Any, Any]:
+    """
+    Put the wrappers of a training around an environment.
+
+    :param env: the bare one
+    :param hyperparameters: of the training, as the RL Zoo reads them
+    :param trust: import wrappers from wherever they are
+    :return: the environment that the model knows; the bare one if there are no wrappers
+    :raises ModelNotTrusted: if a wrapper is neither of this package nor of those it is made from
+    :raises PackageMissing: if a wrapper cannot be imported
+    :raises ModelMismatch: if it is no wrapper, or does not go around this environment
+    """
+    items = list(_items(hyperparameters, "env_wrapper"))
+    if items:
+        # Where a training has SB3's Monitor: some wrappers look at what they are put around.
+        env = gym.Wrapper(env)
+    for path, kwargs in items:
+        if path.rpartition(".")[2] in LEFT_OUT:
+            continue
+        wrapper = _imported(path, trust)
+        with as_mismatch(f"the training's wrapper {path} does not go around the car", "give"):
+            env = wrapper(env, **kwargs)
+    return env
+
+
+def frames_of(hyperparameters: Mapping[str, Any]) -> int | None:
+    """
+    Read how many observations a model sees at once.
+
+    :param hyperparameters: of its training
+    :return: their number; ``None`` if it sees one as it is
+    :raises ModelMismatch: if what is written is no number
+    """
+    frames = hyperparameters.get("frame_stack")
+    if frames is not None and (type(frames) is not int or frames < 1):
+        raise ModelMismatch(f"frame_stack of a training is {frames!r}; expected a number >= 1")
+    return frames
+
+
+def stacked_space(space: spaces.Space[Any], frames: int | None) -> spaces.Space[Any]:
+    """
+    Return the space of so many observations at once.
+
+    :param space: of one
+    :param frames: how many; ``None`` is one as it is
+    :return: as behind ``VecFrameStack``
+    :raises ModelMismatch: if they cannot be put in a row
+    """
+    if frames is None:
+        return space
+    if not isinstance(space, spaces.Box) or len(space.shape) != 1:
+        raise ModelMismatch(
+            f"frame_stack is for observations that are one row of numbers, not for {space}"
+        )
+    from stable_baselines3.common.vec_env.stacked_observations import StackedObservations
+
+    return StackedObservations(1, frames, space).stacked_observation_space
+
+
+def unrebuilt(hyperparameters: Mapping[str, Any]) -> str | None:
+    """
+    Find what cannot be put around a single car.
+
+    :param hyperparameters: of a training
+    :return: what to say about it, if there is something
+    """
+    for path, _ in _items(hyperparameters, "vec_env_wrapper"):
+        package, _, name = path.rpartition(".")
+        if name not in PASSING_ON or not package.startswith("stable_baselines3.common.vec_env"):
+            return (
+                f"vec_env_wrapper {path} changes vectors of environments, and cannot be put around "
+                "the one car of an evaluation; use an env_wrapper, or frame_stack"
+            )
+    return None
+
+
+def _items(hyperparameters: Mapping[str, Any], key: str) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Read dotted paths and arguments in any of the zoo's forms."""
+    value = hyperparameters.get(key)
+    for item in value if isinstance(value, list) else [] if value is None else [value]:
+        single = isinstance(item, dict) and len(item) == 1
+        path, kwargs = next(iter(item.items())) if single else (item, {})
+        if not isinstance(path, str) or not isinstance(kwargs or {}, dict):
+            raise ModelMismatch(
+                f"{key} of a training has {item!r}; expected a dotted path, or one with arguments"
+            )
+        yield path, dict(kwargs or {})
+
+
+def _imported(path: str, trust: bool) -> Any:
+    """Import a wrapper by its dotted path."""
+    module, _, name = path.rpartition(".")
+    if module.partition(".")[0] not in TRUSTED_PACKAGES and not trust:
+        raise ModelNotTrusted(
+            f"the model was trained behind the wrapper {path}, and importing it runs its code; if "
+            "you know who made it, add --trust (from Python: trust=True)"
+        )
+    try:
+        found = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise PackageMissing(
+            f"the model was trained behind the wrapper {path}, which does not import ({error}); "
+            "install the package that it is in"
+        ) from error
+    if not (isinstance(found, type) and issubclass(found, gym.Wrapper)):
+        raise ModelMismatch(f"env_wrapper of a training has {path}, which is no gymnasium.Wrapper")
+    return found

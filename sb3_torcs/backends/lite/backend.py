@@ -1,0 +1,111 @@
+"""The fallback world: a planar race car on a track, with no TORCS installed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from sb3_torcs.actions import checked_gearbox
+from sb3_torcs.backends.lite import physics
+from sb3_torcs.backends.lite.car import TOP_GEAR
+from sb3_torcs.backends.lite.rays import RANGE, Edges, road_edges
+from sb3_torcs.backends.lite.road import road_width
+from sb3_torcs.car import CarState, Controls, FloatArray, Start
+from sb3_torcs.errors import CarLost, InvalidOption
+from sb3_torcs.sensors import range_finder_angles
+from sb3_torcs.tracks.catalogue import load_track
+from sb3_torcs.tracks.track import Track
+
+__all__ = ["LiteBackend"]
+
+CARS = ("car1-trb1",)
+
+
+class LiteBackend:
+    """
+    One ``car1-trb1`` alone on a track.
+
+    :param track: a name, a path, a :class:`Track`, or ``"random"`` for a new one each episode
+    :param car: ``"car1-trb1"``
+    :param range_finders: see :func:`sb3_torcs.sensors.range_finder_angles`
+    :param gearbox: see :data:`sb3_torcs.actions.GEARBOXES`
+    """
+
+    gears = TOP_GEAR
+
+    def __init__(
+        self,
+        track: str | Path | Track = "aalborg",
+        *,
+        car: str = "car1-trb1",
+        range_finders: str | Sequence[float] = "scr",
+        gearbox: str = "automatic",
+    ) -> None:
+        if car not in CARS:
+            raise InvalidOption(
+                f"car is {car!r}; TorcsLite-v0 has {', '.join(CARS)}. The cars of the real game "
+                "are those of Torcs-v0"
+            )
+        self.car = car
+        by_road = checked_gearbox(gearbox) == "road_speed"
+        self._gearbox = physics.BY_ROAD_SPEED if by_road else physics.AUTOMATIC
+        self.range_finder_angles = range_finder_angles(range_finders)
+        self._random = track == "random"
+        self._set_track(load_track(track, np.random.default_rng(0) if self._random else None))
+
+    def _set_track(self, track: Track) -> None:
+        self.track = track
+        self._table: FloatArray = track.table
+        self._edges: Edges = road_edges(track)
+
+    def reset(self, rng: np.random.Generator, start: Start | None) -> CarState:
+        """Begin an episode; see :class:`~sb3_torcs.backends.base.Backend`."""
+        if self._random:
+            self._set_track(load_track("random", rng))
+        self._flying = start is not None
+        track = self.track
+        if start is None:
+            start = Start(track.length - track.grid.distance)
+            offset = track.grid.offset
+        else:
+            segment, along = track.find(start.distance)
+            width = road_width(self._table, segment, along)
+            offset = 0.5 * start.track_position * width
+        x, y, heading = track.pose(start.distance, offset)
+        segment, _ = track.find(start.distance)
+        yaw = heading - start.heading_error
+        self._state = physics.place(x, y, yaw, start.speed, segment, self._table)
+        if start.distance == 0.0:
+            self._state[physics.CROSSINGS] = 1.0  # on the line itself, the lap has begun
+        return self._read()
+
+    def step(self, controls: Controls, ticks: int) -> CarState:
+        """Drive on; see :class:`~sb3_torcs.backends.base.Backend`."""
+        steering, throttle, brake, gear, clutch = controls
+        asked = (steering, throttle, brake, self._gearbox if gear is None else gear, clutch)
+        physics.advance(self._state, self._table, asked, ticks, self._flying)
+        if not math.isfinite(self._state[physics.X] + self._state[physics.VX]):
+            raise CarLost(
+                f"the physics has come to no number on {self.track.name}, the car is nowhere; see "
+                "the surfaces of that track, and call reset to go on"
+            )
+        return self._read()
+
+    def close(self) -> None:
+        """Nothing to give back: the world is two arrays."""
+
+    def _read(self) -> CarState:
+        scalars, wheels, beams = np.empty(physics.SCALARS), np.empty(4), np.empty(19)
+        opponents = np.full(36, RANGE)  # nobody else is here
+        physics.read(
+            self._state, self._table, *self._edges, self.range_finder_angles, scalars, wheels, beams
+        )
+        for array in (wheels, beams, opponents):
+            array.flags.writeable = False
+        values = scalars.tolist()
+        values[physics.GEAR_FIELD] = int(values[physics.GEAR_FIELD])
+        values[physics.LAPS_FIELD] = int(values[physics.LAPS_FIELD])
+        return CarState._make((*values, 1, wheels, beams, opponents))

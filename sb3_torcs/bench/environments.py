@@ -1,0 +1,91 @@
+"""How fast things are: each figure in processor time, on one core, the compared ones in turns."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+
+__all__ = ["environments", "resets"]
+
+
+LITE = "sb3_torcs:TorcsLite-v0"
+TICKS_PER_TURN = 3000  # a minute of driving
+RACETRACK_STEPS_PER_TURN = 10
+RESETS = 200
+
+Figures = dict[str, float | None]
+
+
+def environments(seconds: float) -> Figures:
+    """
+    Measure TorcsLite-v0's control ticks and racetrack-v1's steps, in turns.
+
+    :param seconds: of processor time, at least one turn each [s]
+    :return: the medians over the turns
+    """
+    import highway_env  # noqa: F401  registers racetrack-v1
+
+    lite = gym.make(LITE, action_repeat=1)
+    racetrack = gym.make("racetrack-v1")
+    actions = _scripted_actions(lite)
+    racetrack.action_space.seed(0)
+    others = [racetrack.action_space.sample() for _ in range(RACETRACK_STEPS_PER_TURN)]
+    rates: dict[str, list[float]] = {"lite_ticks_per_s": [], "racetrack_v1_steps_per_s": []}
+    spent = 0.0
+    while spent < seconds:
+        for name, env, sequence in zip(rates, (lite, racetrack), (actions, others), strict=True):
+            taken = _drive(env, sequence)
+            rates[name].append(len(sequence) / taken)
+            spent += taken
+    lite.close()
+    racetrack.close()
+    return {name: statistics.median(values) for name, values in rates.items()}
+
+
+def _scripted_actions(env: gym.Env[Any, Any]) -> list[npt.NDArray[np.float32]]:
+    """Let the scripted driver choose actions from the grid on, and end before the episode does."""
+    from sb3_torcs.agents.scripted import ScriptedDriver
+    from sb3_torcs.evaluation.protocol import drive
+
+    steps = list(zip(drive(env, ScriptedDriver(), seed=0), range(TICKS_PER_TURN), strict=False))
+    return [step.action for step, _ in steps if not step.done]
+
+
+def _drive(env: gym.Env[Any, Any], actions: list[Any]) -> float:
+    """
+    Do actions from a reset on, and begin again where an episode ends.
+
+    :param env: any environment
+    :param actions: to do
+    :return: processor time without the resets [s]
+    """
+    env.reset(seed=0)
+    spent, begin = 0.0, time.process_time()
+    for action in actions:
+        _, _, terminated, truncated, _ = env.step(action)
+        if terminated or truncated:
+            spent += time.process_time() - begin
+            env.reset()
+            begin = time.process_time()
+    return spent + time.process_time() - begin
+
+
+def resets() -> Figures:
+    """
+    Measure a reset of an environment that has been reset before.
+
+    :return: ``lite_reset_ms``
+    """
+    env = gym.make(LITE)
+    env.reset(seed=0)
+    begin = time.process_time()
+    for _ in range(RESETS):
+        env.reset()
+    spent = time.process_time() - begin
+    env.close()
+    return {"lite_reset_ms": 1000.0 * spent / RESETS}

@@ -1,0 +1,113 @@
+"""What part of a training step the environment and the callbacks take."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
+
+from sb3_torcs.bench.environments import Figures
+
+__all__ = ["training_share"]
+
+
+WARM_UP = 50  # training steps before the clock starts
+
+
+class _TimedVecEnv(VecEnvWrapper):
+    """Adds up the time that steps take, with everything that wraps the environment."""
+
+    def __init__(self, venv: VecEnv) -> None:
+        super().__init__(venv)
+        self.spent = 0.0
+
+    def reset(self) -> Any:
+        return self.venv.reset()
+
+    def step_wait(self) -> VecEnvStepReturn:
+        begin = time.process_time()
+        result = self.venv.step_wait()
+        self.spent += time.process_time() - begin
+        return result
+
+
+class _TimedCallbacks(CallbackList):
+    """Runs callbacks, adds up their time, and holds the clock of whole training steps."""
+
+    def __init__(self, callbacks: list[BaseCallback], env: _TimedVecEnv, start: int) -> None:
+        super().__init__(callbacks)
+        self._timed_env = env
+        self._start = start
+        self._spent = 0.0
+        self._began = 0.0
+        self.share = 0.0
+
+    def on_step(self) -> bool:
+        begin = time.process_time()
+        go_on = super().on_step()
+        end = time.process_time()
+        self._spent += end - begin
+        if self.num_timesteps <= self._start:  # the clock runs from the end of this call on
+            self._began, self._spent, self._timed_env.spent = end, 0.0, 0.0
+        else:
+            self.share = (self._spent + self._timed_env.spent) / (end - self._began)
+        return go_on
+
+
+def training_share(steps: int) -> Figures:
+    """
+    Measure what part of a DDPG training step the environment and the callbacks take.
+
+    The shipped hyperparameters are used, with a short warm-up and a small memory; evaluations are
+    no training steps and are left out.
+
+    :param steps: training steps to measure
+    :return: ``training_env_share``, in [0, 1]
+    """
+    import torch as th
+    import yaml
+    from rl_zoo3.exp_manager import ExperimentManager
+
+    import sb3_torcs  # noqa: F401  registers the environment
+    from sb3_torcs.training.zoo import config_file, read_entry
+
+    entry = read_entry(config_file("ddpg"), "TorcsLite-v0")
+    start = int(entry["batch_size"]) + WARM_UP
+    entry.update(learning_starts=int(entry["batch_size"]), buffer_size=start + steps)
+    threads = th.get_num_threads()
+    th.set_num_threads(1)
+    try:
+        with (
+            tempfile.TemporaryDirectory() as scratch,
+            contextlib.redirect_stdout(io.StringIO()),
+        ):
+            config = Path(scratch) / "ddpg.yml"
+            config.write_text(yaml.safe_dump({"TorcsLite-v0": entry}), encoding="utf-8")
+            manager = ExperimentManager(
+                argparse.Namespace(),
+                "ddpg",
+                "TorcsLite-v0",
+                scratch,
+                eval_freq=-1,
+                n_timesteps=start + steps,
+                verbose=0,
+                device="cpu",
+                config=str(config),
+            )
+            model, _ = manager.setup_experiment()
+            env = _TimedVecEnv(model.env)
+            model.env = env
+            callbacks = _TimedCallbacks(manager.callbacks, env, start)
+            model.learn(start + steps, callback=callbacks)
+            env.close()
+    finally:
+        th.set_num_threads(threads)
+    return {"training_env_share": callbacks.share}

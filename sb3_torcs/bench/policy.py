@@ -1,0 +1,267 @@
+"""How many updates per second the policy makes, beside the plain form of the same networks."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import DDPG
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.policies import ContinuousCritic
+from stable_baselines3.common.preprocessing import get_action_dim
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.td3.policies import Actor, TD3Policy
+from torch import nn
+
+from sb3_torcs.policies import fast_matmul
+from sb3_torcs.policies.networks import HEAD_GAINS
+from sb3_torcs.policies.split_head import SplitHeadPolicy
+
+__all__ = ["PlainSplitHeadPolicy", "measure", "updater"]
+
+UPDATES_PER_TURN = 10
+"""Updates between two readings of the clock; short, so that all variants meet the same machine."""
+
+TRANSITIONS = 2000
+"""Random transitions to learn from."""
+
+
+class PlainHeads(nn.Module):
+    """
+    The actor's network as one would write it first.
+
+    :param features_dim: size of the input
+    :param kwargs: as in :class:`~sb3_torcs.policies.networks.SplitHeads`, two hidden layers
+    """
+
+    gain: th.Tensor
+
+    def __init__(self, features_dim: int, **kwargs: Any) -> None:
+        super().__init__()
+        first, second = kwargs["net_arch"]
+        self.hidden = nn.Sequential(
+            nn.Linear(features_dim, first), nn.ReLU(), nn.Linear(first, second), nn.ReLU()
+        )
+        self.heads = nn.Linear(second, len(kwargs["heads"]))
+        nn.init.normal_(self.heads.weight, std=kwargs["init_std"])
+        with th.no_grad():
+            self.heads.bias.copy_(th.tensor(kwargs["head_bias"]))
+        self.register_buffer("gain", th.tensor([HEAD_GAINS[head] for head in kwargs["heads"]]))
+
+    def forward(self, features: th.Tensor) -> th.Tensor:
+        """
+        Decide.
+
+        :param features: (batch, features_dim)
+        :return: (batch, actuators) in [-1, 1]
+        """
+        return th.tanh(self.gain * self.heads(self.hidden(features)))
+
+
+class PlainQ(nn.Module):
+    """
+    A value function as one would write it first.
+
+    :param features_dim: size of the state's features
+    :param action_dim: number of actuators
+    :param net_arch: units of the first, and of the second and third layer
+    """
+
+    def __init__(self, features_dim: int, action_dim: int, net_arch: Sequence[int]) -> None:
+        super().__init__()
+        first, second = net_arch
+        self.state = nn.Sequential(
+            nn.Linear(features_dim, first), nn.ReLU(), nn.Linear(first, second)
+        )
+        self.action = nn.Linear(action_dim, second)
+        self.joint = nn.Sequential(nn.Linear(second, second), nn.ReLU(), nn.Linear(second, 1))
+
+    def forward(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """
+        Value the actions.
+
+        :param features: (batch, features_dim)
+        :param actions: (batch, action_dim) in [-1, 1]
+        :return: (batch, 1)
+        """
+        value: th.Tensor = self.joint(self.state(features) + self.action(actions))
+        return value
+
+
+class PlainCritic(ContinuousCritic):
+    """
+    SB3's critic with :class:`PlainQ` for its value functions, and its gradients as they are.
+
+    :param n_critics: number of value functions
+    :param kwargs: what SB3's ``ContinuousCritic`` takes
+    """
+
+    def __init__(self, *, n_critics: int, **kwargs: Any) -> None:
+        super().__init__(n_critics=0, **kwargs)
+        sizes = kwargs["features_dim"], get_action_dim(self.action_space), kwargs["net_arch"]
+        self.q_networks = [PlainQ(*sizes) for _ in range(n_critics)]
+        for index, network in enumerate(self.q_networks):
+            self.add_module(f"qf{index}", network)
+
+    def forward(self, obs: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, ...]:
+        """
+        Value the actions by each value function.
+
+        :param obs: (batch, observation)
+        :param actions: (batch, action_dim) in [-1, 1]
+        :return: one (batch, 1) per value function
+        """
+        features = self.extract_features(obs, self.features_extractor)
+        return tuple(network(features, actions) for network in self.q_networks)
+
+    def q1_forward(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """
+        Value the actions by the first value function, as SB3's own critic does.
+
+        :param obs: (batch, observation)
+        :param actions: (batch, action_dim) in [-1, 1]
+        :return: (batch, 1)
+        """
+        with th.no_grad():
+            features = self.extract_features(obs, self.features_extractor)
+        value: th.Tensor = self.q_networks[0](features, actions)
+        return value
+
+
+class PlainSplitHeadPolicy(SplitHeadPolicy):
+    """
+    The same networks without any of the shortcuts: what the fast ones must equal.
+
+    :param args: as in ``SplitHeadPolicy``
+    :param kwargs: as in ``SplitHeadPolicy``; the optimizer stays as PyTorch makes it
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        options = {"fused": False, **(kwargs.pop("optimizer_kwargs", None) or {})}
+        super().__init__(*args, optimizer_kwargs=options, **kwargs)
+
+    def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
+        """
+        Make an actor. Called by ``TD3Policy`` for the actor and for its target.
+
+        :param features_extractor: the one to share, or ``None`` for one of its own
+        :return: the actor, on the policy's device
+        """
+        kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)
+        actor = Actor(**{**kwargs, "net_arch": [1]})
+        own = {**self.own_kwargs, "net_arch": kwargs["net_arch"]}
+        actor.mu = PlainHeads(kwargs["features_dim"], **own)  # type: ignore[assignment]
+        return actor.to(self.device)
+
+    def make_critic(
+        self, features_extractor: BaseFeaturesExtractor | None = None
+    ) -> ContinuousCritic:
+        """
+        Make a critic. Called by ``TD3Policy`` for the critic and for its target.
+
+        :param features_extractor: the one to share, or ``None`` for one of its own
+        :return: the critic, on the policy's device
+        """
+        kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
+        return PlainCritic(**kwargs).to(self.device)
+
+    def set_training_mode(self, mode: bool) -> None:
+        """
+        Switch between training and prediction as SB3 does.
+
+        :param mode: ``True`` to train
+        """
+        TD3Policy.set_training_mode(self, mode)
+
+
+class _Spaces(gym.Env[np.ndarray, np.ndarray]):
+    """The spaces of a racing environment, and nothing behind them."""
+
+    observation_space = spaces.Box(-1.0, 1.0, (29,), np.float32)
+    action_space = spaces.Box(
+        np.array([-1, 0, 0], np.float32), np.array([1, 1, 1], np.float32), dtype=np.float32
+    )
+
+
+def updater(policy: type[TD3Policy], batch_size: int, **policy_kwargs: Any) -> DDPG:
+    """
+    Make a DDPG that is ready to update: random transitions in its replay buffer, no output.
+
+    :param policy: class of the policy
+    :param batch_size: transitions per update
+    :param policy_kwargs: arguments of the policy
+    :return: the model; the same twice for the same arguments
+    """
+    model = DDPG(
+        policy,
+        _Spaces(),
+        buffer_size=TRANSITIONS,
+        batch_size=batch_size,
+        policy_kwargs=policy_kwargs,
+        seed=0,
+        device="cpu",
+    )
+    model.set_logger(Logger(None, []))
+    rng = np.random.default_rng(0)
+    assert model.replay_buffer is not None
+    for _ in range(TRANSITIONS):
+        obs, next_obs = rng.uniform(-1, 1, (2, 1, 29))
+        action, reward = rng.uniform(-1, 1, (1, 3)), rng.uniform(-1, 1, 1)
+        model.replay_buffer.add(obs, next_obs, action, reward, np.zeros(1), [{}])
+    return model
+
+
+def measure(batch_size: int = 64, seconds: float = 10.0) -> dict[str, float | None]:
+    """
+    Measure the updates per second of processor time, on one thread.
+
+    :param batch_size: transitions per update
+    :param seconds: [s] processor time to spend in all, at least
+    :return: ``policy_updates_per_s``, ``policy_plain_updates_per_s`` and
+        ``policy_fast_updates_per_s`` (``fast_matmul=True``; ``None`` where its probe says no)
+    """
+    threads = th.get_num_threads()
+    th.set_num_threads(1)
+    try:
+        return _measure(batch_size, seconds)
+    finally:
+        th.set_num_threads(threads)
+        fast_matmul.disable()
+
+
+def _measure(batch_size: int, seconds: float) -> dict[str, float | None]:
+    fast_matmul.disable()
+    models = {
+        "policy_updates_per_s": updater(SplitHeadPolicy, batch_size),
+        "policy_plain_updates_per_s": updater(PlainSplitHeadPolicy, batch_size),
+    }
+    if fast_matmul.probe(batch_size).ok:
+        models["policy_fast_updates_per_s"] = updater(SplitHeadPolicy, batch_size, fast_matmul=True)
+    spent = dict.fromkeys(models, 0.0)
+    for model in models.values():
+        _turn(model, fast=False)
+    turns = 0
+    while sum(spent.values()) < seconds:
+        for name, model in models.items():
+            spent[name] += _turn(model, fast=name == "policy_fast_updates_per_s")
+        turns += 1
+    rates: dict[str, float | None] = {"policy_fast_updates_per_s": None}
+    for name, time_spent in spent.items():
+        rates[name] = turns * UPDATES_PER_TURN / time_spent
+    return rates
+
+
+def _turn(model: DDPG, fast: bool) -> float:
+    if fast:
+        fast_matmul.enable(model.batch_size)
+    begin = time.process_time()
+    model.train(gradient_steps=UPDATES_PER_TURN, batch_size=model.batch_size)
+    spent = time.process_time() - begin
+    if fast:
+        fast_matmul.disable()
+    return spent

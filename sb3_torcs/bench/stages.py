@@ -1,0 +1,78 @@
+"""All measurements of `sb3-torcs bench`, in the order in which they run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from sb3_torcs.bench import scr, torcs
+from sb3_torcs.bench.environments import Figures, environments, resets
+from sb3_torcs.bench.learning import training_share
+from sb3_torcs.bench.policy import measure
+from sb3_torcs.errors import BackendUnavailable
+
+__all__ = ["KEYS", "stages"]
+
+
+KEYS = (
+    "lite_ticks_per_s",
+    "racetrack_v1_steps_per_s",
+    "lite_reset_ms",
+    "torcs_limit_ticks_per_s",
+    "torcs_cpp_ticks_per_s",
+    "torcs_env_ticks_per_s",
+    "torcs_env_repeat5_ticks_per_s",
+    "torcs_reset_ms",
+    "torcs_load_ms",
+    "torcs_vector2_ratio",
+    "scr_ticks_per_s",
+    "scr_reset_ms",
+    "game_frames_per_s",
+    "policy_updates_per_s",
+    "policy_plain_updates_per_s",
+    "policy_fast_updates_per_s",
+    "training_env_share",
+)
+"""All figures, in the order they are shown; those of worlds that are not here stay empty."""
+
+
+BATCH = 64
+
+
+def stages(seconds: float) -> dict[str, Callable[[], Figures]]:
+    """
+    List the measurements.
+
+    :param seconds: to spend on all of them, about [s]
+    :return: by name; each returns some of the figures
+    """
+    share = seconds / 6.0
+    return {
+        "environments": lambda: environments(share),
+        "resets": resets,
+        "game": _where_it_is(lambda: torcs.ticks(share)),
+        "game resets": _where_it_is(torcs.resets),
+        "game loads": _where_it_is(torcs.loads),
+        "game threads": _where_it_is(lambda: torcs.vector(share)),
+        "SCR": _where_it_is(lambda: scr.ticks(share)),
+        "SCR resets": _where_it_is(scr.resets),
+        "pictures": _where_it_is(scr.pictures),
+        "policy": lambda: _policy(share),
+        "training": lambda: training_share(max(int(40.0 * share), 100)),
+    }
+
+
+def _where_it_is(measure: Callable[[], Figures]) -> Callable[[], Figures]:
+    """Leave figures of the game empty where it cannot be driven."""
+
+    def measured() -> Figures:
+        try:
+            return measure()
+        except BackendUnavailable:  # sb3-torcs doctor says why
+            return {}
+
+    return measured
+
+
+def _policy(seconds: float) -> Figures:
+    """Measure the policy's updates."""
+    return measure(batch_size=BATCH, seconds=seconds)

@@ -1,0 +1,24 @@
+"""Callbacks for Stable-Baselines3, all with plain arguments, so that a YAML file can name them."""
+
+from sb3_torcs.callbacks.exploration import (
+    NoiseCallback,
+    NoiseDecayCallback,
+    StochasticBrakeCallback,
+)
+from sb3_torcs.callbacks.learning import GradientStepsCallback, MirrorCallback
+from sb3_torcs.callbacks.metrics import MONITOR_KWARGS, DrivingMetricsCallback
+from sb3_torcs.callbacks.progress import RacingProgressCallback
+from sb3_torcs.callbacks.switches import RandomStartCallback, RewardCallback
+
+__all__ = [
+    "MONITOR_KWARGS",
+    "DrivingMetricsCallback",
+    "GradientStepsCallback",
+    "MirrorCallback",
+    "NoiseCallback",
+    "NoiseDecayCallback",
+    "RacingProgressCallback",
+    "RandomStartCallback",
+    "RewardCallback",
+    "StochasticBrakeCallback",
+]

@@ -1,0 +1,207 @@
+"""Callbacks for stock SB3 and for the hyperparameter files of rl_zoo3: plain values only.
+
+They go by their dotted path, e.g. ``sb3_torcs.callbacks.NoiseCallback: {kind: ou}``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+)
+from stable_baselines3.common.noise import VectorizedActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+from sb3_torcs.callbacks.metrics import DrivingMetricsCallback
+from sb3_torcs.car import is_count, is_number
+from sb3_torcs.errors import InvalidOption, near_miss
+from sb3_torcs.noise import (
+    BLOG,
+    ActuatorNoise,
+    OUNoise,
+    OUParameters,
+    SetPointNoise,
+    StochasticBrake,
+    bind,
+    checked_dt,
+    noises_of,
+)
+
+__all__ = [
+    "DrivingMetricsCallback",
+    "NoiseCallback",
+    "NoiseDecayCallback",
+    "StochasticBrakeCallback",
+]
+
+Parameters = Sequence[float] | Mapping[str, float]
+"""``[mu, theta, sigma]``, or a mapping with these names, in the environment's units."""
+
+KINDS: dict[str, type[ActuatorNoise]] = {"set_point": SetPointNoise, "ou": OUNoise}
+
+
+class NoiseCallback(BaseCallback):
+    """
+    Give the model a noise of :mod:`sb3_torcs.noise`, one stream per parallel environment.
+
+    A model that was saved with such a noise goes on with it: its generator, frames and scale.
+
+    :param kind: ``"set_point"`` (as in the original code) or ``"ou"``
+    :param steering: ``[mu, theta, sigma]`` in environment units
+    :param throttle: ``[mu, theta, sigma]`` in environment units
+    :param brake: ``[mu, theta, sigma]`` in environment units
+    :param dt: duration of one decision in the unit of 1/theta, for ``"ou"``
+    :param seed: of a new noise; by default the model's own
+    :param verbose: as in ``BaseCallback``
+    """
+
+    def __init__(
+        self,
+        *,
+        kind: str = "set_point",
+        steering: Parameters = BLOG[0],
+        throttle: Parameters = BLOG[1],
+        brake: Parameters = BLOG[2],
+        dt: float = 1.0,
+        seed: int | None = None,
+        verbose: int = 0,
+    ) -> None:
+        super().__init__(verbose)
+        if not isinstance(kind, str) or kind not in KINDS:
+            raise InvalidOption(
+                f"kind is {kind!r}{near_miss(str(kind), KINDS)} pass 'set_point' or 'ou'"
+            )
+        self.kind = kind
+        self.parameters = tuple(OUParameters.of(value) for value in (steering, throttle, brake))
+        self.dt = checked_dt(dt)
+        self.seed = seed
+
+    def _on_training_start(self) -> None:
+        if not isinstance(self.model, OffPolicyAlgorithm):
+            raise InvalidOption(
+                f"{type(self.model).__name__} takes no action noise; use NoiseCallback with DDPG, "
+                "TD3 or SAC"
+            )
+        saved = noises_of(self.model)
+        if len(saved) != self.model.n_envs or type(saved[0]) is not KINDS[self.kind]:
+            noise = self._continued(saved[0]) if saved else self._new()
+            n_envs = self.model.n_envs
+            self.model.action_noise = noise if n_envs == 1 else VectorizedActionNoise(noise, n_envs)
+        for noise in bind(self.model):
+            noise.parameters = self.parameters
+            if isinstance(noise, OUNoise):
+                noise.dt = self.dt
+
+    def _new(self) -> ActuatorNoise:
+        seed = self.model.seed if self.seed is None else self.seed
+        return KINDS[self.kind](seed=seed)
+
+    def _continued(self, saved: ActuatorNoise) -> ActuatorNoise:
+        # Another number of environments goes on with the noise itself, another kind with its count.
+        if type(saved) is KINDS[self.kind]:
+            return saved
+        saved.release()
+        noise = self._new()
+        noise.frames, noise.scale = saved.frames, saved.scale
+        return noise
+
+    def _on_step(self) -> bool:
+        return True
+
+
+class _NoiseUser(BaseCallback):
+    """Base of callbacks that steer the noise: finds it before the first step."""
+
+    noises: Sequence[ActuatorNoise] = ()
+
+    def _on_training_start(self) -> None:
+        self.noises = ()
+
+    def _on_rollout_start(self) -> None:
+        # Only now has every callback's training start been called, whatever their order.
+        if self.noises:
+            return
+        self.noises = noises_of(self.model)
+        if not self.noises:
+            raise InvalidOption(
+                f"{type(self).__name__} steers a noise of sb3_torcs, but the model's action_noise "
+                f"is {getattr(self.model, 'action_noise', None)!r}; add NoiseCallback to the "
+                "callbacks"
+            )
+        for noise in self.noises:
+            noise.n_envs = len(self.noises)
+        self._apply()
+
+    def _apply(self) -> None:
+        """Set what does not change during the training."""
+
+    def _on_step(self) -> bool:
+        return True
+
+
+class NoiseDecayCallback(_NoiseUser):
+    """
+    Let the noise fade linearly. Its frames are counted across resumes.
+
+    :param frames: environment steps until the floor is reached
+    :param floor: share of the noise that stays for ever
+    :param verbose: as in ``BaseCallback``
+    """
+
+    def __init__(self, *, frames: int = 100_000, floor: float = 0.0, verbose: int = 0) -> None:
+        super().__init__(verbose)
+        if not is_count(frames) or not is_number(floor) or not 0.0 <= floor <= 1.0:
+            raise InvalidOption(
+                f"frames={frames!r}, floor={floor!r}: pass a whole number of at least 1 frame, and "
+                "a floor in [0, 1]"
+            )
+        self.frames = frames
+        self.floor = floor
+
+    def _apply(self) -> None:
+        done = min(self.noises[0].frames / self.frames, 1.0)
+        scale = 1.0 - (1.0 - self.floor) * done
+        for noise in self.noises:
+            noise.scale = scale
+        self.logger.record("noise/scale", scale)
+        self.logger.record("noise/frames", self.noises[0].frames)
+
+    def _on_step(self) -> bool:
+        self._apply()
+        return True
+
+
+class StochasticBrakeCallback(_NoiseUser):
+    """
+    Give the brake other parameters in some of the steps, so that braking is explored at all.
+
+    :param probability: share of the steps
+    :param mu: of the brake in these steps, in [0, 1]
+    :param theta: of the brake in these steps
+    :param sigma: of the brake in these steps
+    :param verbose: as in ``BaseCallback``
+    """
+
+    def __init__(
+        self,
+        *,
+        probability: float = 0.1,
+        mu: float = 0.2,
+        theta: float = 1.0,
+        sigma: float = 0.1,
+        verbose: int = 0,
+    ) -> None:
+        super().__init__(verbose)
+        if not is_number(probability) or not 0.0 <= probability <= 1.0:
+            raise InvalidOption(f"probability={probability!r}: pass a share of the steps in [0, 1]")
+        self.brake = StochasticBrake(probability, OUParameters.of((mu, theta, sigma)))
+
+    def _apply(self) -> None:
+        for noise in self.noises:
+            noise.stochastic_brake = self.brake
+
+    def _on_training_end(self) -> None:
+        # The model may be trained on without this callback.
+        for noise in self.noises:
+            noise.stochastic_brake = None

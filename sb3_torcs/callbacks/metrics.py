@@ -1,0 +1,372 @@
+"""What a training says about driving, beside what it says about returns.
+
+Everything goes through Stable-Baselines3's own logger (TensorBoard, CSV, the table on the screen).
+The rows of ``monitor.csv`` are Monitor's business: :data:`MONITOR_KWARGS` tells it what to write.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.logger import Image, Logger, TensorBoardOutputFormat
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_torcs.actions import ACTIONS, PEDALS, layout_of_width
+from sb3_torcs.car import CarState
+from sb3_torcs.errors import InvalidOption
+from sb3_torcs.tracks.track import Track
+
+__all__ = [
+    "ENDS",
+    "MONITOR_KWARGS",
+    "DrivenLine",
+    "DrivingMetricsCallback",
+    "callbacks_in",
+    "drive_lap",
+    "line_image",
+    "mean_q",
+]
+
+MONITOR_KWARGS: dict[str, tuple[str, ...] | list[str]] = {
+    "reset_keywords": [],
+    "info_keywords": ["laps", "best_lap_time", "distance", "damage", "end"],
+}
+"""
+For ``Monitor`` and ``make_vec_env(monitor_kwargs=...)``, and as a plain mapping for the YAML::
+
+    monitor_kwargs:
+      reset_keywords: []
+      info_keywords: [laps, best_lap_time, distance, damage, end]
+
+Each episode's row of ``monitor.csv`` then holds these, too. Monitor adds the two together, and its
+default for the first is a tuple: hence the empty list. A ``best_lap_time`` of 0 is no whole lap.
+"""
+
+ENDS = ("off_track", "backwards", "stuck", "damage", "lost", "laps", "time_limit")
+
+BRAKING = 0.05  # [-] of the pedal's way; less is a network's idea of nothing
+SATURATED = 0.01  # [-] of an actuator's range: nearer to a limit than this counts as at it
+RECORD_EVERY = 100  # calls between two records of the means over steps
+TEXT_FORMATS = ("stdout", "log", "json", "csv")  # these refuse pictures
+
+
+def callbacks_in(callback: BaseCallback | None) -> Iterator[BaseCallback]:
+    """
+    Walk a tree of callbacks.
+
+    :param callback: its root: a list, an event with children, or a single one
+    :return: the root and everything below it
+    """
+    if callback is None:
+        return
+    yield callback
+    children = [*getattr(callback, "callbacks", ())]
+    children += [getattr(callback, name, None) for name in ("callback", "callback_on_new_best")]
+    for child in children:
+        if isinstance(child, BaseCallback):
+            yield from callbacks_in(child)
+
+
+class DrivenLine(NamedTuple):
+    """Where a car went, one row per decision."""
+
+    track: Track
+    x: npt.NDArray[np.float64]  # (n,) [m] in the track's frame
+    y: npt.NDArray[np.float64]  # (n,) [m]
+    speed: npt.NDArray[np.float64]  # (n,) [m/s] along the car
+    distance: float  # [m] along the road
+    lap_time: float | None  # [s] of the lap, if it was completed
+
+
+def drive_lap(model: BaseAlgorithm, env: VecEnv, limit: int = 1500) -> DrivenLine:
+    """
+    Drive one lap, deterministically.
+
+    :param model: the driver
+    :param env: racing environments; what the first one does is kept
+    :param limit: decisions after which to give up
+    :return: the line of the lap, or of what there was of it
+    """
+    cars: list[CarState] = []
+    lap_time = 0.0
+    observation: Any = env.reset()
+    (track,) = env.get_attr("track", 0)  # when the lap ends the next one may be on another
+    state, dones = None, np.ones(env.num_envs, dtype=bool)
+    for _ in range(limit):
+        action, state = model.predict(observation, state, dones, deterministic=True)
+        observation, _, dones, infos = env.step(action)
+        cars.append(infos[0]["car"])
+        lap_time = infos[0]["lap_time"]
+        if lap_time or dones[0]:
+            break
+    x, y, speed = np.array([(car.x, car.y, car.speed_x) for car in cars]).T
+    return DrivenLine(track, x, y, speed, cars[-1].distance_raced, lap_time or None)
+
+
+def line_image(line: DrivenLine) -> npt.NDArray[np.uint8]:
+    """
+    Draw a driven line, coloured by speed, over the track's outline.
+
+    :param line: what was driven
+    :return: (height, width, 3)
+    """
+    # Graphics load only when there is something to draw.
+    from matplotlib.image import imread
+
+    from sb3_torcs.tracks.plot import plot_track
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "line.png"
+        plot_track(line.track, path, line=np.column_stack([line.x, line.y]), speed=line.speed)
+        pixels = imread(path)[..., :3]  # in [0, 1]
+    return np.round(255.0 * pixels).astype(np.uint8)
+
+
+def mean_q(model: BaseAlgorithm, size: int = 256) -> float | None:
+    """
+    Ask the critic about the newest transitions of the replay buffer.
+
+    They are taken in order, without drawing, so that looking changes nothing in the training.
+
+    :param model: any algorithm
+    :param size: transitions to ask about
+    :return: the mean Q, or ``None`` for an algorithm without replay buffer, or with an empty one
+    """
+    buffer, critic = getattr(model, "replay_buffer", None), getattr(model, "critic", None)
+    stored = getattr(buffer, "observations", None)
+    if buffer is None or critic is None or not isinstance(stored, np.ndarray) or not buffer.size():
+        return None
+    rows = min(math.ceil(size / buffer.n_envs), buffer.size())
+    newest = (buffer.pos - 1 - np.arange(rows)) % buffer.buffer_size
+    observations = stored[newest].reshape(-1, *stored.shape[2:])
+    actions = buffer.actions[newest].reshape(len(observations), -1)
+    normalizer = model.get_vec_normalize_env()
+    if normalizer is not None:
+        observations = normalizer.normalize_obs(observations)
+    was_training = critic.training
+    critic.train(False)
+    with th.no_grad():
+        values = critic(
+            th.as_tensor(observations, dtype=th.float32, device=model.device),
+            th.as_tensor(actions, dtype=th.float32, device=model.device),
+        )
+    critic.train(was_training)
+    return float(th.stack(list(values)).mean())
+
+
+@dataclass
+class _Steps:
+    """Sums over steps, and how many there were."""
+
+    count: int = 0
+    speed: float = 0.0  # [m/s]
+    braking: int = 0
+    names: tuple[str, ...] = PEDALS.names
+    saturated: list[int] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        """Begin with 0 for each actuator."""
+        self.saturated = [0] * len(self.names)
+
+    def add(self, other: _Steps) -> None:
+        """Take another's sums over and leave it empty."""
+        self.count += other.count
+        self.speed += other.speed
+        self.braking += other.braking
+        self.saturated = [a + b for a, b in zip(self.saturated, other.saturated, strict=True)]
+        other.__init__(names=self.names)  # type: ignore[misc]
+
+    def record(self, logger: Logger) -> None:
+        """Write the means down."""
+        logger.record("driving/speed", self.speed / self.count)
+        logger.record("driving/brake_share", self.braking / self.count)
+        for name, saturated in zip(self.names, self.saturated, strict=True):
+            logger.record(f"driving/saturation_{name}", saturated / self.count)
+
+
+@dataclass
+class _Watched:
+    """An evaluation, and the last of its calls that was looked at."""
+
+    callback: EvalCallback
+    seen: int
+
+
+class DrivingMetricsCallback(BaseCallback):
+    """
+    Log how the car drives. For any algorithm, any number of environments, any kind of ``VecEnv``.
+
+    ========================================  ==========================================  ======
+    ``driving/…``                             what                                        unit
+    ========================================  ==========================================  ======
+    ``lap_time``                              mean of the laps completed                  s
+    ``best_lap_time``                         best lap of the training so far             s
+    ``laps``, ``distance``                    mean of the episodes that ended             -, m
+    ``end_off_track``, ``end_stuck``, …       share of the episodes that ended this way   -
+    ``speed``                                 mean along the car                          m/s
+    ``brake_share``                           share of steps with the brake beyond 5 %    -
+    ``saturation_steering`` (… ``_brake``)    share of steps within 1 % of a limit        -
+    ``q``                                     mean Q of the newest transitions            -
+    ``noise_scale``                           of the action noise, if it has one          -
+    ``evaluation_lap_time``                   of the driven line                          s
+    ``line``                                  the driven line (TensorBoard image)
+    ========================================  ==========================================  ======
+
+    Means are over what happened since the logger's previous row. After each evaluation of an
+    ``EvalCallback`` anywhere in the training's callbacks, one more lap is driven in its environment
+    and drawn, if TensorBoard listens.
+
+    :param q_every: steps of the vector of environments between two looks at Q
+    :param q_size: transitions to ask the critic about
+    :param line: whether to draw the line after evaluations
+    :param line_decisions: decisions after which a lap is given up
+    :param verbose: as in ``BaseCallback``
+    """
+
+    def __init__(
+        self,
+        *,
+        q_every: int = 1000,
+        q_size: int = 256,
+        line: bool = True,
+        line_decisions: int = 1500,
+        verbose: int = 0,
+    ) -> None:
+        super().__init__(verbose)
+        for name, value in (
+            ("q_every", q_every),
+            ("q_size", q_size),
+            ("line_decisions", line_decisions),
+        ):
+            if not isinstance(value, int) or value < 1:
+                raise InvalidOption(f"{name} is {value!r}; expected a whole number >= 1")
+        self.q_every = q_every
+        self.q_size = q_size
+        self.line = line
+        self.line_decisions = line_decisions
+        self.best_lap_time: float | None = None  # [s] of the training
+        self.best_evaluation_lap_time: float | None = None  # [s] of the lines driven
+
+    def _on_training_start(self) -> None:
+        space = self.training_env.action_space
+        width = space.shape[0] if isinstance(space, spaces.Box) else 0
+        layout = layout_of_width(width)
+        if layout is None:
+            raise InvalidOption(
+                f"the actions of this environment have shape {space.shape}; DrivingMetricsCallback "
+                "is for Torcs-v0 and TorcsLite-v0, and knows their actions: "
+                f"{', '.join(ACTIONS)}"
+            )
+        self._layout = layout
+        self._pending = _Steps(names=layout.names)  # not yet recorded
+        self._window = _Steps(names=layout.names)  # since the logger's previous row
+        assert isinstance(space, spaces.Box)
+        low, high = (np.asarray(bound, np.float64) for bound in (space.low, space.high))
+        margin = SATURATED * (high - low)
+        self._limits = list(zip((low + margin).tolist(), (high - margin).tolist(), strict=True))
+        self._evaluations = [
+            _Watched(callback, callback.n_calls)
+            for callback in callbacks_in(self.locals.get("callback"))
+            if isinstance(callback, EvalCallback)
+        ]
+
+    def _on_step(self) -> bool:
+        # PPO keeps what it drew in "actions", and what the environment got beside it.
+        actions = self.locals.get("clipped_actions", self.locals["actions"])
+        pending, read = self._pending, self._layout.read
+        for action, info, done in zip(
+            actions.tolist(), self.locals["infos"], self.locals["dones"], strict=True
+        ):
+            pending.count += 1
+            pending.speed += info["car"].speed_x
+            pending.braking += read(action)[2] > BRAKING
+            for index, (low, high) in enumerate(self._limits):
+                if not low < action[index] < high:
+                    pending.saturated[index] += 1
+            if info.get("lap_time"):
+                self._record_lap(info["lap_time"])
+            if done:
+                self._record_episode(info)
+        if self.n_calls % RECORD_EVERY == 0:
+            self._record_steps()
+        if self.n_calls % self.q_every == 0:
+            self._record_q()
+        self._follow_evaluations()
+        return True
+
+    def _on_training_end(self) -> None:
+        # An EvalCallback that stands behind this one in the list may have had the last word.
+        self._follow_evaluations()
+
+    def _record_lap(self, seconds: float) -> None:
+        self.logger.record_mean("driving/lap_time", seconds)
+        self.best_lap_time = min(seconds, self.best_lap_time or math.inf)
+
+    def _record_episode(self, info: dict[str, Any]) -> None:
+        mean = self.logger.record_mean
+        mean("driving/distance", info["distance"])
+        mean("driving/laps", info["laps"])
+        end = info.get("end") or "time_limit"
+        for way in ENDS:
+            mean(f"driving/end_{way}", float(way == end))
+        if self.best_lap_time is not None:
+            self.logger.record("driving/best_lap_time", self.best_lap_time)
+        self._record_noise()
+        self._record_steps()  # off-policy algorithms write a row at the end of an episode
+
+    def _record_steps(self) -> None:
+        if "driving/speed" not in self.logger.name_to_value:  # the logger wrote a row
+            self._window = _Steps(names=self._layout.names)
+        if self._pending.count:
+            self._window.add(self._pending)
+            self._window.record(self.logger)
+
+    def _record_q(self) -> None:
+        value = mean_q(self.model, self.q_size)
+        if value is not None:
+            self.logger.record("driving/q", value)
+
+    def _record_noise(self) -> None:
+        noise = getattr(self.model, "action_noise", None)
+        noise = next(iter(getattr(noise, "noises", ())), noise)  # all of a vector have the same
+        scale = getattr(noise, "scale", None)
+        if scale is not None:
+            self.logger.record("driving/noise_scale", float(scale))
+
+    def _follow_evaluations(self) -> None:
+        """Draw a line if an evaluation has just been finished."""
+        for watched in self._evaluations:
+            evaluation = watched.callback
+            calls, every = evaluation.n_calls, evaluation.eval_freq
+            if calls != watched.seen and every > 0 and calls % every == 0:
+                watched.seen = calls
+                self._record_line(evaluation.eval_env)
+
+    def _record_line(self, env: VecEnv) -> None:
+        formats = self.logger.output_formats
+        if not self.line or not any(isinstance(f, TensorBoardOutputFormat) for f in formats):
+            return
+        chance = copy.deepcopy(env.get_attr("np_random"))
+        line = drive_lap(self.model, env, self.line_decisions)
+        for index, generator in enumerate(chance):  # later evaluations are as if nobody had looked
+            env.set_attr("np_random", generator, index)
+        if line.lap_time is not None:
+            best = self.best_evaluation_lap_time or math.inf
+            self.best_evaluation_lap_time = min(line.lap_time, best)
+            self.logger.record("driving/evaluation_lap_time", line.lap_time)
+        picture = line_image(line)
+        self.logger.record("driving/line", Image(picture, "HWC"), exclude=TEXT_FORMATS)
+        # At once, as EvalCallback does: the next row may be as far away as the next evaluation.
+        self.logger.dump(self.num_timesteps)

@@ -1,0 +1,113 @@
+"""Callbacks that change the environment while it trains: its reward, where episodes start."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+    EvalCallback,
+)
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_torcs.callbacks.metrics import callbacks_in
+from sb3_torcs.car import checked_start, checked_start_speed
+from sb3_torcs.errors import InvalidOption
+from sb3_torcs.rewards import Reward
+
+__all__ = ["RandomStartCallback", "RewardCallback"]
+
+
+class _SwitchUser(BaseCallback):
+    """Base of callbacks that change settings of environments, and give them back at the end."""
+
+    _switches: Sequence[_Switch] = ()
+
+    def _on_training_end(self) -> None:
+        for switch in self._switches:
+            switch.undo()
+
+
+class RewardCallback(_SwitchUser):
+    """
+    Let the training environments give another reward, and log the mean of each of its terms.
+
+    :param reward: name of a reward, or a mapping of terms to weights
+    :param also_eval: also in the environments of an ``EvalCallback``, whose score it changes
+    :param verbose: as in ``BaseCallback``
+    """
+
+    def __init__(
+        self, *, reward: str | Mapping[str, float], also_eval: bool = False, verbose: int = 0
+    ) -> None:
+        super().__init__(verbose)
+        Reward(reward)  # or a worker process would have to say what is wrong
+        self.reward = reward
+        self.also_eval = also_eval
+
+    def _on_training_start(self) -> None:
+        envs = [self.training_env]
+        if self.also_eval:
+            others = callbacks_in(self.locals["callback"])
+            envs += [other.eval_env for other in others if isinstance(other, EvalCallback)]
+        self._switches = [_Switch(env, "set_reward", self.reward) for env in envs]
+
+    def _on_step(self) -> bool:
+        for info in self.locals["infos"]:
+            for term, value in info.get("reward_terms", {}).items():
+                self.logger.record_mean(f"reward/{term}", value)
+        return True
+
+
+class RandomStartCallback(_SwitchUser):
+    """
+    Let training episodes start elsewhere; evaluation keeps its own start.
+
+    The first episode has begun before any callback is called, and keeps the environment's start.
+
+    :param start: ``"random"`` or ``"grid"``
+    :param speed: that random starts do not exceed [m/s]; by default the environment's own
+    :param verbose: as in ``BaseCallback``
+    """
+
+    def __init__(
+        self, *, start: str = "random", speed: float | None = None, verbose: int = 0
+    ) -> None:
+        super().__init__(verbose)
+        self.start = checked_start(start)
+        self.speed = None if speed is None else checked_start_speed(speed)
+
+    def _on_training_start(self) -> None:
+        settings: list[tuple[str, Any]] = [("set_start", self.start)]
+        if self.speed is not None:
+            settings.append(("set_random_speed", self.speed))
+        self._switches = [_Switch(self.training_env, *setting) for setting in settings]
+
+    def _on_step(self) -> bool:
+        return True
+
+
+def _require(env: VecEnv, name: str) -> None:
+    """Make sure of an attribute. A worker process that lacks it would die of it."""
+    if not env.has_attr(name):
+        raise InvalidOption(
+            f"the environment has no {name}; use Torcs-v0, TorcsLite-v0 or another RacingEnv of "
+            "sb3_torcs"
+        )
+
+
+class _Switch:
+    """A setting of all environments of a vector, which can be undone once."""
+
+    def __init__(self, env: VecEnv, setter: str, value: Any) -> None:
+        _require(env, setter)
+        self.env = env
+        self.setter = setter
+        self.previous: list[Any] = env.env_method(setter, value)
+
+    def undo(self) -> None:
+        """Give every environment its own previous value back."""
+        for index, value in enumerate(self.previous):
+            self.env.env_method(self.setter, value, indices=[index])
+        self.previous = []

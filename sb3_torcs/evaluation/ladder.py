@@ -1,0 +1,72 @@
+"""The ladder: what a drive on a track is worth beside the scripted driver and the game's robots.
+
+Their laps were measured by the engine (``examples/reference_laps.py``) and are shipped, so that
+nobody has to measure them again to climb.
+"""
+
+from __future__ import annotations
+
+import csv
+import functools
+from collections.abc import Iterable
+from pathlib import Path
+
+from sb3_torcs.agents.scripted import SCRIPTED
+from sb3_torcs.evaluation.protocol import Episode
+
+__all__ = ["REFERENCE_FIELDS", "ROBOTS", "RUNGS", "reference_laps", "rung"]
+
+ROBOTS = ("inferno", "berniw", "tita", "lliaw", "bt", "olethros")
+"""Robots that have a driver in every car of the class that is raced here."""
+
+RUNGS = ("finishes", "beats scripted", "beats bt", "beats the best robot")
+"""From the lowest to the highest; who stands on one has climbed all below."""
+
+REFERENCE_FIELDS = ("track", "driver", "car", "standing_lap_s", "best_flying_lap_s")
+REFERENCE_FILE = Path(__file__).parents[1] / "data" / "reference_laps.csv"
+REFERENCE_ENV = "Torcs-v0"  # laps of another world say nothing here
+
+
+@functools.cache
+def reference_laps(track: str, car: str = "car1-trb1") -> dict[str, float]:
+    """
+    Look up what others drive.
+
+    :param track: its name, without category
+    :param car: that they drive it with
+    :return: best flying laps [s] by driver; who does not finish three laps is not there
+    """
+    with REFERENCE_FILE.open(newline="", encoding="utf-8") as file:
+        return {
+            row["driver"]: float(row["best_flying_lap_s"])
+            for row in csv.DictReader(line for line in file if not line.startswith("#"))
+            if row["track"] == track and row["car"] == car and row["best_flying_lap_s"]
+        }
+
+
+def rung(race: Episode, env_id: str, car: str, track: str) -> str:
+    """
+    Say how high a race of three laps from the grid stands.
+
+    :param race: what was driven
+    :param env_id: where
+    :param car: with what
+    :param track: its name, without category
+    :return: one of :data:`RUNGS`, or nothing
+    """
+    if not race.finished:
+        return ""
+    laps = reference_laps(track, car) if env_id == REFERENCE_ENV else {}
+    if not laps or race.flying_lap is None:
+        return RUNGS[0]
+    height = 0
+    for rivals in ((SCRIPTED,), ("bt",), ROBOTS):
+        if not _beaten(race.flying_lap, laps, rivals):
+            break
+        height += 1
+    return RUNGS[height]
+
+
+def _beaten(lap: float, laps: dict[str, float], rivals: Iterable[str]) -> bool:
+    """Whether a lap is better than those of all rivals who finished."""
+    return all(lap < laps[rival] for rival in rivals if rival in laps)

@@ -1,0 +1,251 @@
+"""The evaluation protocol: drive some episodes, write down what happened, and say what is better.
+
+It is written for people in ``docs/evaluation.md``; everything that compares drivers comes here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from types import MappingProxyType
+from typing import Any, NamedTuple, Protocol
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+
+from sb3_torcs.car import CONTROL_TICK, CarState
+
+__all__ = [
+    "KEPT",
+    "RACE_LAPS",
+    "Driver",
+    "Episode",
+    "Merit",
+    "Step",
+    "World",
+    "choose_world",
+    "drive",
+    "evaluate",
+    "merit",
+    "race_environment",
+    "time_limit",
+]
+
+RACE_LAPS = 3  # from the grid in a row: what it takes to *complete* a track
+GAME, WITHOUT_GAME = "Torcs-v0", "TorcsLite-v0"
+RANDOM_TRACK = "random"
+LONGEST_TRACK = 10000.0  # [m] for such a one, whose length is not known beforehand
+KEPT = ("track", "car", "reward", "action_repeat", "range_finders", "action", "gearbox")
+"""What an evaluation takes from the training's environment, unless it is told otherwise."""
+
+
+class Driver(Protocol):
+    """What drives: a Stable-Baselines3 model, or anything that predicts like one."""
+
+    def predict(
+        self,
+        observation: npt.NDArray[np.float32],
+        state: Any = None,
+        episode_start: npt.NDArray[np.bool_] | None = None,
+        deterministic: bool = False,
+    ) -> tuple[npt.NDArray[np.float32], Any]:
+        """Choose an action; the state that comes with it is given back at the next timestep."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One decision of a drive."""
+
+    car: CarState  # after it
+    action: npt.NDArray[np.float32]
+    reward: float
+    info: dict[str, Any]
+    done: bool
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One episode of an evaluation."""
+
+    laps: int
+    lap_times: list[float]  # [s]
+    distance: float  # [m]
+    end: str  # as in ``info``, or "time_limit"
+    damage: float  # [points]
+    episode_return: float
+
+    @property
+    def finished(self) -> bool:
+        """Whether all laps that were asked for were driven, without leaving the road."""
+        return self.end == "laps"
+
+    @property
+    def race_time(self) -> float:
+        """Seconds from the start to the end of the last whole lap; 0 without one."""
+        return sum(self.lap_times)
+
+    @property
+    def flying_lap(self) -> float | None:
+        """The best lap [s] but the first one, which begins standing."""
+        return min(self.lap_times[1:], default=None)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the fields as the command prints them."""
+        fields = asdict(self)
+        fields["return"] = fields.pop("episode_return")
+        return fields
+
+
+class Merit(NamedTuple):
+    """How good races are, in the order in which it counts: greater is better."""
+
+    finished: int  # races whose laps were all driven
+    distance: float  # [m] in the others
+    haste: float  # [s] minus the time of those that were finished
+
+
+def merit(races: Sequence[Episode]) -> Merit:
+    """
+    Value races from the grid, one per track; a training keeps the model whose are the greatest.
+
+    On one track: three whole laps are better than none, then the shorter time is better; without
+    three whole laps, the longer way.
+
+    :param races: of one driver
+    :return: to be compared with that of another driver on the same tracks
+    """
+    finished = [race for race in races if race.finished]
+    others = [race.distance for race in races if not race.finished]
+    return Merit(len(finished), sum(others), -sum(race.race_time for race in finished))
+
+
+class World(NamedTuple):
+    """An environment, and why it was chosen."""
+
+    env_id: str
+    reason: str
+
+
+def choose_world(driver: str, trained_on: str | None, track: Any = None) -> World:
+    """
+    Choose where to drive: where the driver was trained, or else in the game if that can be.
+
+    :param driver: what it is called, for the reason
+    :param trained_on: the environment of its training, if that is known
+    :param track: to drive on
+    :return: the environment
+    """
+    from sb3_torcs.backends.native import check_layout
+    from sb3_torcs.errors import BackendUnavailable
+    from sb3_torcs.torcs.installation import find_game
+
+    if trained_on is not None:
+        return World(trained_on, f"'{driver}' was trained there")
+    unknown = f"'{driver}' does not say where it was trained"
+    if track == RANDOM_TRACK:
+        return World(WITHOUT_GAME, f"{unknown}, and random tracks are there alone")
+    try:
+        check_layout(find_game())
+    except BackendUnavailable:
+        missing = "and Torcs-v0 does not run here, `sb3-torcs doctor` says why"
+        return World(WITHOUT_GAME, f"{unknown}, {missing}")
+    other = f"--env {WITHOUT_GAME} drives it without the game"
+    return World(GAME, f"{unknown}, and the game is installed; {other}")
+
+
+def time_limit(kwargs: Mapping[str, Any]) -> int:
+    """
+    Work out after how many decisions to give up: later than any drive that is not standing.
+
+    :param kwargs: of the environment, with ``laps``
+    :return: decisions
+    """
+    from sb3_torcs.envs.racing import STUCK_SPEED
+    from sb3_torcs.tracks.catalogue import load_track
+
+    track = kwargs.get("track", "aalborg")
+    length = LONGEST_TRACK if track == RANDOM_TRACK else load_track(track).length
+    # One lap more than asked for: the way from the grid to the line, and some patience.
+    seconds = (kwargs["laps"] + 1) * length / STUCK_SPEED
+    return math.ceil(seconds / (kwargs.get("action_repeat", 5) * CONTROL_TICK))
+
+
+def race_environment(
+    env_id: str,
+    env_kwargs: Mapping[str, Any],
+    track: str | None = None,
+    *,
+    hyperparameters: Mapping[str, Any] = MappingProxyType({}),
+    trust: bool = False,
+) -> gym.Env[Any, Any]:
+    """
+    Build the environment of an evaluation: three laps from the grid.
+
+    :param env_id: of the training
+    :param env_kwargs: of the training
+    :param track: instead of the training's
+    :param hyperparameters: of the training, whose wrappers are put around the environment
+    :param trust: as of :func:`~sb3_torcs.agents.wrapping.wrapped`
+    :return: the environment, which nothing but the race ends
+    """
+    from sb3_torcs.agents.wrapping import wrapped
+
+    kwargs = {name: env_kwargs[name] for name in KEPT if name in env_kwargs}
+    kwargs.update({"laps": RACE_LAPS}, **({} if track is None else {"track": track}))
+    env = gym.make(env_id, max_episode_steps=time_limit(kwargs), **kwargs)
+    return wrapped(env, hyperparameters, trust=trust)
+
+
+def drive(env: gym.Env[Any, Any], driver: Driver, *, seed: int | None = None) -> Iterator[Step]:
+    """
+    Drive one episode, deterministically.
+
+    :param env: a racing environment
+    :param driver: chooses the actions
+    :param seed: of the reset
+    :return: the decisions, one by one
+    """
+    observation, _ = env.reset(seed=seed)
+    state, episode_start, done = None, np.ones(1, dtype=bool), False
+    while not done:
+        action, state = driver.predict(observation, state, episode_start, deterministic=True)
+        episode_start = np.zeros(1, dtype=bool)
+        observation, reward, terminated, truncated, info = env.step(action)
+        done = terminated or truncated
+        yield Step(info["car"], action, float(reward), info, done)
+
+
+def evaluate(
+    env: gym.Env[Any, Any], driver: Driver, *, episodes: int = 1, seed: int = 0
+) -> list[Episode]:
+    """
+    Drive some episodes from the environment's own start.
+
+    :param env: a racing environment
+    :param driver: chooses the actions, deterministically
+    :param episodes: how many
+    :param seed: of the first reset; the next episodes go on from it
+    :return: what happened in each
+    """
+    results = []
+    for number in range(episodes):
+        lap_times, total = [], 0.0
+        info: dict[str, Any] = {}
+        for step in drive(env, driver, seed=seed if number == 0 else None):
+            info = step.info
+            total += step.reward
+            if info["lap_time"]:
+                lap_times.append(info["lap_time"])
+        results.append(
+            Episode(
+                laps=info["laps"],
+                lap_times=lap_times,
+                distance=info["distance"],
+                end=info["end"] or "time_limit",
+                damage=info["damage"],
+                episode_return=total,
+            )
+        )
+    return results

@@ -1,0 +1,228 @@
+"""Races that people look at: agents and robots in the game's window, or in a film of it."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from sb3_torcs.agents.models import driver_name
+from sb3_torcs.agents.remote import Agent
+from sb3_torcs.agents.scripted import SCRIPTED
+from sb3_torcs.errors import GameFailed, InvalidOption, ServerLost
+from sb3_torcs.rendering.encoder import PHOTOGRAPHIC, write_video
+from sb3_torcs.rendering.game_video import FPS, Film, side_by_side
+from sb3_torcs.scr.protocol import plain_name
+from sb3_torcs.scr.server import open_ports, start_server
+from sb3_torcs.torcs.installation import Game
+from sb3_torcs.torcs.process import GameProcess
+from sb3_torcs.torcs.race_results import RobotResult
+from sb3_torcs.torcs.race_setup import SCR_SERVER, RaceSetup, session_for
+from sb3_torcs.torcs.results import read_results
+from sb3_torcs.torcs.window import Window, window_arguments
+from sb3_torcs.tracks.trial import check_track
+
+__all__ = ["Show", "film_shows", "show_in_window"]
+
+AFTERMATH = 2.0  # [s] of the race that are shown after an agent's drive has ended
+SCR_DRIVER = (SCR_SERVER, 0)
+
+
+@dataclass
+class Show:
+    """
+    A race, and who is looked at in it.
+
+    :param game: the installation
+    :param track: as of :class:`~sb3_torcs.torcs.race_setup.RaceSetup`
+    :param robot: name and index of the one who is looked at; ``None`` for an agent
+    :param model: of the agent: what :func:`~sb3_torcs.agents.models.load_driver` loads
+    :param settings: of the agent's environment: ``car``, ``action_repeat`` and so on
+    :param opponents: robots' names and indices, who start behind
+    :param laps: to drive
+    :param trust: run what is pickled in the model
+    """
+
+    game: Game
+    track: str | Path
+    robot: tuple[str, int] | None
+    model: str = SCRIPTED
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    opponents: Sequence[tuple[str, int]] = ()
+    laps: int = 1
+    trust: bool = False
+    agent: Agent | None = None
+    results: list[RobotResult] = field(default_factory=list)
+    share: float = 0.0  # of the race that is filmed, 0 to 1
+
+    @property
+    def race(self) -> RaceSetup:
+        """As the game is told."""
+        drivers = [self.robot or SCR_DRIVER, *self.opponents]
+        car = self.settings.get("car", "car1-trb1")
+        return RaceSetup(self.track, drivers, self.laps, session_for(drivers), car)
+
+    @property
+    def driver_name(self) -> str:
+        """As the game shows it."""
+        if self.robot is not None:
+            return self.game.find_robot(*self.robot).name
+        return plain_name(driver_name(self.model))
+
+    def start(self, window: Window) -> GameProcess:
+        """
+        Start the game, and bring the agent to its car.
+
+        :param window: of the game
+        :return: the game
+        """
+        if self.robot is not None:
+            arguments = window_arguments(self.game, window)
+            return GameProcess(self.game, self.race, check=check_track, **arguments)
+        sockets = open_ports(1)
+        port = sockets[0].getsockname()[1]
+        try:
+            process = start_server(self.game, self.race, sockets, window=window)
+        finally:
+            sockets[0].close()
+        try:
+            settings = {"track": self.track, "host": "127.0.0.1", "port": port, **self.settings}
+            self.agent = Agent(self.model, settings, trust=self.trust, name=self.driver_name)
+        except BaseException:
+            process.stop()
+            raise
+        return process
+
+    def finish(self, process: GameProcess) -> None:
+        """
+        Read the results, if the race has come to its end.
+
+        :param process: of the game
+        """
+        if process.poll() == 0:
+            self.results = read_results(process, self.race, self.race.cars(self.game))
+
+
+def show_in_window(show: Show, window: Window) -> None:
+    """
+    Show a race in real time, to its end or until the window is closed.
+
+    :param show: the race
+    :param window: of the game
+    :raises GameFailed: if the game ends with an error
+    """
+    with show.start(window) as process:
+        if show.agent is not None:
+            try:
+                show.agent.drive(AFTERMATH)
+            except ServerLost as error:
+                if process.poll() is None:
+                    raise
+                raise GameFailed(process.epitaph()) from error
+            if show.agent.end is not None:
+                return
+        process.wait()
+        show.finish(process)
+
+
+def film_shows(
+    shows: Sequence[Show],
+    path: Path,
+    *,
+    size: tuple[int, int] = (1280, 720),
+    view: str = "behind",
+    fps: float = FPS,
+) -> None:
+    """
+    Film races, side by side if there are several.
+
+    :param shows: the races, from left to right
+    :param path: of the film, ending in ``.mp4``
+    :param size: width and height of the whole picture [pixels]
+    :param view: one of :data:`sb3_torcs.torcs.window.VIEWS`
+    :param fps: frames per second of simulated time
+    :raises InvalidOption: if the picture cannot be divided so
+    :raises DisplayUnavailable: if there is no virtual display
+    :raises OutputNotWritable: if the file cannot be written; no part of it is left behind
+    :raises GameFailed: if a game ends too early; the same holds
+    """
+    part = (size[0] // len(shows), size[1])
+    if len(shows) > 1 and size[0] % (2 * len(shows)):
+        raise InvalidOption(
+            f"size is {size[0]}x{size[1]}; the width of a film with {len(shows)} side by side has "
+            f"to be a multiple of {2 * len(shows)}"
+        )
+    with ExitStack() as stack:
+        films = [
+            stack.enter_context(
+                Film(show.start, size=part, view=view, fps=fps, driver=show.driver_name)
+            )
+            for show in shows
+        ]
+        threads = [_begin(show, film) for show, film in zip(shows, films, strict=True)]
+        pictures = [_pictures(show, film) for show, film in zip(shows, films, strict=True)]
+        try:
+            joint = side_by_side(*pictures)
+            write_video(
+                path, joint, fps, encoding=PHOTOGRAPHIC,
+                share=lambda: min(show.share for show in shows),
+            )  # fmt: skip
+        finally:
+            for film in films:
+                film.game.stop()
+            for thread in threads:
+                thread.join()
+
+
+def _begin(show: Show, film: Film) -> threading.Thread:
+    """
+    Let an agent drive beside the camera.
+
+    :param show: with the agent
+    :param film: of it
+    :return: the thread
+    """
+
+    def drive() -> None:
+        if show.agent is None:
+            return
+        try:
+            show.agent.drive(AFTERMATH)
+        except BaseException as error:
+            # A game that ended by itself knows better why.
+            if not isinstance(error, ServerLost) or film.game.poll() is None:
+                show.agent.error = error
+            film.game.stop()  # which otherwise waits for an answer
+
+    thread = threading.Thread(target=drive, name="agent")
+    thread.start()
+    return thread
+
+
+def _pictures(show: Show, film: Film) -> Iterator[npt.NDArray[np.uint8]]:
+    """
+    Yield a film to the end of the race, or a little beyond the end of the agent's drive.
+
+    :param show: the race
+    :param film: of it
+    """
+    agent = show.agent
+    try:
+        for frame in film.frames():
+            show.share = frame.share
+            yield frame.picture
+            if agent is not None and agent.end_time is not None:
+                left = agent.end_time + AFTERMATH - frame.time
+                if left < 1.0 / film.fps:
+                    return
+    except GameFailed:
+        if agent is not None and agent.error is not None:
+            raise agent.error from None
+        raise
+    show.finish(film.game)

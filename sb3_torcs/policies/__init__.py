@@ -1,0 +1,6 @@
+"""The policy with split heads for stock DDPG and TD3, and what it is made of."""
+
+from sb3_torcs.policies.export import export_actor
+from sb3_torcs.policies.split_head import SplitHeadPolicy
+
+__all__ = ["SplitHeadPolicy", "export_actor"]

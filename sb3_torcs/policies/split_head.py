@@ -1,0 +1,291 @@
+"""A policy for the stock DDPG and TD3 with one output function per actuator.
+
+The networks are those of the original post: an actor of 300 and 600 ReLU units whose heads start
+near zero, and a critic that the action joins at the second hidden layer. Importing this module
+makes ``DDPG("SplitHeadPolicy", ...)`` and ``TD3("SplitHeadPolicy", ...)`` work; a hyperparameter
+file can name ``sb3_torcs.policies.split_head.SplitHeadPolicy`` without an import.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, cast
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import DDPG, TD3
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
+from stable_baselines3.common.preprocessing import get_action_dim
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from stable_baselines3.td3.policies import Actor, TD3Policy
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+
+from sb3_torcs.actions import layout_of_width
+from sb3_torcs.errors import InvalidOption
+from sb3_torcs.policies import fast_matmul as matmul
+from sb3_torcs.policies.export import export_actor
+from sb3_torcs.policies.networks import HEAD_GAINS, ExactDriver, LateActionCritic, SplitHeadActor
+from sb3_torcs.policies.optimizers import LeanAdam, with_lr_scale
+from sb3_torcs.sensors import OBSERVATION_SIZE
+
+__all__ = ["SplitHeadPolicy", "export_actor"]
+
+NET_ARCH = (300, 600)
+"""Hidden units of both networks in the original post."""
+
+OWN_KERNEL = frozenset({"fused", "foreach", "capturable", "differentiable"})
+"""Options of Adam with which somebody chooses its kernel; then it stays as chosen."""
+
+
+class SplitHeadPolicy(TD3Policy):
+    """
+    The networks of the original post for the stock ``DDPG`` and ``TD3``.
+
+    Of the keyword arguments of SB3's ``TD3Policy``, ``net_arch`` is by default ``[300, 600]`` (the
+    critic takes two numbers), and an Adam gets ``fused=True`` unless ``optimizer_kwargs`` choose
+    its kernel themselves, e.g. by ``{"fused": False}``.
+
+    :param observation_space: as in ``TD3Policy``
+    :param action_space: as in ``TD3Policy``
+    :param lr_schedule: as in ``TD3Policy``
+    :param heads: output function of each action, ``"tanh"`` or ``"sigmoid"``; by default that which
+        fits its range: a tanh where it begins below 0, as steering and a signed pedal do, and a
+        sigmoid where it begins at 0, as throttle and brake do
+    :param head_bias: initial value before each output function, by default 0. A sigmoid of 0 is
+        half throttle and half brake; ``(0, 0, -2)`` starts with 12 % brake
+    :param init_std: standard deviation of the heads' initial weights
+    :param layer_norm: normalise the hidden layers of both networks
+    :param critic_lr_scale: learning rate of the critic divided by that of the actor
+    :param ema_decay: if given, a running average of the actor's weights drives in its place
+        whenever ``predict`` is ``deterministic``, as in evaluations; each update leaves the average
+        this share of itself, e.g. 0.9995. Training is the same to the bit without it
+    :param symmetric: whenever ``predict`` is ``deterministic``, drive the mean of what the actor
+        does and the mirror image of what it does in the mirror, so that a bend to the left is
+        driven like one to the right. For observations whose middle is 0 (no ``VecNormalize``), with
+        range finders that look equally far to both sides. Training is the same to the bit without
+    :param fast_matmul: allow another kernel for speed, see
+        :mod:`sb3_torcs.policies.fast_matmul`; ``policy.fast_matmul_found`` says what was found
+    :param kwargs: the other arguments of ``TD3Policy``
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        *,
+        heads: Sequence[str] | None = None,
+        head_bias: Sequence[float] | None = None,
+        init_std: float = 1e-4,
+        layer_norm: bool = False,
+        critic_lr_scale: float = 1.0,
+        ema_decay: float | None = None,
+        symmetric: bool = False,
+        fast_matmul: bool = False,
+        **kwargs: Any,
+    ) -> None:
+        net_arch = kwargs.pop("net_arch", None)
+        net_arch = list(NET_ARCH) if net_arch is None else net_arch
+        heads = heads_for(action_space) if heads is None else heads
+        bias = (0.0,) * len(heads) if head_bias is None else tuple(head_bias)
+        _check_heads(heads, bias, action_space)
+        _check_net_arch(net_arch)
+        _check_symmetric(symmetric, observation_space, action_space)
+        self.own_kwargs: dict[str, Any] = {
+            "heads": tuple(heads),
+            "head_bias": bias,
+            "init_std": _positive("init_std", init_std),
+            "layer_norm": layer_norm,
+            "critic_lr_scale": _positive("critic_lr_scale", critic_lr_scale),
+            "ema_decay": _share("ema_decay", ema_decay),
+            "symmetric": symmetric,
+            "fast_matmul": fast_matmul,
+        }
+        self.fast_matmul_found = matmul.enable() if fast_matmul else None
+        super().__init__(
+            observation_space,
+            action_space,
+            lr_schedule,
+            net_arch=net_arch,
+            **_fast_optimizer(kwargs),
+        )
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        self._exact: tuple[list[int], ExactDriver] | None = None
+        super()._build(lr_schedule)
+        self.average = self._averaged()
+        scale = self.own_kwargs["critic_lr_scale"]
+        if scale == 1.0:
+            return
+        self.critic.optimizer = with_lr_scale(self.optimizer_class)(
+            [{"params": list(self.critic.parameters()), "lr_scale": scale}],
+            lr=lr_schedule(1),  # type: ignore[call-arg]
+            **self.optimizer_kwargs,
+        )
+
+    def _averaged(self) -> AveragedModel | None:
+        """Begin the average of the actor's weights; its optimizer keeps it up to date."""
+        decay = self.own_kwargs["ema_decay"]
+        if decay is None:
+            return None
+        average = AveragedModel(self.actor, multi_avg_fn=get_ema_multi_avg_fn(decay))
+        average.requires_grad_(False)
+        self.actor.optimizer.register_step_post_hook(
+            lambda *_: average.update_parameters(self.actor)
+        )
+        return average
+
+    @property
+    def driver(self) -> Actor:
+        """The actor that drives when ``predict`` is deterministic."""
+        return self.actor if self.average is None else cast(Actor, self.average.module)
+
+    def exact_driver(self) -> ExactDriver:
+        """Return a copy of what drives when ``predict`` is deterministic."""
+        return ExactDriver(self.driver, symmetric=self.own_kwargs["symmetric"])
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        if not deterministic:
+            return self.actor(observation)
+        driver = self.driver
+        versions = [id(driver), *(parameter._version for parameter in driver.parameters())]
+        if self._exact is None or self._exact[0] != versions:
+            self._exact = (versions, self.exact_driver())
+        return self._exact[1](observation)
+
+    def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
+        """
+        Make an actor. Called by ``TD3Policy`` for the actor and for its target.
+
+        :param features_extractor: the one to share, or ``None`` for one of its own
+        :return: the actor, on the policy's device
+        """
+        kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)
+        own = {
+            key: self.own_kwargs[key] for key in ("heads", "head_bias", "init_std", "layer_norm")
+        }
+        return SplitHeadActor(**own, **kwargs).to(self.device)
+
+    def make_critic(
+        self, features_extractor: BaseFeaturesExtractor | None = None
+    ) -> ContinuousCritic:
+        """
+        Make a critic. Called by ``TD3Policy`` for the critic and for its target.
+
+        :param features_extractor: the one to share, or ``None`` for one of its own
+        :return: the critic, on the policy's device
+        """
+        kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
+        own = {"layer_norm": self.own_kwargs["layer_norm"]}
+        return LateActionCritic(**own, **kwargs).to(self.device)
+
+    def set_training_mode(self, mode: bool) -> None:
+        """
+        Switch between training and prediction, without a walk over the modules if nothing changes.
+
+        :param mode: ``True`` to train
+        """
+        if mode:
+            self._exact = None  # an update by a fused optimizer leaves the versions as they were
+        if mode != self.training:
+            super().set_training_mode(mode)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return {**super()._get_constructor_parameters(), **self.own_kwargs}
+
+
+def heads_for(action_space: spaces.Box) -> tuple[str, ...]:
+    """
+    Choose output functions by the ranges of the actions.
+
+    :param action_space: of the environment
+    :return: ``"tanh"`` or ``"sigmoid"`` for each action
+    """
+    return tuple("sigmoid" if low == 0.0 else "tanh" for low in action_space.low.flatten())
+
+
+def _check_heads(heads: Sequence[str], bias: Sequence[float], action_space: spaces.Box) -> None:
+    n_actions = get_action_dim(action_space)
+    allowed = " or ".join(repr(name) for name in HEAD_GAINS)
+    unknown = [head for head in heads if head not in HEAD_GAINS]
+    if isinstance(heads, str) or unknown:
+        raise InvalidOption(
+            f"heads={heads!r}: each head is {allowed}; "
+            f"pass policy_kwargs=dict(heads={heads_for(action_space)!r})"
+        )
+    if len(heads) != n_actions:
+        raise InvalidOption(
+            f"heads={tuple(heads)!r} has {len(heads)} entries, but the action space has "
+            f"{n_actions} actions; pass policy_kwargs=dict(heads=...) with {n_actions} "
+            f"entries, each {allowed}"
+        )
+    if len(bias) != n_actions:
+        raise InvalidOption(
+            f"head_bias={tuple(bias)!r} has {len(bias)} entries, but the action space has "
+            f"{n_actions} actions; pass one number per action, e.g. {(0.0,) * n_actions}"
+        )
+
+
+def _check_net_arch(net_arch: Any) -> None:
+    critic = net_arch.get("qf") if isinstance(net_arch, dict) else net_arch
+    actor = net_arch.get("pi") if isinstance(net_arch, dict) else net_arch
+    if not actor or not critic or len(critic) != 2:
+        raise InvalidOption(
+            f"net_arch={net_arch!r}: the critic has two layer sizes (the action joins at the "
+            "second) and the actor at least one; pass net_arch=[300, 600], or "
+            "net_arch=dict(pi=[300, 600], qf=[300, 600])"
+        )
+
+
+def _check_symmetric(
+    symmetric: Any, observation_space: spaces.Space, action_space: spaces.Space
+) -> None:
+    if not isinstance(symmetric, bool):
+        raise InvalidOption(f"symmetric={symmetric!r}: pass True or False")
+    ours = observation_space.shape == (OBSERVATION_SIZE,) and layout_of_width(
+        get_action_dim(action_space)
+    )
+    if symmetric and not ours:
+        raise InvalidOption(
+            "symmetric=True mirrors the sensors and actuators of Torcs-v0 and TorcsLite-v0, not "
+            f"{observation_space} and {action_space}; pass symmetric=False"
+        )
+
+
+def _positive(name: str, value: float) -> float:
+    if not 0.0 < value < float("inf"):
+        raise InvalidOption(f"{name}={value!r}: pass a number above 0, e.g. {name}=1.0")
+    return float(value)
+
+
+def _share(name: str, value: float | None) -> float | None:
+    if value is not None and not 0.0 <= value < 1.0:
+        raise InvalidOption(
+            f"{name}={value!r}: pass a share in [0, 1), e.g. {name}=0.9995, or None"
+        )
+    return None if value is None else float(value)
+
+
+def _fast_optimizer(kwargs: dict[str, Any]) -> dict[str, Any]:
+    optimizer_class = kwargs.get("optimizer_class", th.optim.Adam)
+    options = dict(kwargs.get("optimizer_kwargs") or {})
+    if issubclass(optimizer_class, th.optim.Adam) and not OWN_KERNEL & options.keys():
+        options["fused"] = True
+        optimizer_class = LeanAdam if optimizer_class is th.optim.Adam else optimizer_class
+    return {**kwargs, "optimizer_class": optimizer_class, "optimizer_kwargs": options}
+
+
+def _register(*algorithms: type[BaseAlgorithm]) -> None:
+    for algorithm in algorithms:
+        # SB3's classes share one dictionary: each gets a copy of its own.
+        aliases: dict[str, type[BasePolicy]] = {**algorithm.policy_aliases}
+        algorithm.policy_aliases = {**aliases, "SplitHeadPolicy": SplitHeadPolicy}
+
+
+_register(DDPG, TD3)
+
+
+# Saved models and YAML files name the class by its package, whichever file it stands in.
+SplitHeadPolicy.__module__ = "sb3_torcs.policies"

@@ -1,0 +1,106 @@
+"""The game's own picture of a race that is driven elsewhere.
+
+A hidden game draws up the same field on the same track. Nothing of it drives: for each picture it
+is told how the race looks at that moment. So a picture shows the simulated time, however long the
+machine draws, and two pictures of one moment are equal.
+"""
+
+from __future__ import annotations
+
+import socket
+import weakref
+from contextlib import ExitStack
+from dataclasses import replace
+from xml.etree import ElementTree
+
+import numpy as np
+import numpy.typing as npt
+
+from sb3_torcs.errors import GameFailed
+from sb3_torcs.rendering.game_video import read_frame
+from sb3_torcs.torcs.display import VirtualDisplay
+from sb3_torcs.torcs.installation import Game
+from sb3_torcs.torcs.process import GameProcess
+from sb3_torcs.torcs.race_setup import SCR_SERVER, RaceSetup
+from sb3_torcs.torcs.window import GRAPHICS, Window, window_arguments
+from sb3_torcs.tracks.trial import check_track
+
+__all__ = ["GameView"]
+
+AGENT = f"{SCR_SERVER} 0"  # as the game shows its name
+# These tell of moments before, which need not have been drawn, or were those of another episode.
+NO_PAST = ("smoke value", "skid value")
+GRACE = 5.0  # [s] for a game that hung up to be gone
+
+
+class GameView:
+    """
+    Pictures of a race, with the agent in view. The game ends when this is closed.
+
+    :param game: the installation
+    :param race: who races where; the agent is ``("scr_server", 0)``
+    :param window: that the game would show: its size, its view, and whether it has boards
+    :raises DisplayUnavailable: if there is no virtual display
+    :raises GameIncomplete: if the game lacks its program, or a file that it needs for this
+    :raises BackendUnavailable: if our libraries for the inside of the game were not built
+    """
+
+    def __init__(self, game: Game, race: RaceSetup, window: Window) -> None:
+        with ExitStack() as stack:
+            display = stack.enter_context(VirtualDisplay(window.size))
+            self._line, end = socket.socketpair()
+            stack.enter_context(self._line)
+            with end:
+                window = replace(window, driver=AGENT, display=display.name, frames=end.fileno())
+                arguments = window_arguments(game, window)
+                arguments["files"][GRAPHICS] = _without_past(arguments["files"][GRAPHICS])
+                arguments["environment"] |= {
+                    "SB3_TORCS_APPEARANCES": str(end.fileno()),
+                    "SB3_TORCS_SCR_SOCKETS": "",  # nobody drives there
+                }
+                self._game = stack.enter_context(
+                    GameProcess(game, race, check=check_track, **arguments)
+                )
+            self._end = weakref.finalize(self, stack.pop_all().close)
+
+    def __enter__(self) -> GameView:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def frame(self, appearance: bytes) -> npt.NDArray[np.uint8]:
+        """
+        Draw a moment of the race.
+
+        :param appearance: of that moment, from the engine
+        :return: (height, width, 3) red, green and blue, from the top
+        :raises GameFailed: if the game has ended
+        :raises GameTimeout: if it hangs
+        """
+        try:
+            self._line.sendall(appearance)
+            frame = read_frame(self._line.fileno(), self._game)
+        except ConnectionError:
+            frame = None
+        if frame is None:
+            self._game.wait(GRACE)  # it knows better how the game ended
+            raise GameFailed(self._game.epitaph())
+        return frame.picture
+
+    def close(self) -> None:
+        """End the game and its display. Calling it twice does no harm."""
+        self._end()
+
+
+def _without_past(graphics: str) -> str:
+    """
+    Leave out of the pictures what would show earlier ones.
+
+    :param graphics: the game's settings of them, as text
+    """
+    root = ElementTree.fromstring(graphics)
+    for name in NO_PAST:
+        for setting in root.iterfind(f"section[@name='Graphic']/attnum[@name='{name}']"):
+            setting.set("val", "0")
+    return ElementTree.tostring(root, encoding="unicode")

@@ -1,0 +1,1 @@
+"""The SCR protocol: its messages, a client, and the game as a server."""

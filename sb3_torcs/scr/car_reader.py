@@ -1,0 +1,118 @@
+"""From what an SCR server tells to what a car knows: places, laps and times."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from sb3_torcs.car import CONTROL_TICK, CarState, FloatArray
+from sb3_torcs.errors import InvalidOption
+from sb3_torcs.scr.protocol import ScrState
+from sb3_torcs.tracks.track import WIDTH_END, WIDTH_START, Track
+
+__all__ = ["CarReader"]
+
+MARGIN = 1.0  # [m] by which a track's length, added up in another way, may differ
+
+
+class CarReader:
+    """
+    Follows one car, state by state.
+
+    :param track: on which it drives
+    """
+
+    def __init__(self, track: Track) -> None:
+        self._track = track
+
+    def begin(self, state: ScrState) -> CarState:
+        """
+        Take the first state of an episode.
+
+        :param state: the server's
+        :return: the car
+        :raises InvalidOption: if the car is where the track is not
+        """
+        self._before = state
+        self._time = state.lap_time
+        self._laps = 0
+        self._best = 0.0
+        self._tick = CONTROL_TICK
+        self._yaw: float | None = None
+        self._raced = state.distance_raced
+        # The way since the start has six digits of an ever larger number. The place on the lap is
+        # finer; so the other one only says how many laps have to be added to it.
+        self._lap_began = state.distance_raced - state.distance_from_start
+        return self._car(state, 0.0)
+
+    def read(self, state: ScrState, ticks: int) -> CarState:
+        """
+        Take the state at the end of a step.
+
+        :param state: the server's
+        :param ticks: control ticks since the one before
+        :return: the car
+        :raises InvalidOption: if the car is where the track is not
+        """
+        before, self._before = self._before, state
+        duration = state.lap_time - before.lap_time
+        if duration < 0.0:  # a lap has begun
+            # The game's ticks take ten of its steps, or eleven: as those before.
+            duration = self._tick * ticks
+            if state.last_lap_time > 0.0:
+                duration = state.last_lap_time - before.lap_time + state.lap_time
+                self._laps += 1
+                self._best = min(self._best or math.inf, state.last_lap_time)
+        self._tick = duration / ticks
+        self._time += duration
+        raced = self._lap_began + state.distance_from_start
+        if abs(state.distance_raced - raced) > 0.5 * self._track.length:
+            self._lap_began = state.distance_raced - state.distance_from_start
+        return self._car(state, duration)
+
+    def _car(self, state: ScrState, duration: float) -> CarState:
+        """
+        Put the car together.
+
+        :param state: the server's
+        :param duration: of the step [s]
+        """
+        track = self._track
+        distance = state.distance_from_start
+        if distance >= track.length:
+            if distance > track.length + MARGIN:
+                raise InvalidOption(
+                    f"the server's car is {distance:g} m behind the start line, but a lap of "
+                    f"{track.name} has {track.length:.0f} m; give the server's track"
+                )
+            distance = 0.0
+        segment, along = track.find(distance)
+        begin, end = track.table[segment, WIDTH_START : WIDTH_END + 1].tolist()
+        width = begin + (end - begin) * along / track.segments[segment].length
+        offset = 0.5 * width * state.track_position
+        x, y, heading = track.pose_on(segment, along, offset)
+        yaw = math.remainder(heading - state.heading_error, math.tau)
+        turned = 0.0 if self._yaw is None else math.remainder(yaw - self._yaw, math.tau)
+        self._yaw = yaw
+        values = (
+            self._time, x, y, yaw, turned / duration if duration > 0.0 else 0.0,
+            state.speed_x, state.speed_y, state.speed_z, state.height, state.heading_error,
+            offset, width, distance, self._lap_began + state.distance_from_start - self._raced,
+            state.engine_speed, state.gear, state.fuel, state.damage,
+            self._laps, state.lap_time, state.last_lap_time, self._best, state.race_position,
+            _read_only(state.wheel_speeds), _read_only(state.range_finders),
+            _read_only(state.opponents),
+        )  # fmt: skip
+        return CarState._make(values)
+
+
+def _read_only(numbers: tuple[float, ...]) -> FloatArray:
+    """
+    Make an array that nobody can change.
+
+    :param numbers: that it holds
+    """
+    array = np.array(numbers)
+    array.flags.writeable = False
+    return array

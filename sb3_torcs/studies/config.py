@@ -1,0 +1,316 @@
+"""Study files: which agents are to be trained, read and checked before anything starts.
+
+A study is a table of variants by seeds. A variant is an entry of a hyperparameter file of the RL
+Zoo with some of its values changed; a trial is one variant with one seed.
+"""
+
+from __future__ import annotations
+
+import copy
+import os
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import yaml
+
+from sb3_torcs.agents.wrapping import unrebuilt
+from sb3_torcs.errors import StudyError, near_miss
+from sb3_torcs.plain_yaml import read_yaml
+from sb3_torcs.tracks.catalogue import available_tracks, load_track
+from sb3_torcs.training import zoo
+from sb3_torcs.training.zoo_data import as_data
+
+__all__ = ["FIELDS", "Study", "Trial", "merged", "read_study", "track_name"]
+
+REQUIRED = ("name", "seeds", "eval_interval")
+SOURCE = ("algo", "env", "conf_file", "entry", "n_timesteps", "eval_tracks")
+"""What a study says for all its variants, and a variant may say for itself."""
+
+WORDS = ("algo", "env", "conf_file", "entry")
+KEYS = (*REQUIRED, *SOURCE, "variants", "final_tracks")
+ROAD = "road"
+SEEDS = 2**32  # that NumPy takes
+MANY = 10_000  # a larger number of seeds is one seed, without its brackets
+
+FIELDS = (
+    "study", "variant", "seed", "phase", "decisions", "episodes", "wall_s", "cpu_s", "track",
+    "laps", "completes", "lap_times_s", "best_flying_lap_s", "race_time_s", "distance_m", "end",
+    "damage", "return", "kept", "ladder",
+)  # fmt: skip
+"""Columns of the results; ``docs/evaluation.md`` says what they mean."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One variant with one seed: everything that its training depends on."""
+
+    study: str
+    variant: str
+    seed: int
+    algo: str  # as the zoo calls it
+    env_id: str
+    entry: dict[str, Any]  # of a hyperparameter file, changes applied
+    eval_interval: int  # decisions
+    eval_tracks: tuple[str, ...]  # that choose the model
+    final_tracks: tuple[str, ...]  # that the chosen model is measured on
+
+    @property
+    def name(self) -> str:
+        """What its folder is called."""
+        return f"{slug(self.variant)}-seed{self.seed}"
+
+    @property
+    def budget(self) -> int:
+        """Decisions to learn from."""
+        return int(self.entry["n_timesteps"])
+
+    @property
+    def env_kwargs(self) -> dict[str, Any]:
+        """Keyword arguments of the training's environment."""
+        return dict(self.entry.get("env_kwargs") or {})
+
+    def recipe(self) -> dict[str, Any]:
+        """Return what the training depends on: another recipe is another training."""
+        recipe = {**asdict(self), "eval_tracks": list(self.eval_tracks)}
+        del recipe["final_tracks"]
+        return recipe
+
+
+@dataclass(frozen=True)
+class Study:
+    """What a study file asks for."""
+
+    name: str
+    path: Path
+    trials: tuple[Trial, ...]
+
+
+def read_study(path: str | Path) -> Study:
+    """
+    Read a study file, and check all that can be checked without training.
+
+    :param path: of a YAML file; ``docs/evaluation.md`` says what it holds
+    :return: the study
+    :raises StudyError: if the file says something that cannot be done
+    :raises ZooConfigError: if a variant has something that nothing would read
+    :raises TrackNotFound: if there is no such track
+    """
+    file = Path(os.path.expanduser(path))
+    said = _read(file)
+    _check_keys(said, KEYS, f"{file}: unknown key")
+    for key in REQUIRED:
+        if key not in said:
+            raise StudyError(f"{file}: key '{key}' is missing; required: {', '.join(REQUIRED)}")
+    name = said["name"]
+    if not isinstance(name, str) or not slug(name):
+        raise StudyError(f"{file}: name is {name!r}; expected a word, e.g. aalborg")
+    variants = said.get("variants") or {"default": {}}
+    if not isinstance(variants, dict):
+        raise StudyError(f"{file}: variants is {variants!r}; expected 'NAME: {{key: value}}'")
+    seeds = _seeds(said["seeds"], file)
+    trials = tuple(
+        trial
+        for variant, changes in variants.items()
+        for trial in _trials(file, said, str(variant), changes or {}, seeds)
+    )
+    names = [trial.name for trial in trials]
+    if len(set(names)) < len(names):
+        raise StudyError(f"{file}: two variants have names that differ in signs only; rename one")
+    return Study(slug(name), file, trials)
+
+
+def merged(entry: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    Change an entry: mappings are merged, ``null`` takes away, all else replaces.
+
+    The list of callbacks is changed by a mapping from dotted paths to arguments: what is not in the
+    list yet is added.
+
+    :param entry: of a hyperparameter file
+    :param changes: to it
+    :return: the new entry
+    """
+    result = copy.deepcopy(dict(entry))
+    for key, value in changes.items():
+        if value is None:
+            if key not in result:
+                raise StudyError(f"null takes '{key}' away, but it is not there; leave it out")
+            del result[key]
+        elif key == "callback" and isinstance(value, Mapping):
+            by_path = merged(_by_path(result.get(key)), value)
+            result[key] = [{path: kwargs} if kwargs else path for path, kwargs in by_path.items()]
+        elif isinstance(value, Mapping) and isinstance(result.get(key), Mapping):
+            result[key] = merged(result[key], value)
+        else:
+            result[key] = copy.deepcopy(value)
+    return result
+
+
+def track_name(track: str) -> str:
+    """
+    Return what a track is called in results.
+
+    :param track: name or path
+    :return: the name without category
+    """
+    return track if track == "random" else load_track(track).name
+
+
+def slug(text: str) -> str:
+    """
+    Make a name that can be a folder's.
+
+    :param text: any
+    :return: letters, digits, dots and hyphens
+    """
+    return re.sub(r"[^\w.]+", "-", text).strip("-.").lower()
+
+
+class _Once(yaml.SafeLoader):
+    """Refuses a key that is there twice; YAML's own loader takes the last of two variants."""
+
+    def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
+        mapping: yaml.MappingNode = super().compose_mapping_node(anchor)
+        seen = set()
+        for key in (key for key, _ in mapping.value if isinstance(key, yaml.ScalarNode)):
+            if key.value in seen:
+                problem = f"key '{key.value}' is there twice; rename one"
+                raise yaml.MarkedYAMLError(problem=problem, problem_mark=key.start_mark)
+            seen.add(key.value)
+        return mapping
+
+
+def _read(file: Path) -> dict[str, Any]:
+    try:
+        if not file.is_file():
+            raise StudyError(f"there is no study file '{file}'; give a .yml file")
+        said = read_yaml(file.read_text(encoding="utf-8"), _Once)
+    except OSError as error:
+        raise StudyError(f"{file} cannot be read: {error.strerror or error}") from error
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark
+        line = f", line {mark.line + 1}" if mark else ""
+        raise StudyError(f"{file}{line}: not YAML: {error.problem or error.context}") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        why = " ".join(str(error).split())
+        raise StudyError(f"{file}: not YAML: {why}") from error
+    if not isinstance(said, dict):
+        raise StudyError(f"{file}: expected 'key: value' lines, got {said!r:.80}")
+    return said
+
+
+def _seeds(value: Any, file: Path) -> list[int]:
+    """Read ``5``, which is 0 to 4, or a list."""
+    if type(value) is int and value > MANY:
+        raise StudyError(f"{file}: seeds is {value}, too many; one seed is a list: [{value}]")
+    seeds = list(range(value)) if type(value) is int else value
+    if (
+        not isinstance(seeds, list)
+        or not seeds
+        or not all(type(seed) is int and 0 <= seed < SEEDS for seed in seeds)
+        or len(set(seeds)) < len(seeds)
+    ):
+        raise StudyError(
+            f"{file}: seeds is {value!r}; expected how many (at least 1), or a list of different "
+            "whole numbers from 0 to 2**32 - 1, e.g. [0, 1, 2]"
+        )
+    return seeds
+
+
+def _trials(
+    file: Path, said: Mapping[str, Any], variant: str, changes: Any, seeds: Sequence[int]
+) -> Iterable[Trial]:
+    """Read one variant."""
+    place = zoo.Place(file, f"variants: {variant}")
+    if not isinstance(changes, dict) or not slug(variant):
+        raise StudyError(f"{place}: expected 'NAME: {{key: value}}', got {changes!r}")
+    source = _source(said, changes, place)
+    algo, env_id = source["algo"] or "ddpg", source["env"] or "Torcs-v0"
+    zoo.check_racing(env_id)
+    conf_file = source["conf_file"] and file.parent / Path(os.path.expanduser(source["conf_file"]))
+    entry = zoo.read_entry(zoo.config_file(algo, conf_file), source["entry"] or env_id)
+    if source["n_timesteps"] is not None:
+        entry["n_timesteps"] = source["n_timesteps"]
+    try:
+        entry = merged(entry, {key: value for key, value in changes.items() if key not in SOURCE})
+    except StudyError as error:
+        raise StudyError(f"{place}: {error}") from None
+    entry = as_data(entry)
+    zoo.check_entry(entry, algo, env_id, place)
+    entry["n_timesteps"] = zoo.decisions(entry)
+    _check_evaluable(entry, place)
+    interval = said["eval_interval"]
+    if type(interval) is not int or interval < 1:
+        raise StudyError(f"{file}: eval_interval is {interval!r}; expected decisions, e.g. 5000")
+    env_kwargs = entry.get("env_kwargs") or {}
+    own = env_kwargs.get("track", "aalborg")
+    given = source["eval_tracks"]
+    eval_tracks = _tracks(own if given is None else given, f"{place}: eval_tracks")
+    final_tracks = eval_tracks
+    if said.get("final_tracks") is not None:
+        chosen = _tracks(said["final_tracks"], f"{file}: final_tracks")
+        final_tracks = _united(eval_tracks, chosen)
+    gym.make(env_id, **env_kwargs).close()
+    for seed in seeds:
+        yield Trial(
+            slug(said["name"]), variant, seed, algo, env_id, copy.deepcopy(entry), interval,
+            eval_tracks, final_tracks,
+        )  # fmt: skip
+
+
+def _source(
+    said: Mapping[str, Any], changes: Mapping[str, Any], place: zoo.Place
+) -> dict[str, Any]:
+    """Collect what a variant says for itself, or the study for all."""
+    source = {key: changes.get(key, said.get(key)) for key in SOURCE}
+    for key in WORDS:
+        if not isinstance(source[key], str | None):
+            raise StudyError(f"{place}: {key} is {source[key]!r}; expected a word")
+    return source
+
+
+def _check_evaluable(entry: Mapping[str, Any], place: zoo.Place) -> None:
+    """Make sure that evaluations can be driven in the training's environment."""
+    reason = unrebuilt(entry)
+    if reason is not None:
+        raise StudyError(f"{place}: {reason}; or take it away: 'vec_env_wrapper: null'")
+
+
+def _tracks(value: Any, what: str) -> tuple[str, ...]:
+    """Read a list of tracks, or ``road``: all that there are of that kind."""
+    if value == ROAD:
+        return tuple(f"{s.category}/{s.name}" for s in available_tracks() if s.category == ROAD)
+    tracks = [value] if isinstance(value, str) else value
+    listed = isinstance(tracks, list) and all(isinstance(track, str) for track in tracks)
+    if not listed or not tracks:
+        raise StudyError(f"{what} is {value!r}; expected a list of tracks, or '{ROAD}' for all")
+    names = [track_name(track) for track in tracks]
+    if len(set(names)) < len(names):
+        raise StudyError(f"{what}: {', '.join(names)}: one is there twice; take it out")
+    return tuple(tracks)
+
+
+def _united(one: Sequence[str], other: Sequence[str]) -> tuple[str, ...]:
+    """Put two lists of tracks together; a track may have another name in each."""
+    named = {track_name(track): track for track in (*one, *other)}
+    return tuple(named.values())
+
+
+def _check_keys(mapping: Mapping[str, Any], known: Sequence[str], what: str) -> None:
+    for key in mapping:
+        if key not in known:
+            hint = near_miss(str(key), known)
+            raise StudyError(f"{what} '{key}'{hint} allowed: {', '.join(known)}")
+
+
+def _by_path(callbacks: Any) -> dict[str, Any]:
+    """Turn any of the zoo's forms of a list of callbacks into arguments by dotted path."""
+    items = callbacks if isinstance(callbacks, list) else [] if callbacks is None else [callbacks]
+    result: dict[str, Any] = {}
+    for item in items:
+        result.update({item: {}} if isinstance(item, str) else item)
+    return result

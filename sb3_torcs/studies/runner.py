@@ -1,0 +1,328 @@
+"""Studies: every variant with every seed, as trials of Ray Tune on the local cores or a cluster.
+
+Whatever a trial has come to goes to the study's folder, an actor beside the driver. A trial that is
+begun again, because its worker was lost or the whole study was killed, asks the folder what there
+is and goes on from there; workers need no disk of their own.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import signal
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from sb3_torcs.errors import OutputNotWritable, RayUnavailable, StudyError
+from sb3_torcs.signals import answered
+from sb3_torcs.studies.config import Study, Trial
+from sb3_torcs.studies.storage import Files, StudyFolder
+
+__all__ = ["Progress", "require_ray", "run_study", "run_trial"]
+
+RETRIES = 3  # of a trial whose worker was lost or whose code failed, per run of the command
+SESSION = ".session"  # where a killed run's temporary files are
+SCRATCH = "st-"  # what folders with temporary files are called: short, since sockets lie in them
+MARK = ".of-a-study"  # a file that says so
+PRIVATE = "sb3_torcs_study"  # a resource by which a study's own Ray is known to others
+FAILED = "failed"  # the phase of a row that tells of a mistake instead of a race
+
+Progress = Callable[[Trial, dict[str, Any]], None]
+"""Called with a trial and the last of its rows, or with ``{"state": …}``."""
+
+QUIET = {
+    "RAY_AIR_NEW_OUTPUT": "0",
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
+    "RAY_CHDIR_TO_TRIAL_DIR": "0",
+    "TUNE_DISABLE_AUTO_CALLBACK_LOGGERS": "1",
+    "TUNE_WARN_THRESHOLD_S": "1000000",
+}
+"""Ray shall phone nobody, write no logs of its own, and leave the working folder alone."""
+
+
+IMPATIENT = {"RAY_NUM_REDIS_GET_RETRIES": "1"}
+"""A cluster that does not answer is told within a minute; Ray would try for eight."""
+
+
+def run_trial(trial: Trial, place: Any, report: Callable[[dict[str, Any]], None]) -> None:
+    """
+    Train and measure one agent, or go on with it.
+
+    :param trial: which one
+    :param place: a :class:`~sb3_torcs.studies.storage.StudyFolder`, or what stands for one on
+        another machine
+    :param report: called with the newest row
+    """
+    from sb3_torcs.studies.trial import Training, final_row
+
+    files, over, missing = place.state(trial)
+    if not over:
+        with _unpacked(files) as checkpoint:
+            training = Training(trial, checkpoint)
+
+        def after_slice() -> None:
+            with tempfile.TemporaryDirectory() as scratch:
+                training.save(Path(scratch))
+                packed = {file.name: file.read_bytes() for file in Path(scratch).iterdir()}
+            place.put(trial, packed, training.rows)
+            report(training.rows[-1])
+
+        with contextlib.closing(training):
+            training.run(after_slice)
+        files, _, missing = place.state(trial)
+    chosen = [row for row in place.rows(trial) if row["phase"] == "train" and row["kept"]][-1]
+    with _unpacked(files) as folder:
+        assert folder is not None
+        model = folder / "best_model.zip"
+        for track in missing:
+            row = final_row(trial, model, track, chosen)
+            place.put_finals(trial, [row])
+    if missing:
+        report(row)
+
+
+@contextlib.contextmanager
+def _unpacked(files: Files | None) -> Iterator[Path | None]:
+    """Put files into a folder for a while."""
+    if files is None:
+        yield None
+        return
+    with tempfile.TemporaryDirectory() as scratch:
+        for name, content in files.items():
+            (Path(scratch) / name).write_bytes(content)
+        yield Path(scratch)
+
+
+def run_study(
+    study: Study,
+    folder: Path,
+    *,
+    jobs: int | None = None,
+    address: str | None = None,
+    progress: Progress | None = None,
+) -> Path:
+    """
+    Run what is left of a study.
+
+    :param study: what is to be run
+    :param folder: of the study; what is there of it is not done again
+    :param jobs: trials at a time on this machine; by default one per core
+    :param address: of a Ray cluster that this machine belongs to; ``None`` uses this machine alone
+    :param progress: called when a trial has something new
+    :return: the table of the results
+    :raises RayUnavailable: if Ray is missing, or the cluster does not answer
+    :raises StudyError: if the folder is of another study, or in use, or if a variant cannot be
+        built
+    """
+    require_ray(address)
+    tell = progress or _nobody
+    place = StudyFolder(folder, study)
+    with place.locked():
+        _remove_scratch(place.path / SESSION)  # of a run that was killed
+        left = [trial for trial in study.trials if not place.ended(trial)]
+        for trial in {trial.variant: trial for trial in left}.values():
+            _check_buildable(trial)
+        place.begin()
+        place.write_results()
+        for trial in study.trials:
+            for row in place.rows(trial):
+                tell(trial, row)
+            if trial not in left:
+                tell(trial, {"state": "done"})
+        if left:
+            with _ray(place, jobs, address) as scratch:
+                _tune(left, place, scratch, tell)
+    return place.results
+
+
+def _check_buildable(trial: Trial) -> None:
+    """Build the agent of a trial, so that a wrong value is told before anything is trained."""
+    from sb3_torcs.studies.trial import Training
+
+    try:
+        Training(trial).close()
+    except Exception as error:
+        raise StudyError(f"variant '{trial.variant}' cannot be trained: {error}") from error
+
+
+def require_ray(address: str | None = None) -> None:
+    """
+    Make sure that Ray can be imported, and that it will be quiet.
+
+    :param address: of a cluster that is to be joined
+    :raises RayUnavailable: if it is not installed, or the address is none of a cluster
+    """
+    if address is not None and address.startswith("ray://"):
+        raise RayUnavailable(
+            f"'{address}' is for clients outside of a cluster; type the command on one of its "
+            "machines, with --address auto"
+        )
+    settings = QUIET if address is None else {**QUIET, **IMPATIENT}
+    for name, value in settings.items():
+        os.environ.setdefault(name, value)
+    try:
+        import ray.tune  # noqa: F401
+    except ImportError as error:
+        raise RayUnavailable(
+            f"a study needs Ray Tune, which does not import ({error}); type: "
+            'pip install "sb3-torcs[study]" (in a clone: pip install ".[study]")'
+        ) from error
+
+
+@contextlib.contextmanager
+def _ray(place: StudyFolder, jobs: int | None, address: str | None) -> Iterator[Path]:
+    """Start Ray or join a cluster, with a folder for temporary files, and clean up."""
+    import ray
+
+    session = place.path / SESSION
+    scratch = Path(tempfile.mkdtemp(prefix=SCRATCH))
+    options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
+    if address is None:
+        options.update(
+            address="local", num_cpus=jobs or len(os.sched_getaffinity(0)),
+            include_dashboard=False, _temp_dir=str(scratch), resources={PRIVATE: 1},
+        )  # fmt: skip
+    else:
+        options["address"] = address
+    try:
+        try:
+            (scratch / MARK).touch()
+            session.write_text(str(scratch), encoding="utf-8")
+            ray.init(**options)
+        except (OSError, RuntimeError, ValueError) as error:
+            raise RayUnavailable(
+                f"Ray does not start in '{scratch}' ({error}); is there room, and the path short? "
+                "Otherwise choose another place: TMPDIR=/tmp"
+                if address is None
+                else f"no Ray cluster at '{address}' ({error}); start one with `ray start --head` "
+                "and give the address that it prints, or leave --address out"
+            ) from error
+        if address is not None and PRIVATE in ray.cluster_resources():
+            raise RayUnavailable(
+                f"the Ray at '{address}' belongs to another study, and ends with it; leave "
+                "--address out, or start a cluster with `ray start --head`"
+            )
+        # Tune knows Ctrl-C; SIGTERM Ray would take for a crash.
+        with answered(lambda *_: signal.raise_signal(signal.SIGINT), signal.SIGTERM):
+            yield scratch
+    finally:
+        ray.shutdown()
+        shutil.rmtree(scratch, ignore_errors=True)
+        session.unlink(missing_ok=True)
+
+
+def _remove_scratch(session: Path) -> None:
+    """Remove a run's temporary files, and nothing else, whatever the file that names them says."""
+    if not session.is_file():
+        return
+    with contextlib.suppress(OSError, ValueError):  # damaged, or naming what cannot be
+        folder = Path(session.read_text(encoding="utf-8"))
+        if (folder / MARK).is_file():
+            shutil.rmtree(folder, ignore_errors=True)
+    session.unlink()
+
+
+def _tune(trials: list[Trial], place: StudyFolder, scratch: Path, progress: Progress) -> None:
+    """Let Ray Tune run the trials."""
+    import ray
+    from ray import tune
+    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+    here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=False)
+    folder = ray.remote(StudyFolder).options(num_cpus=0, scheduling_strategy=here)
+    actor = folder.remote(place.path, place.study)
+
+    def trainable(config: dict[str, Any]) -> None:
+        if scratch.is_dir():  # on this machine: what a killed worker leaves is removed with it
+            tempfile.tempdir = str(scratch)
+        _run_or_tell(trials[config["trial"]], _Remote(actor), tune.report)
+
+    here_only = _HereOnly(progress)
+
+    class Watch(tune.Callback):
+        """Hands what Tune hears on to whoever watches."""
+
+        def on_trial_start(self, **heard: Any) -> None:
+            here_only.call(trials[heard["trial"].config["trial"]], {"state": "running"})
+
+        def on_trial_result(self, **heard: Any) -> None:
+            trial, row = trials[heard["trial"].config["trial"]], heard["result"]
+            here_only.call(trial, row)
+            if row["phase"] == "final":
+                here_only.call(trial, {"state": "done"})
+            elif row["phase"] == FAILED:
+                here_only.call(trial, {"state": "failed"})
+
+    results = tune.Tuner(
+        tune.with_resources(trainable, {"cpu": 1}),
+        param_space={"trial": tune.grid_search(list(range(len(trials))))},
+        run_config=tune.RunConfig(
+            name="trials",
+            storage_path=str(scratch),
+            verbose=0,
+            callbacks=[Watch()],
+            failure_config=tune.FailureConfig(max_failures=RETRIES),
+        ),
+    ).fit()
+    # One that Ctrl-C found waiting for its turn has no config.
+    found = [results[number] for number in range(len(results))]
+    errors = {result.config["trial"]: _error(result) for result in found if result.config}
+    for number, trial in enumerate(trials):
+        if place.ended(trial):
+            progress(trial, {"state": "done"})
+        elif errors.get(number) is None:
+            progress(trial, {"state": "stopped"})
+        else:
+            progress(trial, {"state": "failed", "error": errors[number]})
+
+
+def _run_or_tell(trial: Trial, place: Any, report: Callable[[dict[str, Any]], None]) -> None:
+    """Run a trial; what another worker would fail of, too, is a last row and no error to Tune."""
+    try:
+        run_trial(trial, place, report)
+    except (StudyError, OutputNotWritable) as error:
+        report({"phase": FAILED, "error": _last_line(error)})
+
+
+def _nobody(trial: Trial, row: dict[str, Any]) -> None:
+    """Watch nothing."""
+    del trial, row
+
+
+def _error(result: Any) -> str | None:
+    """Say why a trial has failed: in its own words, or in the last of a worker's traceback."""
+    if result.error is not None:
+        return _last_line(result.error)
+    said: str | None = (result.metrics or {}).get("error")
+    return said
+
+
+def _last_line(error: Exception) -> str:
+    """Return what a worker's traceback ends with."""
+    return str(error).strip().splitlines()[-1]
+
+
+class _HereOnly:
+    """A function that is left behind when Tune pickles all that it was given."""
+
+    def __init__(self, call: Callable[..., None] | None = None) -> None:
+        self.call: Any = call
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (_HereOnly, ())
+
+
+class _Remote:
+    """An actor that is called like the object that it is."""
+
+    def __init__(self, actor: Any) -> None:
+        self._actor = actor
+
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        import ray
+
+        return lambda *args: ray.get(getattr(self._actor, name).remote(*args))

@@ -1,0 +1,345 @@
+"""The folder of a study: what there is of each trial, written so that a kill breaks nothing.
+
+::
+
+    FOLDER/
+      results.csv                 all rows of all trials
+      VARIANT-seed0/
+        recipe.yml                what the training depends on
+        rows.json                 of the evaluations so far
+        best_model.zip, …         what `sb3-torcs evaluate` reads
+        checkpoint-000012/        to go on from; gone when the training is over
+"""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import fcntl
+import io
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from sb3_torcs.agents.models import BEST_MODEL
+from sb3_torcs.errors import OutputNotWritable, StudyError
+from sb3_torcs.plain_yaml import read_yaml
+from sb3_torcs.studies.config import FIELDS, Study, Trial, track_name
+
+__all__ = ["RECIPE", "RESULTS", "ROWS", "Files", "StudyFolder", "write_whole"]
+
+Files = dict[str, bytes]
+"""Contents of files by name."""
+
+RESULTS = "results.csv"
+RECIPE, ROWS, LOCK = "recipe.yml", "rows.json", ".lock"
+CHECKPOINT = "checkpoint-"
+FOR_DRIVERS = (BEST_MODEL, "vecnormalize.pkl", "config.yml", "args.yml")
+
+
+class StudyFolder:
+    """
+    What a study has come to.
+
+    :param path: of the folder; it is made
+    :param study: that is run in it
+    """
+
+    def __init__(self, path: Path, study: Study) -> None:
+        self.path = path
+        self.study = study
+        path.mkdir(parents=True, exist_ok=True)
+
+    @property
+    def results(self) -> Path:
+        """The table of all rows."""
+        return self.path / RESULTS
+
+    @contextlib.contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keep others out; a killed process lets go of the lock by itself."""
+        with (self.path / LOCK).open("w") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise StudyError(
+                    f"another process runs the study in '{self.path}'; wait for it, or give "
+                    "another --folder"
+                ) from error
+            try:
+                yield
+            finally:
+                with contextlib.suppress(OSError):
+                    if [item.name for item in self.path.iterdir()] == [LOCK]:
+                        shutil.rmtree(self.path)  # nothing was begun
+
+    def of(self, trial: Trial) -> Path:
+        """
+        Return the folder of a trial.
+
+        :param trial: of the study
+        :return: where its files are
+        """
+        return self.path / trial.name
+
+    def begin(self) -> None:
+        """
+        Make a folder for each trial, and make sure that those that are there are of this study.
+
+        :raises StudyError: if the folder is of another study, or if a trial was begun with another
+            recipe
+        """
+        for file in self.path.glob(f"*/{RECIPE}"):
+            other = _parsed(file, _recipe)["study"]
+            if other != self.study.name:
+                raise StudyError(
+                    f"'{self.path}' holds the study '{other}'; give another --folder for "
+                    f"'{self.study.name}'"
+                )
+        for trial in self.study.trials:
+            file = self.of(trial) / RECIPE
+            recipe = trial.recipe()
+            if not file.is_file():
+                write_whole(file, yaml.safe_dump(recipe, sort_keys=False).encode())
+                continue
+            before = _parsed(file, _recipe)
+            if before != recipe:
+                raise StudyError(
+                    f"'{file.parent}' was begun with another {_difference(before, recipe)}; give "
+                    "another --folder, or remove that one to begin it anew"
+                )
+            needed = BEST_MODEL if self.trained(trial) else f"{CHECKPOINT}*"
+            if self.rows(trial) and not any(self.of(trial).glob(needed)):
+                raise StudyError(
+                    f"'{file.parent}' has lost its {needed}; remove that folder to begin this "
+                    "agent anew"
+                )
+
+    def rows(self, trial: Trial) -> list[dict[str, Any]]:
+        """
+        Read the evaluations of a trial.
+
+        :param trial: of the study
+        :return: its rows, those during the training first
+        """
+        return _rows(self.of(trial) / ROWS)
+
+    def trained(self, trial: Trial) -> bool:
+        """
+        Say whether the training of a trial is over.
+
+        :param trial: of the study
+        :return: whether all its decisions were learned from
+        """
+        learned = [row["decisions"] for row in self.rows(trial) if row["phase"] == "train"]
+        return bool(learned) and learned[-1] >= trial.budget
+
+    def missing(self, trial: Trial) -> list[str]:
+        """
+        List the tracks on which the best model was not measured yet.
+
+        :param trial: of the study
+        :return: tracks, as the study file calls them
+        """
+        done = {row["track"] for row in self.rows(trial) if row["phase"] == "final"}
+        return [track for track in trial.final_tracks if track_name(track) not in done]
+
+    def ended(self, trial: Trial) -> bool:
+        """
+        Say whether there is nothing left to do for a trial.
+
+        :param trial: of the study
+        :return: whether it is trained and measured
+        """
+        return self.trained(trial) and not self.missing(trial)
+
+    def checkpoint(self, trial: Trial) -> Path | None:
+        """
+        Find what a trial goes on from.
+
+        :param trial: of the study
+        :return: a folder; ``None`` if the trial has not come so far
+        """
+        return max(self.of(trial).glob(f"{CHECKPOINT}*"), default=None)
+
+    def state(self, trial: Trial) -> tuple[Files | None, bool, list[str]]:
+        """
+        Tell what there is of a trial.
+
+        :param trial: of the study
+        :return: the files to go on from, if any; whether the training is over; tracks on which the
+            best model is still to be measured
+        """
+        over = self.trained(trial)
+        source = self.of(trial) if over else self.checkpoint(trial)
+        files = None
+        if source is not None:
+            files = {file.name: file.read_bytes() for file in source.iterdir() if file.is_file()}
+        return files, over, self.missing(trial)
+
+    def put(self, trial: Trial, files: Mapping[str, bytes], rows: list[dict[str, Any]]) -> None:
+        """
+        Write the newest state of a trial, and take the one before away.
+
+        :param trial: of the study
+        :param files: of its checkpoint
+        :param rows: of its evaluations so far
+        :raises StudyError: if the trial is already as far: two workers drive it
+        :raises OutputNotWritable: if there is no room; the state before is still there
+        """
+        if len(rows) <= len(self.rows(trial)):
+            raise StudyError(f"{trial.name} has come farther elsewhere; this worker is not needed")
+        folder = self.of(trial)
+        over = rows[-1]["decisions"] >= trial.budget
+        before = [*folder.glob(f"{CHECKPOINT}*"), *folder.glob(f".{CHECKPOINT}*")]
+        if not over:
+            aside = folder / f".{CHECKPOINT}new"
+            shutil.rmtree(aside, ignore_errors=True)
+            try:
+                for file, content in files.items():
+                    write_whole(aside / file, content)
+                aside.rename(folder / f"{CHECKPOINT}{len(rows):06d}")
+            except OSError:
+                shutil.rmtree(aside, ignore_errors=True)  # it may be what fills the disk
+                raise
+        for file in FOR_DRIVERS:
+            if file in files:
+                write_whole(folder / file, files[file])
+        write_whole(folder / ROWS, json.dumps(rows).encode())
+        for old in before:
+            shutil.rmtree(old, ignore_errors=True)
+        self.write_results()
+
+    def put_finals(self, trial: Trial, rows: Iterable[dict[str, Any]]) -> None:
+        """
+        Add the final measurements of a trial.
+
+        :param trial: of the study
+        :param rows: one per track
+        """
+        done = self.rows(trial)
+        known = {row["track"] for row in done if row["phase"] == "final"}
+        done += [row for row in rows if row["track"] not in known]
+        write_whole(self.of(trial) / ROWS, json.dumps(done).encode())
+        self.write_results()
+
+    def write_results(self) -> None:
+        """
+        Write all rows into one table, in the order of the study file.
+
+        Those of trials that the file names no more come last.
+        """
+        named = [self.of(trial) / ROWS for trial in self.study.trials]
+        others = sorted(set(self.path.glob(f"*/{ROWS}")).difference(named))
+        table = io.StringIO()
+        writer = csv.writer(table, lineterminator="\n")
+        writer.writerow(FIELDS)
+        for file in (*named, *others):
+            writer.writerows([_cell(row[field]) for field in FIELDS] for row in _rows(file))
+        write_whole(self.results, table.getvalue().encode())
+
+
+def _rows(file: Path) -> list[dict[str, Any]]:
+    rows: list[dict[str, Any]] = _parsed(file, _table) if file.is_file() else []
+    return rows
+
+
+NUMBER, MAYBE = (int, float), (int, float, type(None))
+KINDS: dict[str, tuple[type, ...]] = {
+    **dict.fromkeys(("study", "variant", "phase", "track", "end", "ladder"), (str,)),
+    **dict.fromkeys(("seed", "decisions", "episodes", "laps"), (int,)),
+    **dict.fromkeys(("wall_s", "cpu_s", "distance_m", "damage", "return"), NUMBER),
+    **dict.fromkeys(("best_flying_lap_s", "race_time_s"), MAYBE),
+    **dict.fromkeys(("completes", "kept"), (bool,)),
+    "lap_times_s": (list,),
+}
+"""What the values of a row are."""
+
+
+def _table(text: str) -> list[dict[str, Any]]:
+    rows: Any = json.loads(text)
+    if not isinstance(rows, list) or any(set(FIELDS) - set(row) for row in rows):
+        raise ValueError(f"expected a list of rows with {', '.join(FIELDS)}")
+    for number, row in enumerate(rows):
+        for field in FIELDS:
+            if not isinstance(row[field], KINDS[field]):
+                raise ValueError(f"row {number}: {field} is {_short(row[field])}")
+    return rows
+
+
+def _short(value: Any) -> str:
+    """Show a value, or the beginning of a long one."""
+    text = repr(value)
+    return text if len(text) <= 40 else f"{text[:40]}…"
+
+
+def _recipe(text: str) -> dict[str, Any]:
+    recipe: Any = read_yaml(text)
+    if not isinstance(recipe, dict) or "study" not in recipe:
+        raise ValueError("expected 'key: value' lines, study among them")
+    return recipe
+
+
+def _difference(before: Any, after: Any) -> str:
+    """Name the keys in which two recipes differ, as deep as they are mappings."""
+    if not isinstance(before, dict) or not isinstance(after, dict):
+        return f"(it was {before!r})"
+    changed = []
+    for key in {**after, **before}:
+        one, two = before.get(key), after.get(key)
+        if isinstance(one, dict) and isinstance(two, dict) and one != two:
+            changed.append(f"{key}: {_difference(one, two)}")
+        elif one != two:
+            was = f"it was {one!r}" if key in before else "it was not there"
+            changed.append(f"{key} ({was})")
+    return ", ".join(changed)
+
+
+def _cell(value: Any) -> Any:
+    """Write lists of lap times with spaces, truth as 1 and 0, and nothing as nothing."""
+    if isinstance(value, list):
+        return " ".join(str(item) for item in value)
+    return int(value) if isinstance(value, bool) else value
+
+
+def _parsed(file: Path, parse: Callable[[str], Any]) -> Any:
+    """Read a file that was written here."""
+    try:
+        return parse(file.read_text(encoding="utf-8"))
+    except (OSError, TypeError, ValueError, RecursionError, yaml.YAMLError) as error:
+        why = " ".join(str(error).split())
+        raise StudyError(
+            f"'{file}' cannot be read ({why}); repair it, or remove '{file.parent}' to begin "
+            "this agent anew"
+        ) from error
+
+
+def write_whole(file: Path, content: bytes) -> None:
+    """
+    Write a file that is there whole, or not at all, after a power cut too.
+
+    :param file: to be written, in a folder that is made
+    :param content: of it
+    :raises OutputNotWritable: if that cannot be; what was there before is still there
+    """
+    aside = file.with_name(f".{file.name}")
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            with aside.open("wb") as output:
+                output.write(content)
+                output.flush()
+                os.fsync(output.fileno())
+            aside.replace(file)
+        finally:
+            aside.unlink(missing_ok=True)
+    except OSError as error:
+        raise OutputNotWritable(
+            f"cannot write '{file}': {error.strerror or error}; make room, or give another "
+            "folder, and type the command again: what was written before is kept"
+        ) from error

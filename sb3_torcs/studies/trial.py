@@ -1,0 +1,367 @@
+"""One trial of a study: stock SB3 learns in slices, and can be killed and go on as if nothing was.
+
+A slice is what is learned between two evaluations. At its beginning all chance is seeded by the
+trial's seed and the slice's number, and the cars are put to their start, in an undisturbed training
+too: so what a slice learns depends on nothing but what is in the checkpoint before it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import json
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch as th
+import yaml
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.vec_env import VecNormalize
+
+import sb3_torcs  # noqa: F401  registers the environments, in a worker too
+from sb3_torcs.agents.model_writing import recipe, write_record
+from sb3_torcs.agents.models import BEST_MODEL, Driver, load_driver
+from sb3_torcs.agents.wrapping import frames_of
+from sb3_torcs.errors import StudyError
+from sb3_torcs.evaluation.ladder import rung
+from sb3_torcs.evaluation.protocol import Episode, Merit, evaluate, merit, race_environment
+from sb3_torcs.studies.config import FIELDS, Trial, track_name
+from sb3_torcs.training.manager import command_as_text
+
+__all__ = ["Row", "Training", "final_row"]
+
+Row = dict[str, Any]
+
+LAST_MODEL, MEMORY, STATE = "last_model.zip", "replay.npz", "state.json"
+STATISTICS, BEST_STATISTICS = "statistics.pkl", "vecnormalize.pkl"
+RECORDS = ("config.yml", "args.yml")  # as the zoo writes them: evaluate and watch read them
+
+
+class Training:
+    """
+    One agent that learns.
+
+    :param trial: what is to be learned, and how
+    :param checkpoint: a folder that :meth:`save` has written; ``None`` begins anew
+    :raises StudyError: if the checkpoint cannot be read
+    """
+
+    def __init__(self, trial: Trial, checkpoint: Path | None = None) -> None:
+        th.set_num_threads(1)  # trials run side by side: torch's threads would get in the way
+        self.trial = trial
+        self.rows: list[Row] = []
+        self.episodes = 0  # that have ended, in all training environments together
+        self._best: Merit | None = None
+        self._best_files: dict[str, bytes] = {}
+        self._spent = np.zeros(2)  # [s] of the clock and of the processor, before this process
+        self._races: dict[str, Any] = {}
+        self.model, self.callbacks, self._records = _build(trial)
+        if checkpoint is None:
+            return
+        try:
+            self._load(checkpoint)
+        except Exception as error:  # a broken file can raise anything
+            raise StudyError(
+                f"its checkpoint cannot be read ({type(error).__name__}: {error}); remove the "
+                f"folder {trial.name} of the study to begin that agent anew"
+            ) from error
+
+    @property
+    def slices(self) -> int:
+        """How many slices have been learned from and evaluated."""
+        return len(self.rows) // len(self.trial.eval_tracks)
+
+    @property
+    def normalizer(self) -> VecNormalize | None:
+        """Statistics of the observations, if the entry asks for them."""
+        found: VecNormalize | None = self.model.get_vec_normalize_env()
+        return found
+
+    def run(self, after_slice: Callable[[], None]) -> None:
+        """
+        Learn to the end of the budget.
+
+        :param after_slice: called after each evaluation; may call :meth:`save`
+        :raises StudyError: if a callback stops the training before
+        """
+        remaining = self.trial.budget - self.model.num_timesteps
+        self._clock = _clocks()
+        slices = _Slices(self, after_slice)
+        if remaining > 0:
+            env = self.model.get_env()
+            # Anything but None: SB3 shall not reset the environments, a slice does.
+            self.model._last_obs = np.zeros((env.num_envs, *env.observation_space.shape))
+            self.model.set_logger(Logger(None, []))  # SB3's own leaves an empty folder behind
+            # Slices come last: what others change for a rollout is changed back when one ends.
+            callbacks = [*self.callbacks, slices]
+            # As one learn() to the end, so that schedules fall over the whole budget.
+            self.model.learn(remaining, callback=callbacks, reset_num_timesteps=False)
+            if self.model.num_timesteps < self.trial.budget:
+                raise StudyError(
+                    f"a callback stopped the training at {self.model.num_timesteps} of "
+                    f"{self.trial.budget} decisions; those of a study go to the end of the budget: "
+                    "take that callback away"
+                )
+            slices.end()
+
+    def begin_slice(self) -> None:
+        """Make what follows depend on the seed and the slice's number alone."""
+        model, env = self.model, self.model.get_env()
+        sequence = np.random.SeedSequence((self.trial.seed, self.slices))
+        model.set_random_seed(int(sequence.generate_state(1)[0]))
+        model._last_obs = env.reset()
+        model._last_episode_starts = np.ones(env.num_envs, dtype=bool)
+        if self.normalizer is not None:
+            model._last_original_obs = self.normalizer.get_original_obs()
+        if getattr(model, "action_noise", None) is not None:
+            model.action_noise.reset()
+        if model.use_sde:  # SB3 has drawn it before it called back
+            getattr(model.policy, "actor", model.policy).reset_noise(env.num_envs)
+
+    def end_slice(self, running: np.ndarray) -> None:
+        """
+        Evaluate, and keep the model if it is the best so far.
+
+        :param running: (n_envs,) whether an episode is cut here
+        """
+        self.episodes += int(running.sum())
+        _cut_episodes(self.model, running)
+        races = {track: self._race(track) for track in self.trial.eval_tracks}
+        worth = merit(list(races.values()))
+        kept = self._best is None or worth > self._best
+        if kept:
+            self._best, self._best_files = worth, self._model_files()
+        spent = self._spent + _clocks() - self._clock
+        progress = {
+            "decisions": self.model.num_timesteps,
+            "episodes": self.episodes,
+            "wall_s": round(float(spent[0]), 1),
+            "cpu_s": round(float(spent[1]), 1),
+        }
+        for track, race in races.items():
+            self.rows.append(_row(self.trial, "train", track, race, {**progress, "kept": kept}))
+
+    def save(self, folder: Path) -> None:
+        """
+        Write down all that the rest of the training depends on, and the best model.
+
+        :param folder: an empty one
+        """
+        self._save_model(folder / LAST_MODEL)
+        if getattr(self.model, "replay_buffer", None) is not None:
+            memory: dict[str, Any] = dict(_memory(self.model.replay_buffer))
+            np.savez(folder / MEMORY, **memory)
+        if self.normalizer is not None:
+            self.normalizer.save(str(folder / STATISTICS))
+        for name, content in {**self._best_files, **self._records}.items():
+            (folder / name).write_bytes(content)
+        state = {
+            "rows": self.rows,
+            "episodes": self.episodes,
+            "best": self._best,
+            "spent": list(self._spent + _clocks() - self._clock),
+        }
+        (folder / STATE).write_text(json.dumps(state), encoding="utf-8")
+
+    def close(self) -> None:
+        """Give the environments back."""
+        self.model.get_env().close()
+        for env in self._races.values():
+            env.close()
+
+    def _load(self, folder: Path) -> None:
+        env = self.model.get_env()
+        if (folder / STATISTICS).is_file():
+            env = _with_statistics(env, folder / STATISTICS)
+        self.model = type(self.model).load(folder / LAST_MODEL, env=env, device="cpu")
+        if (folder / MEMORY).is_file():
+            with np.load(folder / MEMORY) as memory:
+                _remember(self.model.replay_buffer, memory)
+        state = json.loads((folder / STATE).read_text(encoding="utf-8"))
+        self.rows, self.episodes = state["rows"], state["episodes"]
+        self._best, self._spent = Merit(*state["best"]), np.array(state["spent"])
+        names = (BEST_MODEL, BEST_STATISTICS)
+        self._best_files = {n: (folder / n).read_bytes() for n in names if (folder / n).is_file()}
+
+    def _race(self, track: str) -> Episode:
+        if track not in self._races:
+            self._races[track] = _race_environment(self.trial, track)
+        driver = Driver(self.model, self.normalizer, frames_of(self.trial.entry))
+        (episode,) = evaluate(self._races[track], driver)
+        return episode
+
+    def _save_model(self, file: Path | io.BytesIO) -> None:
+        trial = self.trial
+        write_record(self.model, recipe(trial.algo, trial.env_id, trial.entry))
+        # A class of memory that SB3 chose itself would be taken for the user's when it is loaded.
+        chosen = "replay_buffer_class" not in self.trial.entry
+        self.model.save(file, exclude=["replay_buffer_class"] if chosen else None)
+
+    def _model_files(self) -> dict[str, bytes]:
+        """Return the present model as files that ``sb3-torcs evaluate`` reads."""
+        buffer = io.BytesIO()
+        self._save_model(buffer)
+        files = {BEST_MODEL: buffer.getvalue()}
+        if self.normalizer is not None:
+            with tempfile.NamedTemporaryFile() as file:
+                self.normalizer.save(file.name)
+                files[BEST_STATISTICS] = Path(file.name).read_bytes()
+        return files
+
+
+class _Slices(BaseCallback):
+    """Divides one ``learn`` into slices, between two rollouts."""
+
+    def __init__(self, training: Training, after_slice: Callable[[], None]) -> None:
+        super().__init__()
+        self.training = training
+        self.after_slice = after_slice
+        self._running = np.zeros(0, dtype=bool)
+        self._number: int | None = None  # of the slice: intervals that lie before it
+
+    def _on_rollout_start(self) -> None:
+        number = self.model.num_timesteps // self.training.trial.eval_interval
+        if number == self._number:
+            return
+        if self._number is not None:
+            self.end()
+        self._number = number
+        self.training.begin_slice()
+
+    def _on_step(self) -> bool:
+        dones = self.locals["dones"]
+        self.training.episodes += int(dones.sum())
+        self._running = ~dones.astype(bool)
+        return True
+
+    def end(self) -> None:
+        """End a slice."""
+        self.training.end_slice(self._running)
+        self.after_slice()
+
+
+def final_row(trial: Trial, model: Path, track: str, progress: Row) -> Row:
+    """
+    Measure a trial's best model on one track, in a fresh evaluation.
+
+    :param trial: whose model it is
+    :param model: the file, its records beside it
+    :param track: to drive on
+    :param progress: the row of the evaluation that the model was kept for
+    :return: a row of the results
+    """
+    env = _race_environment(trial, track)
+    try:
+        (race,) = evaluate(env, load_driver(model, env, trial.algo))
+    finally:
+        env.close()
+    kept_at = {name: progress[name] for name in ("decisions", "episodes", "wall_s", "cpu_s")}
+    return _row(trial, "final", track, race, {**kept_at, "kept": True})
+
+
+def _with_statistics(env: Any, file: Path) -> Any:
+    """Put saved statistics where new ones are, which may be below stacked frames."""
+    if isinstance(env, VecNormalize):
+        return VecNormalize.load(str(file), env.venv)
+    env.venv = _with_statistics(env.venv, file)
+    return env
+
+
+def _race_environment(trial: Trial, track: str) -> Any:
+    """Build the environment of an evaluation; a study's wrappers are those of who started it."""
+    return race_environment(
+        trial.env_id, trial.env_kwargs, track, hyperparameters=trial.entry, trust=True
+    )
+
+
+def _row(trial: Trial, phase: str, track: str, race: Episode, more: Row) -> Row:
+    """Write one race down."""
+    name = track_name(track)
+    row = {
+        "study": trial.study,
+        "variant": trial.variant,
+        "seed": trial.seed,
+        "phase": phase,
+        "track": name,
+        "laps": race.laps,
+        "completes": race.finished,
+        "lap_times_s": [round(seconds, 3) for seconds in race.lap_times],
+        "best_flying_lap_s": race.flying_lap and round(race.flying_lap, 3),
+        "race_time_s": round(race.race_time, 3) if race.finished else None,
+        "distance_m": round(race.distance, 3),
+        "end": race.end,
+        "damage": race.damage,
+        "return": race.episode_return,
+        "ladder": rung(race, trial.env_id, trial.env_kwargs.get("car", "car1-trb1"), name),
+        **more,
+    }
+    return {field: row[field] for field in FIELDS}
+
+
+def _clocks() -> np.ndarray:
+    return np.array([time.perf_counter(), time.process_time()])
+
+
+def _build(trial: Trial) -> tuple[Any, list[BaseCallback], dict[str, bytes]]:
+    """
+    Let the RL Zoo build algorithm, environments and callbacks.
+
+    :param trial: what to build
+    :return: them, and the zoo's records by file name
+    """
+    from rl_zoo3.exp_manager import ExperimentManager
+
+    with tempfile.TemporaryDirectory() as scratch, contextlib.redirect_stdout(io.StringIO()):
+        conf_file = Path(scratch) / "entry.yml"
+        conf_file.write_text(yaml.safe_dump({trial.env_id: trial.entry}), encoding="utf-8")
+        words = argparse.Namespace(algo=trial.algo, env=trial.env_id, seed=trial.seed)
+        manager = ExperimentManager(
+            words, trial.algo, trial.env_id, scratch, eval_freq=-1, seed=trial.seed, verbose=0,
+            device="cpu", config=str(conf_file),
+        )  # fmt: skip
+        with command_as_text():
+            model, _ = manager.setup_experiment()
+        folder = Path(manager.params_path)
+        records = {name: (folder / name).read_bytes() for name in RECORDS}
+    return model, manager.callbacks, records
+
+
+def _cut_episodes(model: Any, running: np.ndarray) -> None:
+    """
+    Let the replay buffer know that these episodes end here, as by a time limit.
+
+    Otherwise returns over several steps would reach into the next episode.
+    """
+    buffer = getattr(model, "replay_buffer", None)
+    if buffer is not None and buffer.handle_timeout_termination:
+        buffer.dones[buffer.pos - 1, running] = True
+        buffer.timeouts[buffer.pos - 1, running] = True
+
+
+def _rings(buffer: Any) -> dict[str, np.ndarray]:
+    """Return the arrays of a replay buffer that have one row per step."""
+    return {
+        name: value
+        for name, value in vars(buffer).items()
+        if isinstance(value, np.ndarray) and value.shape[:1] == (buffer.buffer_size,)
+    }
+
+
+def _memory(buffer: Any) -> dict[str, np.ndarray]:
+    """Return what a replay buffer holds; the rows that it never filled are left out."""
+    rows = buffer.size()
+    rings = {name: ring[:rows] for name, ring in _rings(buffer).items()}
+    return {**rings, "pos": np.array(buffer.pos), "full": np.array(buffer.full)}
+
+
+def _remember(buffer: Any, memory: Any) -> None:
+    """Fill a new replay buffer with what another one held."""
+    for name, ring in _rings(buffer).items():
+        ring[: len(memory[name])] = memory[name]
+    buffer.pos, buffer.full = int(memory["pos"]), bool(memory["full"])

@@ -1,0 +1,264 @@
+"""What the game reads before a race: its description, and that of the SCR server's drivers."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+from xml.etree import ElementTree
+
+from sb3_torcs.car import MANY_LAPS, checked_laps
+from sb3_torcs.errors import GameIncomplete, InvalidOption
+from sb3_torcs.torcs.installation import Game
+
+__all__ = [
+    "RACE_FILE",
+    "SCR_DRIVERS",
+    "SCR_SERVER",
+    "SESSIONS",
+    "RaceSetup",
+    "Session",
+    "session_for",
+    "write_race",
+]
+
+Session = Literal["practice", "race"]
+SESSIONS: Mapping[str, str] = {"practice": "practice", "race": "quickrace"}
+"""The game's own descriptions of the sessions; all but track, drivers and laps stays as there."""
+
+RACE_FILE = "race.xml"  # names the folder of the results, too
+ENGINE_SETTINGS = "config/raceengine.xml"
+
+SCR_SERVER = "scr_server"
+"""The module whose drivers are clients of the SCR protocol."""
+SCR_DRIVERS = 10  # of the module, as that of the championship had
+
+
+def session_for(drivers: Sequence[tuple[str, int]]) -> Session:
+    """
+    Say which session a number of drivers calls for.
+
+    :param drivers: names and indices
+    :return: ``"practice"`` for one, ``"race"`` for several
+    """
+    return "race" if len(drivers) > 1 else "practice"
+
+
+@dataclass(frozen=True)
+class RaceSetup:
+    """
+    Who races where.
+
+    :param track: ``"aalborg"``, ``"road/aalborg"``, or the path of a TORCS XML file
+    :param drivers: modules and indices, the first one at the head of the grid;
+        ``("scr_server", 0)`` is the first of our own module
+    :param laps: to drive
+    :param session: ``"practice"``, for one driver, lap by lap; or ``"race"``
+    :param car: of the drivers of ``scr_server``
+    :raises InvalidOption: if the game would not do that, or would do it wrongly
+    """
+
+    track: str | os.PathLike[str]
+    drivers: Sequence[tuple[str, int]]
+    laps: int = MANY_LAPS
+    session: Session = "practice"
+    car: str = "car1-trb1"
+
+    def __post_init__(self) -> None:
+        if self.session not in SESSIONS:
+            raise InvalidOption(f"session is {self.session!r}; expected {' or '.join(SESSIONS)}")
+        checked_laps(self.laps)
+        drivers = list(self.drivers)
+        if self.session == "practice" and len(drivers) != 1:
+            raise InvalidOption(
+                f"a practice is for one robot, {len(drivers)} are named; choose session 'race'"
+            )
+        if not drivers or len(set(drivers)) < len(drivers):
+            named = ", ".join(f"{name}:{index}" for name, index in drivers) or "none"
+            raise InvalidOption(f"robots are {named}; expected at least one, none of them twice")
+        for name, index in drivers:
+            if name == SCR_SERVER and not 0 <= index < SCR_DRIVERS:
+                raise InvalidOption(
+                    f"{SCR_SERVER} has no driver {index}; expected 0 to {SCR_DRIVERS - 1}"
+                )
+
+    @property
+    def has_clients(self) -> bool:
+        """Whether some drive by the SCR protocol."""
+        return any(name == SCR_SERVER for name, _ in self.drivers)
+
+    def cars(self, game: Game) -> list[str]:
+        """
+        Say who drives which car.
+
+        :param game: the installation
+        :return: the cars of the drivers, in their order
+        """
+        return [
+            self.car if name == SCR_SERVER else game.find_robot(name, index).car
+            for name, index in self.drivers
+        ]
+
+
+def write_race(game: Game, folder: Path, race: RaceSetup) -> str:
+    """
+    Write what the game reads: its own settings, the race, and our drivers if there are any.
+
+    :param game: the installation
+    :param folder: private to the game
+    :param race: who races where; its track by ``category/name``
+    :return: the name that the race goes by in the results
+    :raises GameIncomplete: if the game lacks a file, or has a broken one
+    """
+    settings = folder / ENGINE_SETTINGS
+    settings.parent.mkdir(exist_ok=True)
+    _needed(game, ENGINE_SETTINGS)
+    shutil.copyfile(game.data / ENGINE_SETTINGS, settings)
+    if race.has_clients:
+        _write_scr_drivers(folder, race.car)
+        _forbid_learning(folder, race)
+    template = f"config/raceman/{SESSIONS[race.session]}.xml"
+    _needed(game, template)
+    try:
+        root = ElementTree.parse(game.data / template).getroot()
+        race_name = _text(_section(root, "Races", "1"), "name")
+        _set(_section(root, race_name), "attnum", "laps", str(race.laps))
+        category, _, name = str(race.track).rpartition("/")
+        place = _list(_section(root, "Tracks"), 1)[0]
+        _set(place, "attstr", "name", name)
+        _set(place, "attstr", "category", category)
+        entries = _list(_section(root, "Drivers"), len(race.drivers))
+    except (ElementTree.ParseError, LookupError) as error:
+        raise GameIncomplete(
+            f"{game.data / template} is broken ({error}); type: `sb3-torcs install-torcs`"
+        ) from error
+    for entry, (module, index) in zip(entries, race.drivers, strict=True):
+        _set(entry, "attnum", "idx", str(index))
+        _set(entry, "attstr", "module", module)
+    _write(root, folder / RACE_FILE)
+    return race_name
+
+
+def _write_scr_drivers(folder: Path, car: str) -> None:
+    """
+    Describe the drivers of our module, as the game wants it of a robot.
+
+    :param folder: private to the game
+    :param car: that they drive
+    """
+    root = ElementTree.Element("params", name=SCR_SERVER, type="robotdef")
+    robots = ElementTree.SubElement(root, "section", name="Robots")
+    index = ElementTree.SubElement(robots, "section", name="index")
+    for number in range(SCR_DRIVERS):
+        driver = ElementTree.SubElement(index, "section", name=str(number))
+        texts = {
+            "name": f"{SCR_SERVER} {number}",
+            "team": SCR_SERVER,
+            "author": "sb3_torcs",
+            "car name": car,
+        }
+        for name, value in texts.items():
+            _set(driver, "attstr", name, value)
+        _set(driver, "attnum", "race number", str(number + 1))
+        for channel, value in (("red", "1.0"), ("green", "0.4"), ("blue", "0.0")):
+            _set(driver, "attnum", channel, value)
+    file = folder / "drivers" / SCR_SERVER / f"{SCR_SERVER}.xml"
+    file.parent.mkdir(parents=True)
+    _write(root, file)
+
+
+def _forbid_learning(folder: Path, race: RaceSetup) -> None:
+    """
+    Keep robots from writing down what they learned: after a restart they would drive otherwise.
+
+    :param folder: private to the game
+    :param race: who races where
+    """
+    for module, _ in race.drivers:
+        if module != SCR_SERVER:
+            (folder / "drivers" / module).touch()  # where they would make a folder
+
+
+def _write(root: ElementTree.Element, file: Path) -> None:
+    """
+    Write a file of the game's format.
+
+    :param root: of the document
+    :param file: to write
+    """
+    ElementTree.ElementTree(root).write(file, encoding="UTF-8", xml_declaration=True)
+
+
+def _needed(game: Game, file: str) -> None:
+    """
+    Make sure that a file of the game's data is there.
+
+    :param game: the installation
+    :param file: seen from its data
+    """
+    if not (game.data / file).is_file():
+        raise GameIncomplete(f"there is no {game.data / file}; type: `sb3-torcs install-torcs`")
+
+
+def _section(section: ElementTree.Element, *names: str) -> ElementTree.Element:
+    """
+    Find a section inside another.
+
+    :param section: around it
+    :param names: from the outside in
+    :raises LookupError: naming what is not there
+    """
+    for name in names:
+        inner = next((s for s in section.findall("section") if s.get("name") == name), None)
+        if inner is None:
+            raise LookupError(f"no section '{name}'")
+        section = inner
+    return section
+
+
+def _list(section: ElementTree.Element, entries: int) -> list[ElementTree.Element]:
+    """
+    Give a section numbered entries in place of those it has.
+
+    :param section: to change
+    :param entries: how many
+    :return: the entries
+    """
+    for old in section.findall("section"):
+        section.remove(old)
+    return [
+        ElementTree.SubElement(section, "section", name=str(number))
+        for number in range(1, entries + 1)
+    ]
+
+
+def _set(section: ElementTree.Element, tag: str, name: str, value: str) -> None:
+    """
+    Set a value.
+
+    :param section: to change
+    :param tag: ``attnum`` or ``attstr``
+    :param name: of the value
+    :param value: as text
+    """
+    found = next((a for a in section.findall(tag) if a.get("name") == name), None)
+    if found is None:
+        found = ElementTree.SubElement(section, tag, name=name)
+    found.set("val", value)
+
+
+def _text(section: ElementTree.Element, name: str) -> str:
+    """
+    Read a value.
+
+    :param section: that holds it
+    :param name: of the value
+    :raises LookupError: if it is not there
+    """
+    for attribute in section:
+        if attribute.tag in ("attstr", "attnum") and attribute.get("name") == name:
+            return attribute.get("val", "")
+    raise LookupError(f"no value '{name}' in section '{section.get('name')}'")

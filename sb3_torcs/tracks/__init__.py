@@ -1,0 +1,6 @@
+"""Tracks: straights and arcs, where they come from, and how they are drawn."""
+
+from sb3_torcs.tracks.catalogue import available_tracks, load_track
+from sb3_torcs.tracks.track import Grid, Segment, Surface, Track
+
+__all__ = ["Grid", "Segment", "Surface", "Track", "available_tracks", "load_track"]

@@ -1,0 +1,1 @@
+"""Training with the RL Zoo: hyperparameter files, the run itself, and what is kept of it."""

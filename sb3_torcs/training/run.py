@@ -1,0 +1,359 @@
+"""Training with the RL Zoo: what is asked for, checked, run and kept."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import dataclasses
+import shlex
+import signal
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Any
+
+from sb3_torcs.errors import InvalidOption, OutputNotWritable, WorkerLost
+from sb3_torcs.files import writable_folder
+from sb3_torcs.signals import answered
+
+__all__ = ["Run", "TrainOptions", "train", "train_run"]
+
+if TYPE_CHECKING:
+    from sb3_torcs.training.manager import Manager
+
+EVALUATIONS = 40  # of a whole training, unless --eval-freq says otherwise
+
+
+SHORTEST_EVAL_FREQ = 1000  # decisions
+
+
+PROGRESS = "sb3_torcs.callbacks.RacingProgressCallback"
+
+
+WORKER = "sb3_torcs.training.zoo.UninterruptedWorker"
+
+
+OURS = ("--algo", "--env", "--n-timesteps", "-n", "--log-folder", "-f", "--conf-file", "--uuid")
+"""Words of the zoo that decide where things are; ours say the same."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainOptions:
+    """
+    What to train, and where to put it.
+
+    :param algo: as the RL Zoo calls it
+    :param env: a registered environment
+    :param entry: of the hyperparameter file; ``None`` is the environment's own
+    :param conf_file: hyperparameter file; ``None`` is the shipped one of the algorithm
+    :param track: instead of the entry's
+    :param timesteps: decisions to learn from; ``None`` is what the entry says
+    :param seed: of everything
+    :param folder: gets ``ALGO/ENV_1``, ``ALGO/ENV_2``, ...
+    :param tensorboard: its log folder; ``None`` is ``FOLDER/tensorboard``
+    :param eval_freq: decisions between evaluations; ``None`` is a fortieth of the
+        training, and at least 1000 where it has as many
+    :param eval_episodes: per evaluation
+    :param resume: a saved model (.zip) or a run's folder to go on from
+    :param trust: go on from a model without a record; evaluate strings of the hyperparameter file
+    :param progress: show a progress bar
+    :param zoo_args: further words for the RL Zoo; they win
+    """
+
+    algo: str = "ddpg"
+    env: str = "TorcsLite-v0"
+    entry: str | None = None
+    conf_file: str | Path | None = None
+    track: str | None = None
+    timesteps: int | None = None
+    seed: int = 0
+    folder: str | Path = "logs"
+    tensorboard: str | Path | None = None
+    eval_freq: int | None = None
+    eval_episodes: int = 1
+    resume: str | Path | None = None
+    trust: bool = False
+    progress: bool = True
+    zoo_args: tuple[str, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """What came of a training."""
+
+    folder: Path
+    steps: int  # decisions learned from
+    wanted: int  # decisions that were asked for
+    interrupted: bool
+    last_model: Path | None  # None: the zoo has searched hyperparameters, as its words asked for
+    track: Any  # a name, or a list of them
+
+    @property
+    def best_model(self) -> Path | None:
+        """The best model by evaluation, or the last one if there was no evaluation yet."""
+        best = self.folder / "best_model.zip"
+        return best if best.is_file() else self.last_model
+
+
+def train(options: TrainOptions) -> Path:
+    """
+    Train, and keep the model even if Ctrl-C ends it early.
+
+    :param options: what to train, and where to put it
+    :return: the run's folder: ``best_model.zip``, ``ENV.zip`` (the last one), logs
+    """
+    return train_run(options).folder
+
+
+def train_run(options: TrainOptions) -> Run:
+    """
+    Train, and say how far it came.
+
+    :param options: what to train, and where to put it
+    :return: what came of it
+    :raises ZooConfigError: if the hyperparameters have something that nothing would read
+    :raises InvalidOption: if the words for the zoo cannot be read, or would hide the model
+    :raises OutputNotWritable: if a folder cannot be written
+    """
+    import gymnasium as gym
+
+    from sb3_torcs.agents.wrapping import wrapped
+    from sb3_torcs.training import zoo
+
+    for word in options.zoo_args:
+        if word.partition("=")[0] in OURS:
+            raise InvalidOption(
+                f"'{word}' after -- would hide from sb3-torcs where the model is; before -- there "
+                "are --algo, --env, --timesteps, --folder and --conf-file"
+            )
+    entry, changed = _entry(options)
+    # Made once, so that what is wrong with it is told before anything starts.
+    with contextlib.closing(gym.make(options.env, **changed["env_kwargs"])) as env:
+        resume = _resumed(options, entry, wrapped(env, changed, trust=True), changed)
+    folder = writable_folder(options.folder)
+    tensorboard = _for_tensorboard(options.tensorboard or folder / "tensorboard")
+    wanted = options.timesteps or zoo.decisions(changed)
+    if any(word.endswith("subproc") for word in options.zoo_args):
+        wrappers = entry.get("env_wrapper") or []
+        entry["env_wrapper"] = [*(wrappers if isinstance(wrappers, list) else [wrappers]), WORKER]
+    if options.progress:
+        entry["callback"] = _with_progress(entry.get("callback"))
+    with tempfile.TemporaryDirectory() as scratch:
+        conf_file = _write_entry(Path(scratch) / "zoo.yml", options.env, entry)
+        words = _zoo_words(options, wanted, changed["env_kwargs"])
+        words += ["--conf-file", str(conf_file), "--log-folder", str(folder)]
+        words += ["--tensorboard-log", str(tensorboard)]
+        words += ["--trained-agent", str(resume)] if resume else []
+        track = changed["env_kwargs"].get("track")
+        return _run_zoo(options, [*words, *options.zoo_args], wanted, track)
+
+
+def _for_tensorboard(folder: str | Path) -> Path:
+    """Make a folder that TensorBoard can write to, whose own code takes UTF-8 only."""
+    path = writable_folder(folder)
+    try:
+        str(path.absolute()).encode()
+    except UnicodeEncodeError as error:
+        raise OutputNotWritable(
+            f"TensorBoard cannot write to '{path}', whose name is not UTF-8; give another folder: "
+            "--tensorboard DIR"
+        ) from error
+    return path
+
+
+def _entry(options: TrainOptions) -> tuple[dict[str, Any], dict[str, Any]]:
+    """
+    Read and check the hyperparameters.
+
+    :param options: what to train
+    :return: the entry, and what the zoo will make of it by its own words
+    """
+    from sb3_torcs.training import zoo
+
+    zoo.check_registered(options.env)
+    path = zoo.config_file(options.algo, options.conf_file)
+    name = options.entry or options.env
+    entry = zoo.read_entry(path, name)
+    if options.track is not None:
+        entry["env_kwargs"] = {**(entry.get("env_kwargs") or {}), "track": options.track}
+    changed = {**entry, **_changes(options.zoo_args)}
+    zoo.check_entry(changed, options.algo, options.env, zoo.Place(path, name), trust=options.trust)
+    return entry, {**changed, "env_kwargs": changed.get("env_kwargs") or {}}
+
+
+def _changes(zoo_args: Sequence[str]) -> dict[str, Any]:
+    """Find what the zoo will change of an entry, without a check of its own."""
+    from rl_zoo3.utils import StoreDict
+
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    parser.add_argument("-params", "--hyperparams", nargs="+", action=StoreDict, default={})
+    parser.add_argument("--env-kwargs", nargs="+", action=StoreDict)
+    try:
+        known, _ = parser.parse_known_args(zoo_args)
+    except Exception as error:  # values are evaluated, which can raise anything
+        raise InvalidOption(
+            f"'{shlex.join(zoo_args)}' cannot be read ({error}); values are Python, e.g. "
+            "--hyperparams gamma:0.98 \"learning_rate:'lin_0.001'\""
+        ) from error
+    if known.env_kwargs is None:
+        return dict(known.hyperparams)
+    return {**known.hyperparams, "env_kwargs": known.env_kwargs}
+
+
+def _resumed(
+    options: TrainOptions, entry: dict[str, Any], env: Any, changed: Mapping[str, Any]
+) -> Path | None:
+    """
+    Find and check the model to go on from; with its memory it needs no new warm-up.
+
+    :param options: what to train
+    :param entry: of the hyperparameter file; is adapted
+    :param env: one of those to train in
+    :param changed: what the zoo will make of the entry
+    :return: the model's file; ``None`` begins anew
+    """
+    if options.resume is None:
+        return None
+    from sb3_torcs.agents.models import check_resumable, find_model
+    from sb3_torcs.agents.wrapping import frames_of
+
+    path = find_model(options.resume, prefer_last=True)
+    n_envs, frames = changed.get("n_envs", 1), frames_of(changed)
+    memory = check_resumable(path, env, options.algo, n_envs, frames=frames, trust=options.trust)
+    if "learning_starts" in entry and memory:
+        entry["learning_starts"] = 0
+    if "n_steps" in entry:
+        # SB3 chooses the class of the memory as before; given its own choice, it would warn.
+        entry.setdefault("replay_buffer_class", None)
+    return path
+
+
+def _write_entry(path: Path, env_id: str, entry: dict[str, Any]) -> Path:
+    """Write the one entry that the zoo shall read, under the environment's id."""
+    import yaml
+
+    path.write_text(yaml.safe_dump({env_id: entry}), encoding="utf-8")
+    return path
+
+
+def _zoo_words(options: TrainOptions, wanted: int, env_kwargs: dict[str, Any]) -> list[str]:
+    """Compose the zoo's command line, files and folders aside."""
+    from sb3_torcs.training import zoo
+
+    eval_freq = options.eval_freq
+    if eval_freq is None:
+        eval_freq = max(wanted // EVALUATIONS, min(wanted, SHORTEST_EVAL_FREQ))
+    words = ["--gym-packages", "sb3_torcs", "--algo", options.algo, "--env", options.env]
+    words += ["--n-timesteps", str(wanted), "--seed", str(options.seed)]
+    words += ["--eval-freq", str(eval_freq), "--eval-episodes", str(options.eval_episodes)]
+    words += ["--num-threads", "1", "--device", "cpu", "--verbose", "0", "--save-replay-buffer"]
+    # An evaluation is from the grid and long enough, wherever and how long the training drives.
+    mine = ("start", zoo.TIME_LIMIT)
+    evaluation = {name: value for name, value in env_kwargs.items() if name not in mine}
+    if evaluation:
+        # The zoo does not give the file's env_kwargs to the evaluation's environment.
+        words += ["--eval-env-kwargs", *(f"{name}:{value!r}" for name, value in evaluation.items())]
+    return words
+
+
+def _with_progress(callbacks: Any) -> list[Any]:
+    """
+    Add our progress bar, in front: the zoo cleans up after the first one when it is interrupted.
+
+    :param callbacks: of the entry, in any of the zoo's forms
+    :return: as a list, with the bar
+    """
+    items = callbacks if isinstance(callbacks, list) else [] if callbacks is None else [callbacks]
+    return [PROGRESS, *(item for item in items if item != PROGRESS)]
+
+
+def _run_zoo(options: TrainOptions, words: list[str], wanted: int, track: Any) -> Run:
+    """
+    Run the zoo's own training in this process.
+
+    :param options: what to train
+    :param words: of the zoo's command line
+    :param wanted: decisions to learn from
+    :param track: a name, or a list of them
+    """
+    from sb3_torcs.callbacks.progress import Unbroken
+    from sb3_torcs.training import manager as zoo_training
+
+    managers: list[Manager] = []
+    # Whoever reads may leave, e.g. `tee` at Ctrl-C, before the zoo says that it saves the model.
+    out, err = Unbroken(sys.stdout), Unbroken(sys.stderr)
+    redirected = contextlib.redirect_stdout(out), contextlib.redirect_stderr(err)
+    try:
+        with redirected[0], redirected[1], _noted_interrupts() as seen:
+            zoo_training.train(words, managers)
+    except (OSError, WorkerLost) as error:
+        if not managers:
+            raise
+        raise _told(error, _result(managers[0], wanted, track, False), options) from error
+    return _result(managers[0], wanted, track, bool(seen))
+
+
+def _result(manager: Manager, wanted: int, track: Any, interrupted: bool) -> Run:
+    """Find out what came of a training."""
+    from sb3_torcs.agents.models import saved_steps
+
+    if manager.optimize_hyperparameters:
+        return Run(Path(manager.log_path), 0, wanted, interrupted, None, track)
+    folder = Path(manager.save_path)
+    last_model = folder / f"{manager.env_name}.zip"
+    steps = saved_steps(last_model) if last_model.is_file() else 0
+    return Run(folder, steps, wanted, interrupted, last_model, track)
+
+
+def _told(error: OSError | WorkerLost, result: Run, options: TrainOptions) -> Exception:
+    """Say what has ended a training, what is kept of it, and what to type."""
+    if result.steps > 0:
+        kept = f"kept: '{result.last_model}', {result.steps} of {result.wanted} timesteps"
+        more = f"go on with: {_going_on(options, result)}"
+    else:
+        kept, more = "nothing was kept yet", "start again"
+    if isinstance(error, WorkerLost):
+        return WorkerLost(f"{error}; {kept}; see above why, and {more}")
+    said = f"cannot write '{error.filename}': {error.strerror or error}"
+    return OutputNotWritable(f"{said}; {kept}; make room, or choose another place, and {more}")
+
+
+@contextlib.contextmanager
+def _noted_interrupts() -> Iterator[list[int]]:
+    """
+    Note Ctrl-C, which the zoo takes as the end of the training and swallows; a polite kill, too.
+
+    A second one, while the model is being saved, must not break the file: only a third does.
+    """
+    seen: list[int] = []
+
+    def note(number: int, frame: FrameType | None) -> None:
+        del frame
+        seen.append(number)
+        if len(seen) == 2:
+            sys.stderr.write("saving what was learned; Ctrl-C once more drops it\n")
+            return
+        raise KeyboardInterrupt
+
+    with answered(note, signal.SIGINT, signal.SIGTERM):
+        yield seen
+
+
+def _going_on(options: TrainOptions, result: Run) -> str:
+    """Compose the command line that learns what is left."""
+    left = result.wanted - result.steps
+    return _command(dataclasses.replace(options, resume=result.last_model, timesteps=left))
+
+
+def _command(options: TrainOptions) -> str:
+    """Compose the command line that means these options."""
+    words = ["sb3-torcs", "train"]
+    for field in dataclasses.fields(options):
+        value = getattr(options, field.name)
+        if field.name == "zoo_args" or (value == field.default and field.name != "seed"):
+            continue
+        option = field.name.replace("_", "-")
+        words += [f"--no-{option}"] if value is False else [f"--{option}", str(value)]
+    return shlex.join([*words, *(["--", *options.zoo_args] if options.zoo_args else [])])

@@ -1,0 +1,451 @@
+"""Hyperparameter files: finding them, and reading them before anything starts.
+
+The RL Zoo hands whatever it does not know to the algorithm, hours later for some keys. Here an
+entry is read by the same rules, and what nothing would read is an error that names it.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import inspect
+import multiprocessing
+import os
+import re
+import signal
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import yaml
+
+from sb3_torcs.car import is_count, is_number
+from sb3_torcs.errors import ZooConfigError, near_miss
+from sb3_torcs.plain_yaml import read_yaml
+from sb3_torcs.sensors import look_both_ways, range_finder_angles
+from sb3_torcs.training.zoo_data import as_data, check_class, check_data
+
+__all__ = [
+    "TIME_LIMIT",
+    "ZOO_KEYS",
+    "Place",
+    "UninterruptedWorker",
+    "check_entry",
+    "check_racing",
+    "check_registered",
+    "config_file",
+    "decisions",
+    "read_config",
+    "read_entry",
+]
+
+Entry = dict[str, Any]
+
+ZOO_KEYS = frozenset(
+    {
+        "callback", "env_kwargs", "env_wrapper", "frame_stack", "monitor_kwargs", "n_envs",
+        "n_timesteps", "noise_std", "noise_type", "normalize", "policy", "policy_kwargs",
+        "vec_env_wrapper",
+    }
+)  # fmt: skip
+"""What the RL Zoo itself reads of an entry; all else goes to the algorithm's constructor."""
+
+GIVEN_BY_ZOO = ("self", "env", "tensorboard_log", "seed", "verbose", "device", "_init_setup_model")
+"""Arguments of the constructor that the zoo passes itself: in an entry they would clash."""
+
+GIVEN_BY_POLICY_OWNER = ("self", "observation_space", "action_space", "lr_schedule")
+"""Arguments of a policy that the algorithm passes itself."""
+
+TIME_LIMIT = "max_episode_steps"
+"""What ``gym.make`` itself takes of an entry's ``env_kwargs``: it holds for training episodes."""
+
+REQUIRED = ("n_timesteps", "policy")
+
+OURS = ("Torcs-v0", "TorcsLite-v0")
+
+
+class UninterruptedWorker(gym.Wrapper[Any, Any, Any, Any]):
+    """
+    Leaves Ctrl-C to the training, if the environment is in a worker process of it.
+
+    The terminal interrupts all processes. A worker that ends takes the model with it.
+
+    :param env: any
+    """
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        super().__init__(env)
+        if multiprocessing.parent_process() is not None:
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+class Place(NamedTuple):
+    """Where in which file an entry stands, for messages."""
+
+    file: Path
+    entry: str
+
+    def __str__(self) -> str:
+        return f"{self.file}, entry '{self.entry}'"
+
+
+def shipped_folder() -> Path:
+    """Return the folder of the shipped files: the installed package, or that of a checkout."""
+    spec = importlib.util.find_spec("sb3_torcs.zoo_configs")
+    if spec is not None and spec.submodule_search_locations:
+        return Path(next(iter(spec.submodule_search_locations)))
+    return Path(__file__).resolve().parents[2] / "zoo_configs"
+
+
+def config_file(algo: str, conf_file: str | Path | None = None) -> Path:
+    """
+    Find the hyperparameter file of an algorithm.
+
+    :param algo: as the zoo calls it, e.g. ``"ddpg"``
+    :param conf_file: a file to use instead of the shipped one
+    :return: its path
+    :raises ZooConfigError: if there is none
+    """
+    if conf_file is not None:
+        path = Path(os.path.expanduser(conf_file))
+        if not path.is_file():
+            raise ZooConfigError(f"there is no hyperparameter file '{path}'; give a .yml file")
+        return path
+    path = shipped_folder() / f"{algo}.yml"
+    if not path.is_file():
+        known = sorted(file.stem for file in shipped_folder().glob("*.yml"))
+        raise ZooConfigError(
+            f"no hyperparameters are shipped for the algorithm '{algo}'{near_miss(algo, known)} "
+            f"shipped: {', '.join(known)}; for another one give a file: --conf-file FILE.yml"
+        )
+    return path
+
+
+def read_config(path: Path) -> dict[str, Entry]:
+    """
+    Read a hyperparameter file.
+
+    :param path: of a YAML file
+    :return: its entries by name
+    :raises ZooConfigError: if it is not a mapping of mappings
+    """
+    try:
+        entries = read_yaml(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f", line {mark.line + 1}" if mark else ""
+        problem = getattr(error, "problem", None) or error
+        raise ZooConfigError(f"{path}{line}: not YAML: {problem}") from error
+    if not isinstance(entries, dict) or not entries:
+        raise ZooConfigError(f"{path}: expected entries 'ENV-ID: {{key: value}}'")
+    for name, entry in entries.items():
+        if not isinstance(name, str):
+            raise ZooConfigError(f"{path}: an entry is called {name!r}; expected a word")
+        if not isinstance(entry, dict):
+            raise ZooConfigError(f"{Place(path, name)}: expected a mapping, got {entry!r:.80}")
+    return entries
+
+
+def read_entry(path: Path, name: str) -> Entry:
+    """
+    Read one entry; changing it changes nothing else.
+
+    :param path: of a YAML file
+    :param name: of the entry: an environment's id, or what the file calls it
+    :return: the entry
+    :raises ZooConfigError: if the file has no such entry
+    """
+    entries = read_config(path)
+    if name not in entries and "default" in entries:
+        name = "default"
+    if name not in entries:
+        raise ZooConfigError(
+            f"{path} has no entry '{name}'{near_miss(name, entries)} it has: {', '.join(entries)}"
+        )
+    return as_data(entries[name])
+
+
+def check_entry(entry: Entry, algo: str, env_id: str, place: Place, *, trust: bool = False) -> None:
+    """
+    Make sure that everything in an entry will be read by something.
+
+    :param entry: as read from the file
+    :param algo: as the zoo calls it
+    :param env_id: a registered environment
+    :param place: where the entry stands
+    :param trust: let the zoo evaluate strings as Python
+    :raises ZooConfigError: for the first thing that nothing would read
+    """
+    from rl_zoo3.utils import ALGOS
+
+    if not trust:
+        check_data(entry, str(place))
+    if algo not in ALGOS:
+        raise ZooConfigError(
+            f"the RL Zoo has no algorithm '{algo}'{near_miss(algo, ALGOS)} it has: "
+            f"{', '.join(sorted(ALGOS))}"
+        )
+    for key in REQUIRED:
+        if key not in entry:
+            raise ZooConfigError(f"{place}: key '{key}' is missing")
+    _check_numbers(entry, place)
+    constructor = (_arguments(ALGOS[algo]) or set()) - set(GIVEN_BY_ZOO)
+    _check_keys(entry, ZOO_KEYS | constructor, "key", place)
+    policy = _policy(entry["policy"], ALGOS[algo], place)
+    _check_call("policy_kwargs", policy, entry.get("policy_kwargs"), place, GIVEN_BY_POLICY_OWNER)
+    for key in ("callback", "env_wrapper", "vec_env_wrapper"):
+        for path, arguments in _items(entry.get(key), key, place):
+            _check_call(f"{key} {path}", _imported(path, key, place), arguments, place)
+    _check_env_kwargs(entry.get("env_kwargs"), env_id, place)
+    _check_wrappers(entry, place)
+    _check_symmetric(entry, place)
+
+
+def _check_symmetric(entry: Entry, place: Place) -> None:
+    """Make sure that a policy that drives its mirror image, too, sees something that has one."""
+    policy_kwargs = entry.get("policy_kwargs")
+    if not isinstance(policy_kwargs, Mapping) or not policy_kwargs.get("symmetric"):
+        return
+    if entry.get("normalize"):
+        raise ZooConfigError(
+            f"{place}: policy_kwargs has symmetric, which needs observations whose middle is 0, "
+            "and normalize moves it; take one of them away: the observations are scaled already"
+        )
+    env_kwargs = entry.get("env_kwargs") or {}
+    if not look_both_ways(range_finder_angles(env_kwargs.get("range_finders", "scr"))):
+        raise ZooConfigError(
+            f"{place}: policy_kwargs has symmetric, which needs range finders that look equally "
+            "far to both sides; take it away, or set range_finders to scr or narrow"
+        )
+
+
+def _check_env_kwargs(env_kwargs: Any, env_id: str, place: Place) -> None:
+    """Check what goes to ``gym.make``."""
+    if not isinstance(env_kwargs, Mapping | None):
+        raise ZooConfigError(f"{place}: env_kwargs is {env_kwargs!r}; expected '{{key: value}}'")
+    if env_kwargs is not None and TIME_LIMIT in env_kwargs:
+        limit = env_kwargs[TIME_LIMIT]
+        if not is_count(limit):
+            raise ZooConfigError(
+                f"{place}: {TIME_LIMIT} is {limit!r}; expected a whole number of decisions >= 1"
+            )
+        env_kwargs = {key: value for key, value in env_kwargs.items() if key != TIME_LIMIT}
+    _check_call("env_kwargs", _env_class(env_id), env_kwargs, place)
+
+
+def _check_wrappers(entry: Entry, place: Place) -> None:
+    """Check what goes to Monitor and to VecNormalize."""
+    from stable_baselines3.common.monitor import Monitor
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    _check_call("normalize", VecNormalize, entry.get("normalize"), place, ("self", "venv"))
+    keywords = entry.get("monitor_kwargs")
+    _check_call("monitor_kwargs", Monitor, keywords, place, ("self", "env", "filename"))
+    if isinstance(keywords, Mapping):
+        kinds = {type(keywords.get(key, ())) for key in ("info_keywords", "reset_keywords")}
+        if len(kinds) > 1:  # Monitor adds the two, and a tuple is its default
+            raise ZooConfigError(
+                f"{place}: monitor_kwargs needs both info_keywords and reset_keywords as lists; "
+                "add the other one as []"
+            )
+
+
+def check_registered(env_id: str) -> None:
+    """
+    Make sure that an environment exists.
+
+    :param env_id: as for ``gym.make``, without a module
+    :raises ZooConfigError: if it is not registered
+    """
+    if env_id not in gym.registry:
+        raise ZooConfigError(
+            f"no environment '{env_id}' is registered{near_miss(env_id, OURS)} "
+            f"ours: {', '.join(OURS)}"
+        )
+
+
+def check_racing(env_id: str) -> None:
+    """
+    Make sure that an environment exists and is one of racing.
+
+    :param env_id: as for ``gym.make``, without a module
+    :raises ZooConfigError: if it is not
+    """
+    from sb3_torcs.envs.racing import RacingEnv
+    from sb3_torcs.envs.torcs import TorcsEnv
+
+    check_registered(env_id)
+    built = _env_class(env_id)
+    if not (isinstance(built, type) and issubclass(built, (RacingEnv, TorcsEnv))):
+        raise ZooConfigError(f"{env_id} is no racing environment; ours: {', '.join(OURS)}")
+
+
+def decisions(entry: Entry) -> int:
+    """
+    Read how many decisions an entry asks for; YAML takes ``1e5`` for a word.
+
+    :param entry: that :func:`check_entry` has seen
+    :return: its ``n_timesteps``
+    """
+    return int(float(entry["n_timesteps"]))
+
+
+def _is_budget(value: Any) -> bool:
+    try:
+        return not isinstance(value, bool) and 1.0 <= float(value) < float("inf")
+    except (TypeError, ValueError):
+        return False
+
+
+def _is_schedule(value: Any) -> bool:
+    if isinstance(value, str):
+        return bool(re.fullmatch(r"(lin_)?[\d.]+(e[+-]?\d+)?", value))
+    return value is None or is_number(value)
+
+
+def _is_share(value: Any) -> bool:
+    return is_number(value) and 0.0 <= value <= 1.0
+
+
+NUMBERS: tuple[tuple[tuple[str, ...], Callable[[Any], bool], str], ...] = (
+    (("n_timesteps",), _is_budget, "a number >= 1"),
+    (
+        ("learning_rate", "clip_range", "clip_range_vf", "delta_std"),
+        _is_schedule,
+        "a number, or lin_NUMBER to fall to 0",
+    ),
+    (
+        ("n_envs", "batch_size", "buffer_size", "n_steps", "n_epochs", "policy_delay"),
+        is_count,
+        "a whole number >= 1, e.g. 64",
+    ),
+    (("gamma", "tau", "gae_lambda"), _is_share, "a number from 0 to 1, e.g. 0.005"),
+    (
+        ("learning_starts",),
+        lambda value: is_count(value) or value == 0,
+        "a whole number >= 1, or 0",
+    ),
+    (
+        ("gradient_steps",),
+        lambda value: is_count(value) or value == -1,
+        "a whole number >= 1, or -1",
+    ),
+)
+"""Numbers that are read, or used, only when the training has begun: keys, rule, and its words."""
+
+
+def _check_numbers(entry: Entry, place: Place) -> None:
+    """Make sure that numbers are such that one can train with them."""
+    for keys, good, words in NUMBERS:
+        for key in keys:
+            if key in entry and not good(entry[key]):
+                raise ZooConfigError(f"{place}: {key} is {entry[key]!r}; expected {words}")
+
+
+def _env_class(env_id: str) -> Callable[..., Any]:
+    """Return what builds an environment."""
+    entry_point = gym.spec(env_id).entry_point
+    if isinstance(entry_point, str):
+        module, _, name = entry_point.partition(":")
+        return getattr(importlib.import_module(module), name)
+    if entry_point is None:
+        raise ZooConfigError(f"{env_id} has no entry point; register it with one")
+    return entry_point
+
+
+def _policy(name: Any, algorithm: Any, place: Place) -> Callable[..., Any]:
+    """Find the class that a policy's alias or dotted path stands for."""
+    if isinstance(name, str) and "." in name:
+        return _imported(name, "policy", place)
+    if name not in algorithm.policy_aliases:
+        known = algorithm.policy_aliases
+        raise ZooConfigError(
+            f"{place}: unknown policy {name!r}{near_miss(str(name), known)} allowed: "
+            f"{', '.join(known)}, or a dotted path such as sb3_torcs.policies.SplitHeadPolicy"
+        )
+    return algorithm.policy_aliases[name]
+
+
+def _items(value: Any, key: str, place: Place) -> list[tuple[str, Mapping[str, Any]]]:
+    """
+    Read what the zoo takes for callbacks and wrappers.
+
+    :param value: a dotted path, ``{path: {argument: value}}``, a list of those, or ``None``
+    :param key: its key
+    :param place: where it stands
+    :return: dotted paths and their arguments
+    """
+    items = value if isinstance(value, list) else [] if value is None else [value]
+    result: list[tuple[str, Mapping[str, Any]]] = []
+    for item in items:
+        single = isinstance(item, dict) and len(item) == 1
+        path, arguments = next(iter(item.items())) if single else (item, {})
+        if not isinstance(path, str) or not isinstance(arguments, dict):
+            raise ZooConfigError(
+                f"{place}: {key} has {item!r}; expected a dotted path, or one dotted path with "
+                "its arguments indented below it (check the indentation)"
+            )
+        result.append((path, arguments))
+    return result
+
+
+def _imported(path: str, key: str, place: Place) -> Callable[..., Any]:
+    """Import a class by its dotted path."""
+    module_name, _, name = path.rpartition(".")
+    try:
+        module = importlib.import_module(module_name)
+    except (ImportError, ValueError) as error:
+        raise ZooConfigError(f"{place}: {key} '{path}' does not import: {error}") from error
+    if not hasattr(module, name):
+        raise ZooConfigError(
+            f"{place}: {key} '{path}': {module_name} has no '{name}'"
+            f"{near_miss(name, vars(module))} correct the dotted path"
+        )
+    found = getattr(module, name)
+    check_class(found, path, key, str(place))
+    return found
+
+
+def _arguments(function: Callable[..., Any]) -> set[str] | None:
+    """
+    Return the names of the arguments that a constructor takes, also those it hands to its bases.
+
+    :param function: a class, or a function that builds one
+    :return: the names; ``None`` if it takes any
+    """
+    names: set[str] = set()
+    for step in function.__mro__[:-1] if inspect.isclass(function) else (function,):
+        own = vars(step).get("__init__") if inspect.isclass(step) else step
+        if own is None:
+            continue
+        parameters = inspect.signature(own).parameters.values()
+        kinds = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+        names.update(p.name for p in parameters if p.kind in kinds)
+        if not any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters):
+            return names
+    return None
+
+
+def _check_call(
+    what: str,
+    function: Callable[..., Any],
+    arguments: Any,
+    place: Place,
+    given: Iterable[str] = ("self",),
+) -> None:
+    """Make sure that a constructor has all these arguments; strings are the zoo's to evaluate."""
+    known = _arguments(function)
+    if isinstance(arguments, Mapping) and known is not None:
+        _check_keys(arguments, known - set(given), f"{what}: argument", place)
+
+
+def _check_keys(mapping: Mapping[str, Any], known: Iterable[str], what: str, place: Place) -> None:
+    """Make sure that all keys are known."""
+    known = sorted(known)
+    for key in mapping:
+        if key not in known:
+            hint = near_miss(str(key), known)
+            if hint == ";":
+                hint = f"; allowed: {', '.join(known)}"
+            raise ZooConfigError(f"{place}: unknown {what} '{key}'{hint}")
