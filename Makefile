@@ -19,8 +19,8 @@ help: ## show the verbs
 install: $(STAMP) ## put everything into .venv/
 
 $(STAMP): setup.cfg pyproject.toml setup.py
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || \
-	  { echo "Python is $$($(PYTHON) --version 2>&1), 3.10 or newer is needed; try: make PYTHON=python3.12 $(MAKECMDGOALS)"; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "Python is $$($(PYTHON) --version 2>&1), 3.11 or newer is needed; try: make PYTHON=python3.12 $(MAKECMDGOALS)"; exit 1; }
 	@test -x $(BIN)/pip || $(PYTHON) -m venv $(VENV) || \
 	  { rm -rf $(VENV); echo "Python cannot make a virtual environment; type: sudo apt install python3-venv"; exit 1; }
 	$(BIN)/python -m pip install --quiet --upgrade pip
@@ -41,9 +41,9 @@ $(BUILT): $(STAMP) $(SOURCES)
 	@touch $@
 
 game: install ## get TORCS and Xvfb, if they are not here
-	$(BIN)/sb3-torcs install-torcs --film
+	$(BIN)/sb3-torcs install-torcs --video
 
-test: native game ## run every test
+test: native game check-codestyle lint type ## check format, lint and types, and run every test
 	$(BIN)/python -m pytest -n 2 --durations=10
 
 pytest: native game ## run the tests that do not train
@@ -79,9 +79,7 @@ type: install ## check types
 
 commit-checks: format lint type ## what to run before a commit
 
-ci: check-codestyle lint type test ## everything
-
 clean: ## remove .venv/ and what was built; trainings stay
 	rm -rf build dist *.egg-info $(VENV)
 
-.PHONY: help install native game demo test pytest sanitize bench format check-codestyle lint type commit-checks ci clean
+.PHONY: help install native game demo test pytest sanitize bench format check-codestyle lint type commit-checks clean

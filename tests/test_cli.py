@@ -763,8 +763,8 @@ def test_the_doctor_misses_what_only_the_games_own_program_needs(
     monkeypatch.setattr(game_process, "__file__", str(tmp_path / "torcs/process.py"))
     ok, found = doctor_says(capsys)
     assert ok, "both environments drive without"
-    assert found["film"]["found"].startswith("no Xvfb; type: `sb3-torcs install-torcs --film`")
-    assert "`watch --film` and render_mode 'game'" in found["film"]["found"]
+    assert found["film"]["found"].startswith("no Xvfb; type: `sb3-torcs install-torcs --video`")
+    assert "`watch --video` and render_mode 'game'" in found["film"]["found"]
     assert "no display; only for `watch`" in found["window"]["found"]
     assert "_scr_server" in found["game libraries"]["found"]
     assert building.build_command() in found["game libraries"]["found"]

@@ -14,7 +14,7 @@ import pytest
 from processes import children
 
 from sb3_torcs.agents import remote as driving
-from sb3_torcs.cli import main
+from sb3_torcs.cli import _parser, main
 from sb3_torcs.evaluation import watching
 from sb3_torcs.scr.server import start_server
 from sb3_torcs.torcs.display import VirtualDisplay
@@ -68,7 +68,7 @@ def test_a_film_of_a_robot_is_the_race_that_the_game_runs_without_one(tmp_path, 
     assert main(["robots", "inferno", "--track", "a-speedway", "--laps", "1", "--game"]) == 0
     alone = capsys.readouterr().out
     film = tmp_path / "lap.mp4"
-    assert main(["watch", "inferno", *SMALL, "--film", str(film)]) == 0
+    assert main(["watch", "inferno", *SMALL, "--video", str(film)]) == 0
     filmed = capsys.readouterr().out
     assert filmed == f"{alone}film: {film}\n"
     (lap,) = re.findall(r"best lap: ([\d.]+) s", alone)
@@ -80,7 +80,7 @@ def test_a_film_of_a_robot_is_the_race_that_the_game_runs_without_one(tmp_path, 
 
 def test_two_drivers_side_by_side(tmp_path, capsys):
     film = tmp_path / "both.mp4"
-    words = ["watch", "scripted", *SMALL, "--beside", "inferno", "--film", str(film)]
+    words = ["watch", "scripted", *SMALL, "--beside", "inferno", "--video", str(film)]
     assert main(words) == 0
     out = capsys.readouterr().out
     assert "scripted, car1-trb1, a-speedway" in out
@@ -94,10 +94,10 @@ def test_two_drivers_side_by_side(tmp_path, capsys):
 def test_two_side_by_side_are_on_one_track(monkeypatch):
     filmed = []
     monkeypatch.setattr(watching, "film_shows", lambda shows, *_, **__: filmed.extend(shows))
-    words = ["--beside", "ddpg-aalborg", "--film", "both.mp4"]
+    words = ["--beside", "ddpg-aalborg", "--video", "both.mp4"]
     assert main(["watch", "ddpg-league", *words]) == 0
     assert main(["watch", "inferno", *words, "--track", "forza"]) == 0
-    assert main(["watch", "bt", "--beside", "ddpg-league", "--film", "both.mp4"]) == 0
+    assert main(["watch", "bt", "--beside", "ddpg-league", "--video", "both.mp4"]) == 0
     tracks = [show.track for show in filmed]
     assert tracks == ["corkscrew"] * 2 + ["forza"] * 2 + ["corkscrew"] * 2
     assert [show.race.car for show in filmed[:2]] == ["car1-ow1", "car1-trb1"]
@@ -106,7 +106,7 @@ def test_two_side_by_side_are_on_one_track(monkeypatch):
 def test_a_film_ends_soon_after_the_agents_drive(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(driving, "load_driver", lambda *_: Turning())
     film = tmp_path / "off.mp4"
-    assert main(["watch", "scripted", *SMALL, "--film", str(film)]) == 0
+    assert main(["watch", "scripted", *SMALL, "--video", str(film)]) == 0
     assert re.search(r"scripted: (off_track|backwards) after -?\d+ m", capsys.readouterr().out)
     assert 10 < stream(film)[1] < 60
 
@@ -114,7 +114,7 @@ def test_a_film_ends_soon_after_the_agents_drive(tmp_path, monkeypatch, capsys):
 def test_an_agent_that_breaks_down_ends_everything(tmp_path, monkeypatch):
     monkeypatch.setattr(driving, "load_driver", lambda *_: Failing())
     with pytest.raises(ZeroDivisionError, match="as told"):
-        main(["watch", "scripted", *SMALL, "--film", str(tmp_path / "broken.mp4")])
+        main(["watch", "scripted", *SMALL, "--video", str(tmp_path / "broken.mp4")])
     assert not (tmp_path / "broken.mp4").exists()
 
 
@@ -126,7 +126,7 @@ def test_a_window_shows_the_race_and_closes(monkeypatch, capsys):
     assert re.search(r"scripted: (off_track|backwards) after", capsys.readouterr().out)
 
 
-@pytest.mark.parametrize("film", [[], ["--film", "killed.mp4"]])
+@pytest.mark.parametrize("film", [[], ["--video", "killed.mp4"]])
 def test_a_game_that_is_killed_says_how_it_ended(film, tmp_path, monkeypatch, capsys):
     started = []
 
@@ -158,7 +158,7 @@ def test_without_a_display_it_offers_a_film(monkeypatch, capsys):
     assert main(["watch", "inferno"]) == 2
     said = capsys.readouterr().err
     assert "there is no display" in said
-    assert "--film" in said
+    assert "--video" in said
 
 
 @pytest.mark.parametrize(
@@ -166,19 +166,19 @@ def test_without_a_display_it_offers_a_film(monkeypatch, capsys):
     [
         (["infernal"], "there is no model 'infernal'"),
         (["infernal"], "nor is there a robot 'infernal'; did you mean 'inferno'?"),
-        (["inferno", "--beside", "bt"], "--beside is for films; add --film FILE.mp4"),
-        (["inferno", "--fps", "10"], "--fps is for films; add --film FILE.mp4"),
-        (["inferno", "--beside", "bt:4", "--car", "buggy", "--film", "lap.mp4"], "--car is for"),
+        (["inferno", "--beside", "bt"], "--beside is for videos; add --video FILE.mp4"),
+        (["inferno", "--fps", "10"], "--fps is for videos; add --video FILE.mp4"),
+        (["inferno", "--beside", "bt:4", "--car", "buggy", "--video", "lap.mp4"], "--car is for"),
         (
-            ["inferno", "--beside", "bt", "--size", "642x360", "--film", "lap.mp4"],
+            ["inferno", "--beside", "bt", "--size", "642x360", "--video", "lap.mp4"],
             "size is 642x360; the width of a film with 2 side by side has to be a multiple of 4",
         ),
-        (["inferno", "--film", "lap.avi"], "'lap.avi' should end in .mp4"),
-        (["inferno", "--film", "lap.mp4", "--view", "behnd"], "did you mean 'behind'?"),
-        (["inferno", "--film", "lap.mp4", "--fps", "0"], "fps is 0; expected 1 to 500"),
-        (["inferno", "--film", "lap.mp4", "--size", "161x120"], "a film needs even numbers"),
-        (["inferno", "--film", "lap.mp4", "--track", "forzza"], "did you mean 'forza'?"),
-        (["inferno", "--film", "lap.mp4", "--robots", "inferno"], "none of them twice"),
+        (["inferno", "--video", "lap.avi"], "'lap.avi' should end in .mp4"),
+        (["inferno", "--video", "lap.mp4", "--view", "behnd"], "did you mean 'behind'?"),
+        (["inferno", "--video", "lap.mp4", "--fps", "0"], "fps is 0; expected 1 to 500"),
+        (["inferno", "--video", "lap.mp4", "--size", "161x120"], "a film needs even numbers"),
+        (["inferno", "--video", "lap.mp4", "--track", "forzza"], "did you mean 'forza'?"),
+        (["inferno", "--video", "lap.mp4", "--robots", "inferno"], "none of them twice"),
     ],
 )
 def test_what_cannot_be_watched(words, message, tmp_path, monkeypatch, capsys):
@@ -192,3 +192,8 @@ def test_a_size_that_is_none(capsys):
     with pytest.raises(SystemExit):
         main(["watch", "inferno", "--size", "big"])
     assert "'big': expected WIDTHxHEIGHT" in capsys.readouterr().err
+
+
+def test_the_older_name_of_the_video_still_works():
+    """It is hidden, for scripts of before."""
+    assert _parser().parse_args(["watch", "inferno", "--film", "lap.mp4"]).video == "lap.mp4"

@@ -116,8 +116,8 @@ def test_what_cannot_be_drawn_is_refused_by_name(aalborg, tmp_path, change, mess
     [
         ["watch", "inferno"],
         ["watch", "scripted"],
-        ["watch", "inferno", "--film", "lap.mp4"],
-        ["watch", "scripted", "--film", "lap.mp4"],
+        ["watch", "inferno", "--video", "lap.mp4"],
+        ["watch", "scripted", "--video", "lap.mp4"],
         ["serve", "--window", "--port", "27613"],
     ],
 )

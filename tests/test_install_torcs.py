@@ -121,7 +121,7 @@ def test_with_root_apt_installs(machine, own, tmp_path, monkeypatch, capsys):
 def test_film_gets_a_display_too_and_only_once(machine, monkeypatch, capsys):
     monkeypatch.setattr(os, "geteuid", lambda: 0)
     for _ in range(2):
-        assert main(["install-torcs", "--film"]) == 0
+        assert main(["install-torcs", "--video"]) == 0
         assert f"Xvfb is installed: {machine}/bin/Xvfb" in capsys.readouterr().out
     game, display = [line for line in log(machine) if line.startswith("apt-get install")]
     assert "torcs torcs-data" in game
@@ -130,13 +130,13 @@ def test_film_gets_a_display_too_and_only_once(machine, monkeypatch, capsys):
 
 def test_a_display_is_for_root_alone_to_install(machine, tmp_path, monkeypatch, capsys):
     write_game(tmp_path / "usr")
-    assert main(["install-torcs", "--film"]) == 1
+    assert main(["install-torcs", "--video"]) == 1
     assert "type: sudo apt-get install xvfb libgl1-mesa-dri" in capsys.readouterr().err
     monkeypatch.setattr(os, "geteuid", lambda: 0)
-    assert main(["install-torcs", "--film", "--check"]) == 1
+    assert main(["install-torcs", "--video", "--check"]) == 1
     assert log(machine) == []
     (machine / "no-install").touch()
-    assert main(["install-torcs", "--film"]) == 1
+    assert main(["install-torcs", "--video"]) == 1
     assert "could not install xvfb" in capsys.readouterr().err
 
 

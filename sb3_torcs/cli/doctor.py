@@ -20,7 +20,7 @@ from sb3_torcs.torcs.installation import find_game, linker_knows
 
 __all__ = ["Check", "add_parser", "checks", "run"]
 
-OLDEST_PYTHON = (3, 10)
+OLDEST_PYTHON = (3, 11)
 PACKAGES = {
     "gymnasium": "gymnasium",
     "highway-env": "highway_env",
@@ -133,7 +133,7 @@ def _found_and_fix(error: Sb3TorcsError) -> tuple[str, str]:
 def _python() -> Check:
     found = ".".join(str(part) for part in sys.version_info[:3])
     ok = sys.version_info >= OLDEST_PYTHON
-    return Check("python", ok, found, None if ok else "install Python 3.10 or newer")
+    return Check("python", ok, found, None if ok else "install Python 3.11 or newer")
 
 
 def _package(name: str, module: str) -> Check:
@@ -306,7 +306,7 @@ def _film() -> Check:
     if program is not None:
         return Check("film", True, program, None)
     found = f"no {PROGRAM}; type: {INSTALL}"
-    return _optional("film", found, "`watch --film` and render_mode 'game'")
+    return _optional("film", found, "`watch --video` and render_mode 'game'")
 
 
 def _optional(name: str, found: str, users: str) -> Check:

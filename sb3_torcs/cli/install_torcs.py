@@ -33,7 +33,7 @@ Debian and Ubuntu: as root by apt-get; otherwise, or with --user, its packages a
 libraries that this system lacks are downloaded and unpacked into your own data folder, which
 needs no root and changes nothing else.
 
-With --film also Xvfb, as root only: a film or a picture of the game needs it where there is no
+With --video also Xvfb, as root only: a film or a picture of the game needs it where there is no
 display.
 """
 ELSEWHERE = """\
@@ -58,7 +58,12 @@ def add_parser(subparsers: Any) -> None:
     add = parser.add_argument
     add("--check", action="store_true", help="only say whether it is here; 1 if it is not")
     add("--user", action="store_true", help="unpack it for this user, even as root")
-    add("--film", action="store_true", help="also get Xvfb, to film where there is no display")
+    add(
+        "--video",
+        action="store_true",
+        help="also get Xvfb, for videos where there is no display",
+    )
+    add("--film", dest="video", action="store_true", help=argparse.SUPPRESS)  # its older name
     parser.set_defaults(run=run)
 
 
@@ -69,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
     """
     try:
         _tell(_found_or_installed(args))
-        if args.film:
+        if args.video:
             _get_display(args.check)
     except (BackendUnavailable, InstallFailed) as error:
         print(f"sb3-torcs: {error}", file=sys.stderr)

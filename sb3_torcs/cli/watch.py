@@ -24,9 +24,9 @@ DESCRIPTION = """\
 Watch a saved model, or a robot of the game, drive a car in the game's own window. The game's keys
 work there: F2 to F11 change the view, p pauses, + and - change the pace, Esc ends the race.
 
-With --film the command writes a video instead, frame by frame in simulated time: no frame is
+With --video the command writes a video instead, frame by frame in simulated time: no frame is
 dropped or doubled, however slow the machine. It needs no display, only the program Xvfb, which
-`sb3-torcs install-torcs --film` gets.
+`sb3-torcs install-torcs --video` gets.
 
 The race ends after --laps laps. A model's race also ends two seconds after the car has left the
 road or stands still.
@@ -64,7 +64,8 @@ def add_parser(subparsers: Any) -> None:
         metavar="WxH",
         help="width and height in pixels; default: 1280x720",
     )
-    add("--film", metavar="FILE.mp4", help="write a video of the race to this file")
+    add("--video", metavar="FILE.mp4", help="write a video of the race to this file")
+    add("--film", dest="video", help=argparse.SUPPRESS)  # its older name
     add("--fps", type=float, metavar="N", help="frames per second of the video; default: 30")
     add("--trust", action="store_true", help=TRUST_HELP)
     add(
@@ -85,9 +86,9 @@ def run(args: argparse.Namespace) -> int:
     from sb3_torcs.torcs.installation import find_game
 
     for option in ("beside", "fps"):
-        if getattr(args, option) is not None and args.film is None:
-            raise InvalidOption(f"--{option} is for films; add --film FILE.mp4")
-    film = writable_file(args.film, (".mp4",)) if args.film else None
+        if getattr(args, option) is not None and args.video is None:
+            raise InvalidOption(f"--{option} is for videos; add --video FILE.mp4")
+    film = writable_file(args.video, (".mp4",)) if args.video else None
     game = find_game()
     names = [args.name] if args.beside is None else [args.name, args.beside]
     shows = _shows(game, names, args)
@@ -179,7 +180,7 @@ def _in_window(show: Show, args: argparse.Namespace) -> None:
     from sb3_torcs.torcs.display import find_display
     from sb3_torcs.torcs.window import Window
 
-    display = find_display("`--film FILE.mp4` films the race without one")
+    display = find_display("`--video FILE.mp4` films the race without one")
     window = Window(size=args.size, view=args.view, display=display, driver=show.driver_name)
     show_in_window(show, window)
 

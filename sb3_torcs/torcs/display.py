@@ -19,7 +19,7 @@ from sb3_torcs.errors import DisplayUnavailable
 __all__ = ["VirtualDisplay", "find_display"]
 
 PROGRAM = "Xvfb"
-INSTALL = "`sb3-torcs install-torcs --film`, or: `sudo apt install xvfb`"
+INSTALL = "`sb3-torcs install-torcs --video`, or: `sudo apt install xvfb`"
 PATIENCE = 20.0  # [s] for a server to start on a busy machine
 GRACE = 5.0  # [s] for a server to end
 ANSWER_TIME = 5.0  # [s] for a server to greet
