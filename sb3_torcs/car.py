@@ -36,7 +36,7 @@ CONTROL_TICK = 0.02
 
 
 MANY_LAPS = 1 << 30
-"""That nobody drives to the end; the game counts to twice as many."""
+"""[-] More laps than anyone drives, for a race without an end; the game can count to twice that."""
 
 MAX_DAMAGE = 10000.0
 """[points] At which TORCS takes a car out of the race; its drag has doubled by then."""

@@ -14,7 +14,8 @@ __all__ = ["answered"]
 @contextlib.contextmanager
 def answered(by: Callable[[int, FrameType | None], None], *numbers: int) -> Iterator[None]:
     """
-    Let a function answer signals. Elsewhere than in the main thread, which alone can, it does not.
+    Handle signals by a function. Python allows that in the main thread only; in others nothing
+    changes.
 
     :param by: called with the number of the signal and the frame that it came in
     :param numbers: of the signals

@@ -178,7 +178,7 @@ def _record(model: Path, data: dict[str, Any]) -> TrainingRecord:
 
 def driver_record(driver: str | Path) -> TrainingRecord:
     """
-    Read how that was trained which is to drive.
+    Read how a driver was trained.
 
     :param driver: as in :func:`find_model`, or ``"scripted"``, of whom nothing is known
     :return: what is known

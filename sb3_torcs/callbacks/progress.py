@@ -35,7 +35,7 @@ def spoken_time(seconds: float) -> str:
 
 class Unbroken:
     """
-    A stream whose reader may leave: what nobody reads is dropped, and that is no error.
+    Text output that goes on when its reader, such as ``tee``, has ended: the text is dropped.
 
     :param stream: to write to
     """

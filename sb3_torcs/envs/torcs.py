@@ -72,8 +72,8 @@ class TorcsEnv(RacingEnv):
     :param grid_place: of the agent on the grid, 1 in front; ``None`` is behind all opponents
     :param sensor_noise: range finders and opponent sensors err by 10 % and 2 %, as those of the
         SCR server's ``-noisy``; not with ``"scr"``
-    :param host: of an SCR server that runs already, in the race that it has and without starts
-        elsewhere than on the grid; ``None`` starts a game where ``"scr"`` needs one
+    :param host: of a running SCR server; its race is driven as it is, and each episode starts on
+        the grid. With ``None``, ``"scr"`` starts a game of its own
     :param port: of the driver there; ``None`` is 3001, the first one
     :raises BackendUnavailable: if the game or the extension is missing, or not as expected
     :raises SceneryMissing: if the game shall draw a track, and cannot

@@ -108,10 +108,10 @@ class Merit(NamedTuple):
 
 def merit(races: Sequence[Episode]) -> Merit:
     """
-    Value races from the grid, one per track; a training keeps the model whose are the greatest.
+    Score the races of one driver, one race per track from the grid. Training keeps the best model.
 
-    On one track: three whole laps are better than none, then the shorter time is better; without
-    three whole laps, the longer way.
+    On one track, a race of three whole laps beats one without; among those, the shorter time wins;
+    among the others, the longer distance.
 
     :param races: of one driver
     :return: to be compared with that of another driver on the same tracks
@@ -157,7 +157,7 @@ def choose_world(driver: str, trained_on: str | None, track: Any = None) -> Worl
 
 def time_limit(kwargs: Mapping[str, Any]) -> int:
     """
-    Work out after how many decisions to give up: later than any drive that is not standing.
+    Compute the time limit of an evaluation, long enough for the slowest car that is not stuck.
 
     :param kwargs: of the environment, with ``laps``
     :return: decisions

@@ -32,8 +32,10 @@ __all__ = ["ScrClient"]
 
 LONGEST = 65535  # [bytes] of a datagram; some servers send pictures
 LOOKS = 50  # for an answer before this process sleeps: some 100 microseconds
-FULL_LUCK = 8  # at two for each look in vain, after how many it sleeps at once ...
-NO_LUCK = -200  # ... for so many answers
+# A wait begins by polling. Polls that find an answer add 1 to a score of at most FULL_LUCK, others
+# take 2 off; when it is used up, the next -NO_LUCK waits sleep at once.
+FULL_LUCK = 8
+NO_LUCK = -200
 FIRST_PAUSE = 1.0  # [s] before the first message is said again; servers take their time to load
 PAUSE = 1.0  # [s] before an action is said again
 LONGEST_PAUSE = 5.0  # [s] until it is noticed that a port was closed

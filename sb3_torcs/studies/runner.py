@@ -307,7 +307,7 @@ def _last_line(error: Exception) -> str:
 
 
 class _HereOnly:
-    """A function that is left behind when Tune pickles all that it was given."""
+    """A callback for this process only: Ray Tune pickles it as one that does nothing."""
 
     def __init__(self, call: Callable[..., None] | None = None) -> None:
         self.call: Any = call

@@ -27,8 +27,10 @@ constexpr auto SILENCE = 2s;     // after which a client may be gone: most ask a
 constexpr auto WATCH = 500ms;    // how often a wait looks for the game's owner
 constexpr auto AWAKE = 100us;    // how long a wait looks for an answer before it sleeps
 constexpr int MANY_NOTES = 100;  // for who runs the server; more would only fill the disk
-constexpr int FULL_LUCK = 8;     // at two for each look in vain, after how many it sleeps at once
-constexpr int NO_LUCK = -200;    // ... for so many waits
+// A wait begins by polling. Polls that find an answer add 1 to a score of at most FULL_LUCK, others
+// take 2 off; when it is used up, the next -NO_LUCK waits sleep at once.
+constexpr int FULL_LUCK = 8;
+constexpr int NO_LUCK = -200;
 
 Owner& owner() {
     static Owner owner;
