@@ -6,6 +6,8 @@ A room is a module or a folder at the top of the package.
 from __future__ import annotations
 
 import ast
+import configparser
+import importlib
 import io
 import tokenize
 from collections.abc import Iterator
@@ -207,6 +209,31 @@ def test_no_files_import_each_other():
     dotted = {f"sb3_torcs.{named(p).removesuffix('.py').replace('/', '.')}": p for p in FILES}
     graph = {name: modules_that(path, set(dotted)) for name, path in dotted.items()}
     assert in_circle(graph) == []
+
+
+def test_each_folder_of_python_is_installed():
+    """A folder that setup.cfg does not name is missing from the wheel."""
+    setup = configparser.ConfigParser()
+    setup.read(PACKAGE.parent / "setup.cfg")
+    listed = set(setup["options"]["packages"].split())
+    folders = {".".join(path.parent.relative_to(PACKAGE.parent).parts) for path in FILES}
+    assert listed == folders | {"sb3_torcs.zoo_configs"}
+
+
+@pytest.mark.parametrize("path", [
+    "sb3_torcs.callbacks.GradientStepsCallback", "sb3_torcs.callbacks.MirrorCallback",
+    "sb3_torcs.callbacks.NoiseCallback", "sb3_torcs.callbacks.NoiseDecayCallback",
+    "sb3_torcs.callbacks.DrivingMetricsCallback", "sb3_torcs.callbacks.RandomStartCallback",
+    "sb3_torcs.callbacks.RewardCallback", "sb3_torcs.callbacks.StochasticBrakeCallback",
+    "sb3_torcs.noise.OUNoise", "sb3_torcs.noise.SetPointNoise",
+    "sb3_torcs.policies.SplitHeadPolicy", "sb3_torcs.policies.export_actor",
+    "sb3_torcs.progress.RacingProgressCallback", "sb3_torcs.zoo.UninterruptedWorker",
+    "sb3_torcs.tracks.load_track", "sb3_torcs.evaluation.evaluate",
+])  # fmt: skip
+def test_what_files_and_people_name_stays_importable(path):
+    """Saved models, records of trainings and hyperparameter files hold these names."""
+    module, _, name = path.rpartition(".")
+    assert hasattr(importlib.import_module(module), name)
 
 
 def test_the_top_of_the_package_is_short():
