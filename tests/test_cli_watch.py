@@ -196,4 +196,5 @@ def test_a_size_that_is_none(capsys):
 
 def test_the_older_name_of_the_video_still_works():
     """It is hidden, for scripts of before."""
-    assert _parser().parse_args(["watch", "inferno", "--film", "lap.mp4"]).video == "lap.mp4"
+    parser, _ = _parser()
+    assert parser.parse_args(["watch", "inferno", "--film", "lap.mp4"]).video == "lap.mp4"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -22,6 +23,21 @@ def traces(name):
     number = name[1:]
     files = [Path(f"/tmp/.X{number}-lock"), Path(f"/tmp/.X11-unix/X{number}")]
     return [file for file in files if file.exists()]
+
+
+def left_behind(display):
+    """Its files, unless another server has its number by now, or is giving it back."""
+    end = time.monotonic() + 10.0
+    while traces(display.name):
+        lock = Path(f"/tmp/.X{display.name[1:]}-lock")
+        with contextlib.suppress(OSError, ValueError):
+            owner = int(lock.read_text())
+            if owner != display.pid and runs(owner):
+                return []
+        if time.monotonic() > end:
+            return traces(display.name)
+        time.sleep(0.05)
+    return []
 
 
 def runs(pid):
