@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from sb3_torcs.studies.estimates import Array, Estimate, estimate, share
-
-if TYPE_CHECKING:
-    from sb3_torcs.studies.report import Results
+from sb3_torcs.studies.results import Results
 
 __all__ = ["NO_LAP", "draw_together", "draw_variant"]
 

@@ -7,7 +7,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -16,31 +16,13 @@ from sb3_torcs.evaluation.ladder import RUNGS
 from sb3_torcs.studies.config import slug
 from sb3_torcs.studies.estimates import Estimate, estimate
 from sb3_torcs.studies.pictures import NO_LAP, draw_together, draw_variant
+from sb3_torcs.studies.results import Results
 from sb3_torcs.studies.storage import RECIPE, RESULTS, ROWS, write_whole
 
-__all__ = ["Results", "read_results", "write_report"]
+__all__ = ["read_results", "write_report"]
 
 FEWEST = 3  # seeds that have an interval
 TOGETHER = "learning.png"  # the picture of all variants
-
-
-class Results(NamedTuple):
-    """The rows of one variant with one seed."""
-
-    variant: str
-    seed: int
-    train: list[dict[str, Any]]
-    final: list[dict[str, Any]]
-
-    @property
-    def evaluations(self) -> list[list[dict[str, Any]]]:
-        """Rows of the training, one list of tracks per evaluation."""
-        return [list(rows) for _, rows in itertools.groupby(self.train, lambda r: r["decisions"])]
-
-    def at_home(self) -> dict[str, Any] | None:
-        """Return the final drive on the track that chose the model."""
-        home = self.train[0]["track"]
-        return next((row for row in self.final if row["track"] == home), None)
 
 
 def read_results(folder: Path) -> list[Results]:
