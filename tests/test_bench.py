@@ -27,11 +27,10 @@ def test_the_environments_are_measured_in_the_same_run(monkeypatch):
     assert min(figures.values()) > 0.0
 
 
-def test_the_measured_actions_keep_the_car_moving(monkeypatch):
+def test_the_measured_actions_keep_the_car_moving():
     """A car that stands is cheaper than one that drives."""
-    monkeypatch.setattr(bench, "TICKS_PER_TURN", 500)
     env = bench.gym.make(bench.LITE, action_repeat=1)
-    actions = bench._scripted_actions(env)
+    actions = bench_torcs.scripted_actions(env, 500)
     env.reset(seed=0)
     speeds = [env.step(action)[4]["car"].speed_x for action in actions]
     env.close()

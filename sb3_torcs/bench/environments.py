@@ -7,8 +7,8 @@ import time
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
-import numpy.typing as npt
+
+from sb3_torcs.bench.torcs import Figures, scripted_actions
 
 __all__ = ["environments", "resets"]
 
@@ -17,8 +17,6 @@ LITE = "sb3_torcs:TorcsLite-v0"
 TICKS_PER_TURN = 3000  # a minute of driving
 RACETRACK_STEPS_PER_TURN = 10
 RESETS = 200
-
-Figures = dict[str, float | None]
 
 
 def environments(seconds: float) -> Figures:
@@ -32,7 +30,7 @@ def environments(seconds: float) -> Figures:
 
     lite = gym.make(LITE, action_repeat=1)
     racetrack = gym.make("racetrack-v1")
-    actions = _scripted_actions(lite)
+    actions = scripted_actions(lite, TICKS_PER_TURN)
     racetrack.action_space.seed(0)
     others = [racetrack.action_space.sample() for _ in range(RACETRACK_STEPS_PER_TURN)]
     rates: dict[str, list[float]] = {"lite_ticks_per_s": [], "racetrack_v1_steps_per_s": []}
@@ -45,15 +43,6 @@ def environments(seconds: float) -> Figures:
     lite.close()
     racetrack.close()
     return {name: statistics.median(values) for name, values in rates.items()}
-
-
-def _scripted_actions(env: gym.Env[Any, Any]) -> list[npt.NDArray[np.float32]]:
-    """Let the scripted driver choose actions from the grid on, and end before the episode does."""
-    from sb3_torcs.agents.scripted import ScriptedDriver
-    from sb3_torcs.evaluation.protocol import drive
-
-    steps = list(zip(drive(env, ScriptedDriver(), seed=0), range(TICKS_PER_TURN), strict=False))
-    return [step.action for step, _ in steps if not step.done]
 
 
 def _drive(env: gym.Env[Any, Any], actions: list[Any]) -> float:

@@ -14,7 +14,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
-from sb3_torcs.bench.environments import Figures
+from sb3_torcs.bench.torcs import Figures
 
 __all__ = ["training_share"]
 

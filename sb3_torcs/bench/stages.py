@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from sb3_torcs.bench import scr, torcs
-from sb3_torcs.bench.environments import Figures, environments, resets
+from sb3_torcs.bench.environments import environments, resets
 from sb3_torcs.bench.learning import training_share
 from sb3_torcs.bench.policy import measure
+from sb3_torcs.bench.torcs import Figures
 from sb3_torcs.errors import BackendUnavailable
 
 __all__ = ["KEYS", "stages"]

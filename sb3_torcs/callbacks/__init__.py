@@ -1,4 +1,7 @@
-"""Callbacks for Stable-Baselines3, all with plain arguments, so that a YAML file can name them."""
+"""Callbacks for Stable-Baselines3, whose arguments are plain values.
+
+A hyperparameter file names them, e.g. ``sb3_torcs.callbacks.NoiseCallback: {kind: ou}``.
+"""
 
 from sb3_torcs.callbacks.exploration import (
     NoiseCallback,

@@ -1,19 +1,13 @@
-"""Callbacks for stock SB3 and for the hyperparameter files of rl_zoo3: plain values only.
-
-They go by their dotted path, e.g. ``sb3_torcs.callbacks.NoiseCallback: {kind: ou}``.
-"""
+"""Callbacks for exploration: the action noise, its decay, and the stochastic brake."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from stable_baselines3.common.callbacks import (
-    BaseCallback,
-)
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_torcs.callbacks.metrics import DrivingMetricsCallback
 from sb3_torcs.car import is_count, is_number
 from sb3_torcs.errors import InvalidOption, near_miss
 from sb3_torcs.noise import (
@@ -29,7 +23,6 @@ from sb3_torcs.noise import (
 )
 
 __all__ = [
-    "DrivingMetricsCallback",
     "NoiseCallback",
     "NoiseDecayCallback",
     "StochasticBrakeCallback",

@@ -8,14 +8,12 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import (
-    BaseCallback,
-)
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_torcs.callbacks.switches import _require
+from sb3_torcs.callbacks.switches import require_method
 from sb3_torcs.car import is_count
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.policies.mirror import mirror_half
@@ -110,7 +108,7 @@ class MirrorCallback(_WhileLearning):
                 f"{type(self).__name__} needs observations whose middle is 0, which VecNormalize "
                 "moves; take 'normalize' away: the observations are scaled already"
             )
-        _require(self.training_env, "range_finder_angles")
+        require_method(self.training_env, "range_finder_angles")
         for angles in self.training_env.get_attr("range_finder_angles"):
             if not look_both_ways(angles):
                 raise InvalidOption(

@@ -5,10 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from stable_baselines3.common.callbacks import (
-    BaseCallback,
-    EvalCallback,
-)
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_torcs.callbacks.metrics import callbacks_in
@@ -16,7 +13,7 @@ from sb3_torcs.car import checked_start, checked_start_speed
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.rewards import Reward
 
-__all__ = ["RandomStartCallback", "RewardCallback"]
+__all__ = ["RandomStartCallback", "RewardCallback", "require_method"]
 
 
 class _SwitchUser(BaseCallback):
@@ -88,8 +85,14 @@ class RandomStartCallback(_SwitchUser):
         return True
 
 
-def _require(env: VecEnv, name: str) -> None:
-    """Make sure of an attribute. A worker process that lacks it would die of it."""
+def require_method(env: VecEnv, name: str) -> None:
+    """
+    Make sure that environments have a method. A worker process without it would die of the call.
+
+    :param env: of the training
+    :param name: of the method
+    :raises InvalidOption: if they lack it
+    """
     if not env.has_attr(name):
         raise InvalidOption(
             f"the environment has no {name}; use Torcs-v0, TorcsLite-v0 or another RacingEnv of "
@@ -101,7 +104,7 @@ class _Switch:
     """A setting of all environments of a vector, which can be undone once."""
 
     def __init__(self, env: VecEnv, setter: str, value: Any) -> None:
-        _require(env, setter)
+        require_method(env, setter)
         self.env = env
         self.setter = setter
         self.previous: list[Any] = env.env_method(setter, value)

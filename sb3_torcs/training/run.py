@@ -24,17 +24,10 @@ if TYPE_CHECKING:
     from sb3_torcs.training.manager import Manager
 
 EVALUATIONS = 40  # of a whole training, unless --eval-freq says otherwise
-
-
 SHORTEST_EVAL_FREQ = 1000  # decisions
 
-
 PROGRESS = "sb3_torcs.callbacks.RacingProgressCallback"
-
-
 WORKER = "sb3_torcs.training.zoo.UninterruptedWorker"
-
-
 OURS = ("--algo", "--env", "--n-timesteps", "-n", "--log-folder", "-f", "--conf-file", "--uuid")
 """Words of the zoo that decide where things are; ours say the same."""
 
