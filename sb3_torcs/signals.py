@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable, Iterator
 from types import FrameType
 
-__all__ = ["answered"]
+__all__ = ["answered", "handlers_kept"]
 
 
 @contextlib.contextmanager
@@ -23,9 +23,27 @@ def answered(by: Callable[[int, FrameType | None], None], *numbers: int) -> Iter
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = {number: signal.signal(number, by) for number in numbers}
+    with handlers_kept(*numbers):
+        for number in numbers:
+            signal.signal(number, by)
+        yield
+
+
+@contextlib.contextmanager
+def handlers_kept(*numbers: int) -> Iterator[None]:
+    """
+    Put back the handlers of signals that a library replaces and leaves replaced. Python allows that
+    in the main thread only; elsewhere no library can replace them.
+
+    :param numbers: of the signals
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.getsignal(number) for number in numbers}
     try:
         yield
     finally:
         for number, handler in before.items():
-            signal.signal(number, handler)
+            if handler is not None:  # else it was set by other code than Python, and is not known
+                signal.signal(number, handler)

@@ -24,6 +24,7 @@ from sb3_torcs.studies.runner import MARK, PRIVATE, SESSION, run_study, run_tria
 from sb3_torcs.studies.storage import StudyFolder
 
 CLOCKS = ("wall_s", "cpu_s")
+HANDLED = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
 
 
 def study_file(folder, **changes):
@@ -189,7 +190,10 @@ def test_what_was_lost_of_a_folder_is_told(begun, capsys):
 @pytest.mark.slow
 def test_a_damaged_checkpoint_is_told_once(begun, capsys):
     study, place = begun
+    handlers = [signal.getsignal(number) for number in HANDLED]
     assert main(["study", str(study.path), "--folder", str(place.path)]) == 1
+    # Tune leaves its own behind, which would swallow the next Ctrl-C of this process.
+    assert [signal.getsignal(number) for number in HANDLED] == handlers
     out = capsys.readouterr().out
     assert "small-nets-seed0 failed: its checkpoint cannot be read (" in out
     assert "remove the folder small-nets-seed0 of the study" in out

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_torcs.errors import OutputNotWritable, RayUnavailable, StudyError
-from sb3_torcs.signals import answered
+from sb3_torcs.signals import answered, handlers_kept
 from sb3_torcs.studies.config import Study, Trial
 from sb3_torcs.studies.storage import Files, StudyFolder
 
@@ -134,7 +134,9 @@ def run_study(
             if trial not in left:
                 tell(trial, {"state": "done"})
         if left:
-            with _ray(place, jobs, address) as scratch:
+            # Ray and Tune replace these handlers and never put them back.
+            kept = handlers_kept(signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
+            with kept, _ray(place, jobs, address) as scratch:
                 _tune(left, place, scratch, tell)
     return place.results
 
