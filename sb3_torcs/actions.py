@@ -136,10 +136,8 @@ def action_layout(action: str, gears: int = GEARS) -> ActionLayout:
     if action == "manual":
         low, high = (-1.0, 0.0, 0.0, -1.0, 0.0), (1.0, 1.0, 1.0, float(gears), 1.0)
         return ActionLayout(_MANUAL, low, high, _read_manual)
-    raise InvalidOption(
-        f"action is {action!r}{near_miss(str(action), ACTIONS)} expected one of "
-        f"{', '.join(map(repr, ACTIONS))}"
-    )
+    advice = f"expected one of {', '.join(map(repr, ACTIONS))}"
+    raise InvalidOption(f"action is {action!r}{near_miss(str(action), ACTIONS, advice)}")
 
 
 def layout_of_width(width: int) -> ActionLayout | None:
@@ -162,10 +160,8 @@ def checked_gearbox(gearbox: str) -> str:
     :raises InvalidOption: for anything else
     """
     if not isinstance(gearbox, str) or gearbox not in GEARBOXES:
-        raise InvalidOption(
-            f"gearbox is {gearbox!r}{near_miss(str(gearbox), GEARBOXES)} expected "
-            f"{' or '.join(map(repr, GEARBOXES))}"
-        )
+        advice = f"expected {' or '.join(map(repr, GEARBOXES))}"
+        raise InvalidOption(f"gearbox is {gearbox!r}{near_miss(str(gearbox), GEARBOXES, advice)}")
     return gearbox
 
 

@@ -192,13 +192,16 @@ class ZooConfigError(Sb3TorcsError, ValueError):
     """A hyperparameter file has an entry that nothing would read."""
 
 
-def near_miss(name: str, known: Iterable[str]) -> str:
+def near_miss(name: str, known: Iterable[str], advice: str = "") -> str:
     """
-    Suggest the known name that was probably meant.
+    End a complaint about an unknown name: with the known one that was probably meant, and advice.
 
     :param name: what was typed
     :param known: the names that exist
-    :return: ``"; did you mean 'x'?"``, or ``";"`` when nothing is close; the sentence goes on
+    :param advice: what else to say
+    :return: e.g. ``"; did you mean 'x'? it has x, y"``, or ``"; it has x, y"`` if none is close
     """
     close = difflib.get_close_matches(name, map(str, known), n=1, cutoff=0.6)
-    return f"; did you mean '{close[0]}'?" if close else ";"
+    suggestion = [f"did you mean '{close[0]}'?"] if close else []
+    ending = " ".join([*suggestion, advice] if advice else suggestion)
+    return f"; {ending}" if ending else ""

@@ -105,10 +105,10 @@ class Reward:
     def __init__(self, reward: str | Mapping[str, float]) -> None:
         if isinstance(reward, str):
             if reward not in PRESETS:
-                raise UnknownRewardTerm(
-                    f"no reward '{reward}'{near_miss(reward, PRESETS)} rewards: "
-                    f"{', '.join(PRESETS)}, or a dict of weights over {', '.join(TERMS)}"
+                advice = (
+                    f"rewards: {', '.join(PRESETS)}, or a dict of weights over {', '.join(TERMS)}"
                 )
+                raise UnknownRewardTerm(f"no reward '{reward}'{near_miss(reward, PRESETS, advice)}")
             weights = PRESETS[reward]
         elif isinstance(reward, Mapping):
             weights = dict(reward)
@@ -118,10 +118,9 @@ class Reward:
             )
         for name, weight in weights.items():
             if not isinstance(name, str) or name not in (*TERMS, "scale", "crash"):
-                hint = near_miss(str(name), TERMS)
+                advice = f"terms: {', '.join(TERMS)}; besides them 'scale' and 'crash'"
                 raise UnknownRewardTerm(
-                    f"no reward term '{name}'{hint} terms: {', '.join(TERMS)}; "
-                    "besides them 'scale' and 'crash'"
+                    f"no reward term '{name}'{near_miss(str(name), TERMS, advice)}"
                 )
             if not is_number(weight):
                 raise InvalidOption(

@@ -61,10 +61,8 @@ def algorithm_of(name: str | None, data: dict[str, Any], model: Path) -> tuple[s
     if name is None:
         raise ModelMismatch(f"'{model}' does not tell its algorithm; say it: --algo ddpg")
     if name not in ALGOS:
-        raise InvalidOption(
-            f"the RL Zoo has no algorithm '{name}'{near_miss(name, ALGOS)} it has: "
-            f"{', '.join(sorted(ALGOS))}"
-        )
+        advice = f"it has: {', '.join(sorted(ALGOS))}"
+        raise InvalidOption(f"the RL Zoo has no algorithm '{name}'{near_miss(name, ALGOS, advice)}")
     return name, _sbx_algorithm(name, model) if is_sbx(data) else ALGOS[name]
 
 

@@ -136,11 +136,11 @@ def find_model(path: str | Path, *, prefer_last: bool = False) -> Path:
         given = AGENTS / str(path)
     if not given.is_dir():
         known = [*(file.name for file in given.parent.glob("*.zip")), *shipped_agents()]
-        raise InvalidOption(
-            f"there is no model '{given}'{near_miss(given.name, known)} give the .zip that a "
-            "training saved, the folder of its run, or a shipped agent: "
+        advice = (
+            "give the .zip that a training saved, the folder of its run, or a shipped agent: "
             f"{', '.join(shipped_agents())}"
         )
+        raise InvalidOption(f"there is no model '{given}'{near_miss(given.name, known, advice)}")
     best = given / BEST_MODEL
     last = [
         file for file in (given / f"{sub.name}.zip" for sub in given.iterdir()) if file.is_file()

@@ -62,9 +62,8 @@ class NoiseCallback(BaseCallback):
     ) -> None:
         super().__init__(verbose)
         if not isinstance(kind, str) or kind not in KINDS:
-            raise InvalidOption(
-                f"kind is {kind!r}{near_miss(str(kind), KINDS)} pass 'set_point' or 'ou'"
-            )
+            hint = near_miss(str(kind), KINDS, "pass 'set_point' or 'ou'")
+            raise InvalidOption(f"kind is {kind!r}{hint}")
         self.kind = kind
         self.parameters = tuple(OUParameters.of(value) for value in (steering, throttle, brake))
         self.dt = checked_dt(dt)

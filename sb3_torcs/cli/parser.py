@@ -34,12 +34,12 @@ class Parser(argparse.ArgumentParser):
         """
         known = list(verbs)
         if not word.startswith("-") and word not in known:
-            hint = near_miss(word, known)
-            self.error(f"there is no verb '{word}'{hint} choose from {', '.join(known)}")
+            hint = near_miss(word, known, f"choose from {', '.join(known)}")
+            self.error(f"there is no verb '{word}'{hint}")
 
     def _refuse(self, unknown: list[str]) -> NoReturn:
         """Say which words are unknown; the first option among them is perhaps a near miss."""
         options = [option for action in self._actions for option in action.option_strings]
         wrong = next((word for word in unknown if word.startswith("-")), unknown[0])
-        hint = near_miss(wrong.partition("=")[0], options).removesuffix(";")
+        hint = near_miss(wrong.partition("=")[0], options)
         self.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")

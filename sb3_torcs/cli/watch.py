@@ -165,7 +165,7 @@ def _record(game: Game, name: str) -> TrainingRecord:
     try:
         return told_record(name)
     except InvalidOption as error:
-        hint = near_miss(name, game.robots()).rstrip(";")
+        hint = near_miss(name, game.robots())
         raise InvalidOption(f"{error}; nor is there a robot '{name}'{hint}") from None
 
 

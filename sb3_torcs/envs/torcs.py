@@ -219,10 +219,8 @@ def _picture(picture: str, render_mode: str | None) -> str:
     :raises InvalidOption: if there is no such picture, or not in this mode
     """
     if picture not in PICTURES:
-        raise InvalidOption(
-            f"picture is {picture!r}{near_miss(str(picture), PICTURES)} "
-            f"expected {' or '.join(map(repr, PICTURES))}"
-        )
+        advice = f"expected {' or '.join(map(repr, PICTURES))}"
+        raise InvalidOption(f"picture is {picture!r}{near_miss(str(picture), PICTURES, advice)}")
     if picture == "game" and render_mode == "human":
         raise InvalidOption(
             "picture 'game' is for render_mode 'rgb_array'; `sb3-torcs watch` shows the game's "

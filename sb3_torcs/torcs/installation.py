@@ -146,10 +146,8 @@ class Game:
                 missing = folder / f"{short}.xml"
                 raise GameIncomplete(f"track '{name}' has no {missing}; type: {INSTALL}")
         known = [key for full in tracks for key in (full.rpartition("/")[2], full)]
-        hint = near_miss(name, known)
-        raise TrackNotFound(
-            f"the game at {self.data} has no track '{name}'{hint} `sb3-torcs tracks` lists them"
-        )
+        hint = near_miss(name, known, "`sb3-torcs tracks` lists them")
+        raise TrackNotFound(f"the game at {self.data} has no track '{name}'{hint}")
 
     def find_car(self, name: str) -> Path:
         """
@@ -161,10 +159,8 @@ class Game:
         """
         cars = self.cars()
         if not isinstance(name, str) or name not in cars:
-            hint = near_miss(str(name), cars)
-            raise UnknownCar(
-                f"the game at {self.data} has no car '{name}'{hint} it has {', '.join(cars)}"
-            )
+            hint = near_miss(str(name), cars, f"it has {', '.join(cars)}")
+            raise UnknownCar(f"the game at {self.data} has no car '{name}'{hint}")
         return cars[name]
 
     def parse_robot(self, text: str) -> tuple[str, int]:
@@ -201,10 +197,8 @@ class Game:
         """
         robots = self.robots()
         if name not in robots:
-            hint = near_miss(name, robots)
-            raise UnknownRobot(
-                f"the game at {self.data} has no robot '{name}'{hint} it has {', '.join(robots)}"
-            )
+            hint = near_miss(name, robots, f"it has {', '.join(robots)}")
+            raise UnknownRobot(f"the game at {self.data} has no robot '{name}'{hint}")
         for entry in robots[name]:
             if entry.index == index:
                 if entry.car in self.cars():

@@ -66,8 +66,8 @@ def load_track(
         if name in (candidate, candidate.rpartition("/")[2]):
             return _read(path, source)
     known = [key for full in _known_files() for key in (full.rpartition("/")[2], full)]
-    hint = near_miss(name, known)
-    raise TrackNotFound(f"no track '{name}'{hint} `sb3-torcs tracks` lists them")
+    hint = near_miss(name, known, "`sb3-torcs tracks` lists them")
+    raise TrackNotFound(f"no track '{name}'{hint}")
 
 
 def available_tracks() -> list[TrackSummary]:

@@ -115,9 +115,10 @@ def config_file(algo: str, conf_file: str | Path | None = None) -> Path:
     path = shipped_folder() / f"{algo}.yml"
     if not path.is_file():
         known = sorted(file.stem for file in shipped_folder().glob("*.yml"))
+        advice = f"shipped: {', '.join(known)}; for another one give a file: --conf-file FILE.yml"
         raise ZooConfigError(
-            f"no hyperparameters are shipped for the algorithm '{algo}'{near_miss(algo, known)} "
-            f"shipped: {', '.join(known)}; for another one give a file: --conf-file FILE.yml"
+            f"no hyperparameters are shipped for the algorithm '{algo}'"
+            f"{near_miss(algo, known, advice)}"
         )
     return path
 
@@ -160,9 +161,8 @@ def read_entry(path: Path, name: str) -> Entry:
     if name not in entries and "default" in entries:
         name = "default"
     if name not in entries:
-        raise ZooConfigError(
-            f"{path} has no entry '{name}'{near_miss(name, entries)} it has: {', '.join(entries)}"
-        )
+        advice = f"it has: {', '.join(entries)}"
+        raise ZooConfigError(f"{path} has no entry '{name}'{near_miss(name, entries, advice)}")
     return as_data(entries[name])
 
 
@@ -182,9 +182,9 @@ def check_entry(entry: Entry, algo: str, env_id: str, place: Place, *, trust: bo
     if not trust:
         check_data(entry, str(place))
     if algo not in ALGOS:
+        advice = f"it has: {', '.join(sorted(ALGOS))}"
         raise ZooConfigError(
-            f"the RL Zoo has no algorithm '{algo}'{near_miss(algo, ALGOS)} it has: "
-            f"{', '.join(sorted(ALGOS))}"
+            f"the RL Zoo has no algorithm '{algo}'{near_miss(algo, ALGOS, advice)}"
         )
     for key in REQUIRED:
         if key not in entry:
@@ -259,10 +259,8 @@ def check_registered(env_id: str) -> None:
     :raises ZooConfigError: if it is not registered
     """
     if env_id not in gym.registry:
-        raise ZooConfigError(
-            f"no environment '{env_id}' is registered{near_miss(env_id, OURS)} "
-            f"ours: {', '.join(OURS)}"
-        )
+        hint = near_miss(env_id, OURS, f"ours: {', '.join(OURS)}")
+        raise ZooConfigError(f"no environment '{env_id}' is registered{hint}")
 
 
 def check_racing(env_id: str) -> None:
@@ -360,9 +358,12 @@ def _policy(name: Any, algorithm: Any, place: Place) -> Callable[..., Any]:
         return _imported(name, "policy", place)
     if name not in algorithm.policy_aliases:
         known = algorithm.policy_aliases
+        advice = (
+            f"allowed: {', '.join(known)}, or a dotted path such as "
+            "sb3_torcs.policies.SplitHeadPolicy"
+        )
         raise ZooConfigError(
-            f"{place}: unknown policy {name!r}{near_miss(str(name), known)} allowed: "
-            f"{', '.join(known)}, or a dotted path such as sb3_torcs.policies.SplitHeadPolicy"
+            f"{place}: unknown policy {name!r}{near_miss(str(name), known, advice)}"
         )
     return algorithm.policy_aliases[name]
 
@@ -400,7 +401,7 @@ def _imported(path: str, key: str, place: Place) -> Callable[..., Any]:
     if not hasattr(module, name):
         raise ZooConfigError(
             f"{place}: {key} '{path}': {module_name} has no '{name}'"
-            f"{near_miss(name, vars(module))} correct the dotted path"
+            f"{near_miss(name, vars(module), 'correct the dotted path')}"
         )
     found = getattr(module, name)
     check_class(found, path, key, str(place))
@@ -445,7 +446,5 @@ def _check_keys(mapping: Mapping[str, Any], known: Iterable[str], what: str, pla
     known = sorted(known)
     for key in mapping:
         if key not in known:
-            hint = near_miss(str(key), known)
-            if hint == ";":
-                hint = f"; allowed: {', '.join(known)}"
+            hint = near_miss(str(key), known) or f"; allowed: {', '.join(known)}"
             raise ZooConfigError(f"{place}: unknown {what} '{key}'{hint}")
