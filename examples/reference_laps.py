@@ -7,12 +7,11 @@ from pathlib import Path
 import sb3_torcs
 from sb3_torcs.agents.robots import race
 from sb3_torcs.agents.scripted import SCRIPTED, ScriptedDriver
+from sb3_torcs.car import DEFAULT_CAR
 from sb3_torcs.evaluation.ladder import REFERENCE_FIELDS, REFERENCE_FILE, ROBOTS
 from sb3_torcs.evaluation.protocol import RACE_LAPS, evaluate, race_environment
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.tracks.catalogue import available_tracks
-
-CAR = "car1-trb1"
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--tracks", nargs="+", help="category/name; default: all")
@@ -24,7 +23,7 @@ if args.tracks and args.out == REFERENCE_FILE:
 
 def scripted(track):
     """Lap times [s] of the driver without a network."""
-    env = race_environment("Torcs-v0", {"car": CAR}, track)
+    env = race_environment("Torcs-v0", {"car": DEFAULT_CAR}, track)
     (episode,) = evaluate(env, ScriptedDriver())
     env.close()
     return episode.lap_times
@@ -33,7 +32,7 @@ def scripted(track):
 def robot(name, track):
     """Lap times [s] of a robot in the car of the class."""
     (result,) = race([find_game().parse_robot(name)], track, RACE_LAPS)
-    return [lap.time for lap in result.laps] if result.car == CAR else []
+    return [lap.time for lap in result.laps] if result.car == DEFAULT_CAR else []
 
 
 aside = args.out.with_name(f".{args.out.name}")
@@ -46,6 +45,6 @@ with aside.open("w", newline="", encoding="utf-8") as file:
             laps = scripted(track) if driver == SCRIPTED else robot(driver, track)
             whole = len(laps) == RACE_LAPS
             times = (f"{laps[0]:.3f}", f"{min(laps[1:]):.3f}") if whole else ("", "")
-            writer.writerow((track.rpartition("/")[2], driver, CAR, *times))
+            writer.writerow((track.rpartition("/")[2], driver, DEFAULT_CAR, *times))
             print(f"{track}: {driver} {', '.join(f'{lap:.3f}' for lap in laps) or 'no lap'}")
 aside.replace(args.out)  # whole, or what was there before

@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.progress import track as progress
 
 from sb3_torcs.backends.native import NativeBackend
-from sb3_torcs.car import CONTROL_TICK, Controls, Start
+from sb3_torcs.car import CONTROL_TICK, DEFAULT_CAR, Controls, Start
 from sb3_torcs.cli.common import table
 from sb3_torcs.errors import CarLost, InvalidOption, Sb3TorcsError, TrackFileError
 from sb3_torcs.torcs.installation import find_game
@@ -127,7 +127,7 @@ def every_robot() -> list[str]:
     """Name one driver of each module that can drive here, that of the agent's car if it has one."""
     names = []
     for name, drivers in find_game().robots().items():
-        for entry in sorted(drivers, key=lambda entry: entry.car != "car1-trb1"):
+        for entry in sorted(drivers, key=lambda entry: entry.car != DEFAULT_CAR):
             try:
                 find_game().find_robot(name, entry.index)
             except Sb3TorcsError:

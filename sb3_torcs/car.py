@@ -16,6 +16,7 @@ from sb3_torcs.errors import InvalidOption
 
 __all__ = [
     "CONTROL_TICK",
+    "DEFAULT_CAR",
     "MANY_LAPS",
     "MAX_DAMAGE",
     "CarState",
@@ -30,6 +31,9 @@ __all__ = [
 ]
 
 FloatArray = npt.NDArray[np.float64]
+
+DEFAULT_CAR = "car1-trb1"
+"""The car of the SCR championship, which all worlds have."""
 
 CONTROL_TICK = 0.02
 """[s] The interval at which TORCS calls its robots; one decision lasts a whole number of them."""

@@ -11,7 +11,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sb3_torcs.actions import checked_gearbox
-from sb3_torcs.car import MANY_LAPS, CarState, Controls, FloatArray, Start, checked_laps, is_count
+from sb3_torcs.car import (
+    DEFAULT_CAR,
+    MANY_LAPS,
+    CarState,
+    Controls,
+    FloatArray,
+    Start,
+    checked_laps,
+    is_count,
+)
 from sb3_torcs.errors import BackendUnavailable, InvalidOption, TrackFileError
 from sb3_torcs.sensors import range_finder_angles
 from sb3_torcs.torcs.building import build_command
@@ -46,7 +55,7 @@ def make_engine(
     track: str | os.PathLike[str],
     entries: Sequence[tuple[str, int]],
     *,
-    car: str = "car1-trb1",
+    car: str = DEFAULT_CAR,
     session: Session = "practice",
     laps: int = 0,
     angles: FloatArray | None = None,
@@ -162,7 +171,7 @@ class NativeBackend:
         self,
         track: str | Path = "aalborg",
         *,
-        car: str = "car1-trb1",
+        car: str = DEFAULT_CAR,
         range_finders: str | Sequence[float] = "scr",
         opponents: Sequence[str] = (),
         laps: int | None = None,
@@ -351,7 +360,9 @@ def check_layout(game: Game) -> str:
     engine = make_engine(game, name, [AGENT])
     summary = engine.track_summary()
     engine.close()
-    return f"as TORCS 1.3.7, by {summary['name']} ({summary['segments']} segments) and car1-trb1"
+    return (
+        f"as TORCS 1.3.7, by {summary['name']} ({summary['segments']} segments) and {DEFAULT_CAR}"
+    )
 
 
 def _extension() -> Any:

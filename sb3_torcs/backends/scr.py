@@ -13,7 +13,7 @@ import numpy as np
 
 from sb3_torcs.actions import checked_gearbox, controls_from_action
 from sb3_torcs.backends.native import AGENT, starting_list, track_path
-from sb3_torcs.car import CONTROL_TICK, MANY_LAPS, CarState, Controls, Start, is_count
+from sb3_torcs.car import CONTROL_TICK, DEFAULT_CAR, MANY_LAPS, CarState, Controls, Start, is_count
 from sb3_torcs.errors import EngineForked, GameFailed, GameTimeout, InvalidOption, ServerLost
 from sb3_torcs.scr.car_reader import CarReader
 from sb3_torcs.scr.client import ScrClient
@@ -65,7 +65,7 @@ class ScrBackend:
         self,
         track: str | Path = "aalborg",
         *,
-        car: str = "car1-trb1",
+        car: str = DEFAULT_CAR,
         range_finders: str | Sequence[float] = "scr",
         opponents: Sequence[str] = (),
         laps: int | None = None,

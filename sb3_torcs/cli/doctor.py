@@ -13,6 +13,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from sb3_torcs.car import DEFAULT_CAR
 from sb3_torcs.cli.common import print_json, quiet_output
 from sb3_torcs.errors import BackendUnavailable, Sb3TorcsError
 from sb3_torcs.torcs.building import build_command
@@ -37,7 +38,6 @@ PACKAGES = {
 
 EXTENSION = "sb3_torcs._engine"
 COMPILERS = ("c++", "g++", "clang++")
-DEFAULT_CAR = "car1-trb1"
 GAME_LIBRARIES = ("_scr_server", "_game_window")
 PROGRAM_USERS = "`watch`, `serve`, `robots --game`, backend 'scr' and render_mode 'game'"
 LIBRARY_USERS = "`watch`, `serve`, backend 'scr' and render_mode 'game'"

@@ -6,6 +6,7 @@ import argparse
 import sys
 from typing import TYPE_CHECKING, Any
 
+from sb3_torcs.car import DEFAULT_CAR
 from sb3_torcs.cli.common import (
     MODEL_HELP,
     TRUST_HELP,
@@ -54,7 +55,7 @@ def add_parser(subparsers: Any) -> None:
     add("model", metavar="MODEL", help=MODEL_HELP)
     add("--env", metavar="ID", help="default: that of the training, or Torcs-v0 if it runs here")
     add("--track", metavar="T", help="default: that of the training, or aalborg")
-    add("--car", metavar="C", help="default: that of the training, or car1-trb1")
+    add("--car", metavar="C", help=f"default: that of the training, or {DEFAULT_CAR}")
     add("--episodes", type=positive, default=1, metavar="N", help="default: 1")
     add("--laps", type=positive, default=3, metavar="L", help="laps per episode; default: 3")
     add("--seed", type=seed, default=0, metavar="S", help="of the first reset; default: 0")

@@ -7,6 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sb3_torcs.car import DEFAULT_CAR
 from sb3_torcs.cli.common import natural, positive, print_json, quiet_output, table
 from sb3_torcs.cli.results import results_as_json, show_results
 from sb3_torcs.files import writable_file
@@ -41,7 +42,7 @@ def add_parser(subparsers: Any) -> None:
     add = parser.add_argument
     add("name", nargs="?", metavar="NAME", help="the robot, e.g. inferno")
     add("--index", type=natural, metavar="I",
-        help="which of the robot's drivers; default: that of car1-trb1")  # fmt: skip
+        help=f"which of the robot's drivers; default: that of {DEFAULT_CAR}")  # fmt: skip
     add("--track", default="aalborg", metavar="T", help="the track; default: aalborg")
     add("--laps", type=positive, default=3, metavar="N", help="laps to drive; default: 3")
     add("--with", dest="rivals", metavar="NAME:I,…",

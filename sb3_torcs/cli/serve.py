@@ -7,6 +7,7 @@ from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from sb3_torcs.car import DEFAULT_CAR
 from sb3_torcs.cli.common import positive
 from sb3_torcs.cli.results import show_results
 
@@ -55,7 +56,8 @@ def add_parser(subparsers: Any) -> None:
     add("--track", default="aalborg", metavar="T", help="default: aalborg")
     add("--drivers", type=positive, default=1, metavar="N", help="clients, 1 to 10; default: 1")
     add("--robots", metavar="NAME:I,…", help="of the game, who start behind the clients")
-    add("--car", default="car1-trb1", metavar="C", help="of the clients; default: car1-trb1")
+    add("--car", default=DEFAULT_CAR, metavar="C",
+        help=f"of the clients; default: {DEFAULT_CAR}")  # fmt: skip
     add("--laps", type=positive, default=20, metavar="L", help="default: 20")
     add("--host", default="127.0.0.1", metavar="H",
         help="address to listen at; default: 127.0.0.1, 0.0.0.0 lets others in")  # fmt: skip

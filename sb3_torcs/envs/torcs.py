@@ -15,7 +15,7 @@ from sb3_torcs.backends.base import Backend
 from sb3_torcs.backends.native import NativeBackend, track_path
 from sb3_torcs.backends.scr import ScrBackend
 from sb3_torcs.backends.several import SeveralTracks, is_several
-from sb3_torcs.car import is_count
+from sb3_torcs.car import DEFAULT_CAR, is_count
 from sb3_torcs.envs.racing import RacingEnv
 from sb3_torcs.errors import EnvClosed, InvalidOption, near_miss
 from sb3_torcs.torcs.installation import find_game
@@ -88,7 +88,7 @@ class TorcsEnv(RacingEnv):
         self,
         *,
         track: str | Path | Sequence[str | Path] = "aalborg",
-        car: str = "car1-trb1",
+        car: str = DEFAULT_CAR,
         reward: str | Mapping[str, float] = "progress",
         action_repeat: int = 5,
         range_finders: str | Sequence[float] = "scr",

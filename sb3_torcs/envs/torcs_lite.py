@@ -11,6 +11,7 @@ from sb3_torcs.actions import ActionName, GearboxName, used_gearbox
 from sb3_torcs.backends.base import Backend
 from sb3_torcs.backends.lite.backend import LiteBackend
 from sb3_torcs.backends.several import SeveralTracks, is_several
+from sb3_torcs.car import DEFAULT_CAR
 from sb3_torcs.envs.racing import RacingEnv
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.tracks.track import Track
@@ -82,7 +83,7 @@ class TorcsLiteEnv(RacingEnv):
         self,
         *,
         track: str | Path | Track | Sequence[str | Path | Track] = "aalborg",
-        car: str = "car1-trb1",
+        car: str = DEFAULT_CAR,
         reward: str | Mapping[str, float] = "progress",
         action_repeat: int = 5,
         range_finders: str | Sequence[float] = "scr",

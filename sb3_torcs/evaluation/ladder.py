@@ -12,6 +12,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from sb3_torcs.agents.scripted import SCRIPTED
+from sb3_torcs.car import DEFAULT_CAR
 from sb3_torcs.evaluation.protocol import Episode
 
 __all__ = ["REFERENCE_FIELDS", "ROBOTS", "RUNGS", "reference_laps", "rung"]
@@ -28,7 +29,7 @@ REFERENCE_ENV = "Torcs-v0"  # laps of another world say nothing here
 
 
 @functools.cache
-def reference_laps(track: str, car: str = "car1-trb1") -> dict[str, float]:
+def reference_laps(track: str, car: str = DEFAULT_CAR) -> dict[str, float]:
     """
     Look up what others drive.
 

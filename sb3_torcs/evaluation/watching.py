@@ -15,6 +15,7 @@ import numpy.typing as npt
 from sb3_torcs.agents.models import driver_name
 from sb3_torcs.agents.remote import Agent
 from sb3_torcs.agents.scripted import SCRIPTED
+from sb3_torcs.car import DEFAULT_CAR
 from sb3_torcs.errors import GameFailed, InvalidOption, ServerLost
 from sb3_torcs.rendering.encoder import PHOTOGRAPHIC, write_video
 from sb3_torcs.rendering.game_video import FPS, Film, side_by_side
@@ -65,7 +66,7 @@ class Show:
     def race(self) -> RaceSetup:
         """As the game is told."""
         drivers = [self.robot or SCR_DRIVER, *self.opponents]
-        car = self.settings.get("car", "car1-trb1")
+        car = self.settings.get("car", DEFAULT_CAR)
         return RaceSetup(self.track, drivers, self.laps, session_for(drivers), car)
 
     @property

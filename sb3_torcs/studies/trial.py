@@ -28,6 +28,7 @@ import sb3_torcs  # noqa: F401  registers the environments, in a worker too
 from sb3_torcs.agents.model_writing import recipe, write_record
 from sb3_torcs.agents.models import BEST_MODEL, Driver, load_driver
 from sb3_torcs.agents.wrapping import frames_of
+from sb3_torcs.car import DEFAULT_CAR
 from sb3_torcs.errors import StudyError
 from sb3_torcs.evaluation.ladder import rung
 from sb3_torcs.evaluation.protocol import Episode, Merit, evaluate, merit, race_environment
@@ -298,7 +299,7 @@ def _row(trial: Trial, phase: str, track: str, race: Episode, more: Row) -> Row:
         "end": race.end,
         "damage": race.damage,
         "return": race.episode_return,
-        "ladder": rung(race, trial.env_id, trial.env_kwargs.get("car", "car1-trb1"), name),
+        "ladder": rung(race, trial.env_id, trial.env_kwargs.get("car", DEFAULT_CAR), name),
         **more,
     }
     return {field: row[field] for field in FIELDS}

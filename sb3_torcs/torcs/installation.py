@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+from sb3_torcs.car import DEFAULT_CAR
 from sb3_torcs.errors import (
     GameIncomplete,
     GameNotFound,
@@ -56,7 +57,6 @@ MODULES = (  # what a race without a window needs, in the folder of libraries
 PHYSICS = "modules/simu/simuv2.so"
 SURFACES = "data/tracks/surfaces.xml"
 NOT_ROBOTS = ("human",)
-SCR_CAR = "car1-trb1"  # of the SCR championship, and the default of the environments
 
 
 @dataclass(frozen=True, order=True)
@@ -182,7 +182,7 @@ class Game:
         if not drivers:
             return name, self.find_robot(name, 0).index  # whose error says which there are
         cars = self.cars()
-        best = min(drivers, key=lambda d: (d.car != SCR_CAR, d.car not in cars, d.index))
+        best = min(drivers, key=lambda d: (d.car != DEFAULT_CAR, d.car not in cars, d.index))
         return name, self.find_robot(name, best.index).index
 
     def find_robot(self, name: str, index: int) -> RobotEntry:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Literal
 from xml.etree import ElementTree
 
-from sb3_torcs.car import MANY_LAPS, checked_laps
+from sb3_torcs.car import DEFAULT_CAR, MANY_LAPS, checked_laps
 from sb3_torcs.errors import GameIncomplete, InvalidOption
 from sb3_torcs.torcs.installation import Game
 
@@ -65,7 +65,7 @@ class RaceSetup:
     drivers: Sequence[tuple[str, int]]
     laps: int = MANY_LAPS
     session: Session = "practice"
-    car: str = "car1-trb1"
+    car: str = DEFAULT_CAR
 
     def __post_init__(self) -> None:
         if self.session not in SESSIONS:

@@ -13,7 +13,7 @@ from sb3_torcs.backends.lite import physics
 from sb3_torcs.backends.lite.car import TOP_GEAR
 from sb3_torcs.backends.lite.rays import RANGE, Edges, road_edges
 from sb3_torcs.backends.lite.road import road_width
-from sb3_torcs.car import CarState, Controls, FloatArray, Start
+from sb3_torcs.car import DEFAULT_CAR, CarState, Controls, FloatArray, Start
 from sb3_torcs.errors import CarLost, InvalidOption
 from sb3_torcs.sensors import range_finder_angles
 from sb3_torcs.tracks.catalogue import load_track
@@ -21,7 +21,7 @@ from sb3_torcs.tracks.track import Track
 
 __all__ = ["LiteBackend"]
 
-CARS = ("car1-trb1",)
+CARS = (DEFAULT_CAR,)
 
 
 class LiteBackend:
@@ -40,7 +40,7 @@ class LiteBackend:
         self,
         track: str | Path | Track = "aalborg",
         *,
-        car: str = "car1-trb1",
+        car: str = DEFAULT_CAR,
         range_finders: str | Sequence[float] = "scr",
         gearbox: str = "automatic",
     ) -> None:
