@@ -53,7 +53,7 @@ def robot_samples(name, track):
 
 
 def model_samples(name, track):
-    """What a model does in three laps, once per decision."""
+    """What a model does in three laps, once per timestep."""
     record = driver_record(name)
     env = race_environment(
         record.env_id or "Torcs-v0",
@@ -62,8 +62,8 @@ def model_samples(name, track):
         hyperparameters=record.hyperparameters,
     )
     rows = [
-        {**step.car._asdict(), "throttle": step.action[1], "brake": step.action[2]}
-        for step in drive(env, load_driver(name, env))
+        {**timestep.car._asdict(), "throttle": timestep.action[1], "brake": timestep.action[2]}
+        for timestep in drive(env, load_driver(name, env))
     ]
     env.close()
     return rows

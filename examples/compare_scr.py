@@ -1,7 +1,7 @@
 """Hold the SCR protocol to the engine: the same driver on the same track by both.
 
 The driver decides by what it sees: in the engine, and over SCR in the stock game with our driver
-module. All observations, decisions, lap times and the damage have to be the same. The exit status
+module. All observations, actions, lap times and the damage have to be the same. The exit status
 is 1 if they are not.
 """
 
@@ -21,10 +21,10 @@ from sb3_torcs.cli.common import table
 from sb3_torcs.evaluation.protocol import Driver
 
 ROUNDING = 1e-6  # [-] between observations, which are at most 3
-SAME = 1e-4  # [-] between two actions that count as the same decision
+SAME = 1e-4  # [-] between two actions that count as equal
 MILLISECOND = 0.001  # [s]
 KEPT = ("car", "action_repeat", "range_finders", "action", "gearbox")  # of a model's training
-HEADERS = ("track", "equal", "same decisions", "difference", "laps, engine", "laps, game")
+HEADERS = ("track", "equal", "same actions", "difference", "laps, engine", "laps, game")
 
 
 class Drive(NamedTuple):
@@ -39,9 +39,9 @@ class Drive(NamedTuple):
 class Comparison(NamedTuple):
     """Two drives, the engine's first."""
 
-    decisions: int  # that both made
+    timesteps: int  # that both made
     largest_difference: float  # [-] between observations
-    same_decisions: int  # before the first that differs
+    same_actions: int  # before the first that differs
     laps: tuple[list[float], list[float]]  # [s]
     damage: tuple[float, float]
 
@@ -51,7 +51,7 @@ class Comparison(NamedTuple):
         one, other = self.laps
         return (
             self.largest_difference < ROUNDING
-            and self.same_decisions == self.decisions
+            and self.same_actions == self.timesteps
             and len(one) == len(other)
             and all(abs(a - b) < MILLISECOND for a, b in zip(one, other, strict=True))
             and self.damage[0] == self.damage[1]
@@ -113,7 +113,7 @@ def main() -> None:
     for track in progress(tracks, "racing", console=Console(stderr=True)):
         answer = compare(track, driver, laps=words.laps, **settings)
         all_equal &= answer.equal
-        same = f"{answer.same_decisions} of {answer.decisions}"
+        same = f"{answer.same_actions} of {answer.timesteps}"
         apart = f"{answer.largest_difference:.1e}"
         laps = tuple(map(times, answer.laps))
         rows.append((track, "yes" if answer.equal else "NO", same, apart, *laps))

@@ -19,10 +19,10 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from sb3_torcs.agents.models import find_model, load_driver, saved_steps
+from sb3_torcs.agents.models import find_model, load_driver, saved_timesteps
 from sb3_torcs.cli.common import positive, seed
 from sb3_torcs.errors import OutputNotWritable, Sb3TorcsError
-from sb3_torcs.evaluation.protocol import Step, drive
+from sb3_torcs.evaluation.protocol import Timestep, drive
 from sb3_torcs.files import writable_folder
 from sb3_torcs.training import zoo
 from sb3_torcs.training.run import TrainOptions, train_run
@@ -33,8 +33,8 @@ EVALUATIONS = 40  # of a whole training
 
 STATE, LOG, RUNS = "demo.json", "training.log", "runs"
 MODEL, LAST_MODEL, TENSORBOARD = "model.zip", "last_model.zip", "tensorboard"
-FILM, PICTURE = "lap.mp4", "line.png"
-EVERYTHING = (STATE, LOG, RUNS, MODEL, LAST_MODEL, TENSORBOARD, FILM, PICTURE)
+VIDEO, PICTURE = "lap.mp4", "line.png"
+EVERYTHING = (STATE, LOG, RUNS, MODEL, LAST_MODEL, TENSORBOARD, VIDEO, PICTURE)
 
 
 def main(words: list[str] | None = None) -> int:
@@ -63,7 +63,7 @@ def parse(words: list[str] | None) -> argparse.Namespace:
     )
     how.add_argument("--fresh", action="store_true", help="throw away what is there; start over")
     parser.add_argument(
-        "--timesteps", type=positive, metavar="N", help="decisions to learn from, all runs together"
+        "--timesteps", type=positive, metavar="N", help="timesteps to learn from, all runs together"
     )
     parser.add_argument("--seed", type=seed, default=0, metavar="S", help="default: 0")
     parser.add_argument("--folder", type=Path, default=Path("demo"), help="default: demo")
@@ -77,7 +77,7 @@ def choose(args: argparse.Namespace, wanted: int | None, done: int) -> str:
     if args.go_on or (args.timesteps or 0) > wanted:
         return "continue"
     finished = done >= wanted
-    state = "a finished training" if finished else f"a training, {done:,} of {wanted:,} decisions"
+    state = "a finished training" if finished else f"a training, {done:,} of {wanted:,} timesteps"
     print(f"{args.folder}/ holds {state}.")
     keep = "show" if finished else "continue"
     if not sys.stdin.isatty():
@@ -88,14 +88,14 @@ def choose(args: argparse.Namespace, wanted: int | None, done: int) -> str:
 
 
 def read_state(folder: Path) -> tuple[int | None, int]:
-    """Return the decisions wanted, if a training was ever begun here, and those learned from."""
+    """Return the timesteps wanted, if a training was ever begun here, and those learned from."""
     if not (folder / STATE).is_file():
         return None, 0
     try:
         wanted = int(json.loads((folder / STATE).read_text())["timesteps"])
     except (ValueError, KeyError, TypeError):  # a full disk took half of it
         wanted = shipped_timesteps()
-    return wanted, sum(saved_steps(find_model(run, prefer_last=True)) for run in runs(folder))
+    return wanted, sum(saved_timesteps(find_model(run, prefer_last=True)) for run in runs(folder))
 
 
 def runs(folder: Path) -> list[Path]:
@@ -122,12 +122,12 @@ def clear(folder: Path) -> None:
 
 
 def shipped_timesteps() -> int:
-    """Return the decisions that the shipped hyperparameters ask for."""
+    """Return the timesteps that the shipped hyperparameters ask for."""
     return int(zoo.read_entry(zoo.config_file(ALGO), ENV)["n_timesteps"])
 
 
 def train(folder: Path, wanted: int, done: int, seed: int) -> bool:
-    """Learn from the decisions that are still wanted; say whether Ctrl-C ended it."""
+    """Learn from the timesteps that are still wanted; say whether Ctrl-C ended it."""
     before = runs(folder)
     (folder / STATE).write_text(json.dumps({"timesteps": wanted, "seed": seed}))
     options = TrainOptions(
@@ -142,13 +142,13 @@ def train(folder: Path, wanted: int, done: int, seed: int) -> bool:
         resume=find_model(before[-1], prefer_last=True) if before else None,
     )
     verb = "goes on learning" if before else "learns"
-    print(f"DDPG {verb} to drive {TRACK}: {wanted - done:,} decisions, log in {folder / LOG}.")
+    print(f"DDPG {verb} to drive {TRACK}: {wanted - done:,} timesteps, log in {folder / LOG}.")
     print("Ctrl-C keeps what was learned so far.", flush=True)
     try:
         # The zoo's tables would run through the progress bar.
         with (folder / LOG).open("a", buffering=1) as log, contextlib.redirect_stdout(log):
             interrupted = train_run(options).interrupted
-    except KeyboardInterrupt:  # before the first decision, or a third time
+    except KeyboardInterrupt:  # before the first timestep, or a third time
         interrupted = True
     forget(folder)
     return interrupted
@@ -156,10 +156,10 @@ def train(folder: Path, wanted: int, done: int, seed: int) -> bool:
 
 def forget(folder: Path) -> None:
     """Drop all replay buffers but the newest: they are large, and only that one is of use."""
-    memories = [run / "replay_buffer.pkl" for run in runs(folder)]
-    if memories and memories[-1].is_file():
-        for memory in memories[:-1]:
-            memory.unlink(missing_ok=True)
+    buffers = [run / "replay_buffer.pkl" for run in runs(folder)]
+    if buffers and buffers[-1].is_file():
+        for buffer in buffers[:-1]:
+            buffer.unlink(missing_ok=True)
 
 
 def best_model(folder: Path) -> Path:
@@ -183,7 +183,7 @@ def show(folder: Path, interrupted: bool) -> bool:
     steps: dict[str, Callable[[Path], str]] = {
         "the models": keep_models,
         "the picture": draw,
-        "the film": film,
+        "the video": video,
     }
     return not all([attempt(name, step, folder) for name, step in steps.items()])
 
@@ -216,37 +216,37 @@ def car_and_driver(folder: Path, **options: Any) -> Iterator[tuple[Any, Any]]:
         env.close()
 
 
-def best_lap(folder: Path) -> tuple[list[Step], slice, float | None]:
+def best_lap(folder: Path) -> tuple[list[Timestep], slice, float | None]:
     """Drive some laps; return the drive, where in it the best lap is, and its time in seconds."""
     with car_and_driver(folder) as (env, driver):
-        steps = list(drive(env, driver, seed=0))
-    best, seconds, first = slice(0, len(steps)), None, 0
-    for number, step in enumerate(steps):
-        lap_time = step.info["lap_time"]
+        timesteps = list(drive(env, driver, seed=0))
+    best, seconds, first = slice(0, len(timesteps)), None, 0
+    for number, timestep in enumerate(timesteps):
+        lap_time = timestep.info["lap_time"]
         if not lap_time:
             continue
         if seconds is None or lap_time < seconds:
             best, seconds = slice(first, number + 1), lap_time
         first = number + 1
-    return steps, best, seconds
+    return timesteps, best, seconds
 
 
 def draw(folder: Path) -> str:
     from sb3_torcs.tracks.catalogue import load_track
     from sb3_torcs.tracks.plot import plot_track
 
-    steps, lap, seconds = best_lap(folder)
-    cars = [step.car for step in steps[lap]]
+    timesteps, lap, seconds = best_lap(folder)
+    cars = [timestep.car for timestep in timesteps[lap]]
     line = np.array([(car.x, car.y) for car in cars])
     speed = np.array([car.speed_x for car in cars])
     plot_track(load_track(TRACK), folder / PICTURE, line=line, speed=speed)
-    return f"{folder / PICTURE}: {described(seconds, steps)}"
+    return f"{folder / PICTURE}: {described(seconds, timesteps)}"
 
 
-def film(folder: Path) -> str:
+def video(folder: Path) -> str:
     from sb3_torcs.rendering.encoder import write_video
 
-    steps, lap, seconds = best_lap(folder)
+    timesteps, lap, seconds = best_lap(folder)
     with car_and_driver(folder, render_mode="rgb_array") as (env, driver):
         # The same drive again: it is deterministic.
         frames = (
@@ -255,14 +255,14 @@ def film(folder: Path) -> str:
             if lap.start <= number < lap.stop
         )
         fps = env.unwrapped.metadata["render_fps"]
-        write_video(folder / FILM, frames, fps, lap.stop - lap.start)
-    return f"{folder / FILM}: {described(seconds, steps)}"
+        write_video(folder / VIDEO, frames, fps, lap.stop - lap.start)
+    return f"{folder / VIDEO}: {described(seconds, timesteps)}"
 
 
-def described(seconds: float | None, steps: list[Step]) -> str:
+def described(seconds: float | None, timesteps: list[Timestep]) -> str:
     if seconds is not None:
         return f"its best lap of {LAPS}, {seconds:.2f} s"
-    return f"no whole lap yet: {steps[-1].car.distance_raced:.0f} m"
+    return f"no whole lap yet: {timesteps[-1].car.distance_raced:.0f} m"
 
 
 def last_words(folder: Path) -> str:
@@ -273,7 +273,7 @@ def last_words(folder: Path) -> str:
     for name, what, command in (
         (MODEL, "the best model by evaluation", [tool("sb3-torcs"), "evaluate", MODEL, *laps]),
         (TENSORBOARD, "how it learned", [tool("tensorboard"), "--logdir", TENSORBOARD]),
-        (FILM, "its best drive, seen from above", ["xdg-open", FILM]),
+        (VIDEO, "its best drive, seen from above", ["xdg-open", VIDEO]),
         (PICTURE, "the line it drove, coloured by speed", ["xdg-open", PICTURE]),
     ):
         path = str(folder / name)
@@ -283,7 +283,7 @@ def last_words(folder: Path) -> str:
     if wanted is None or not done:
         lines.append(f"Nothing was learned yet. Begin with: {again(folder, '--fresh')}")
         return "\n".join(lines)
-    lines.append(f"\nLearned from {done:,} of {wanted:,} decisions.")
+    lines.append(f"\nLearned from {done:,} of {wanted:,} timesteps.")
     more = "--continue" if done < wanted else f"--continue --timesteps {2 * wanted}"
     lines += [f"Go on:      {again(folder, more)}", f"Start over: {again(folder, '--fresh')}"]
     return "\n".join(lines)

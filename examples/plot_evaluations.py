@@ -22,7 +22,7 @@ for row, run in zip(rows, args.runs, strict=True):
     row.set_title(f"{run}", fontsize=8, loc="left", pad=2)
     row.grid(alpha=0.3)
 rows[-1].set_ylim(bottom=0.0)  # of all rows: they share the axis
-rows[-1].set_xlabel("decisions learned from")
+rows[-1].set_xlabel("timesteps learned from")
 figure.supylabel("return of the evaluation from the grid", fontsize=9)
 figure.savefig(args.out, dpi=110)
 print(f"{args.out}: the red point is the model that was kept")

@@ -34,7 +34,7 @@ pedal = [0.0, 1.0, 0.3]  # mu, theta [1/s], sigma
 callbacks = [
     RandomStartCallback(),  # an episode may begin anywhere, so that every corner is practised
     NoiseCallback(kind="ou", dt=0.1, steering=[0.0, 1.0, 0.2], throttle=pedal, brake=pedal),
-    NoiseDecayCallback(frames=int(0.7 * args.timesteps), floor=0.2),
+    NoiseDecayCallback(timesteps=int(0.7 * args.timesteps), floor=0.2),
     EvalCallback(eval_env, eval_freq=1500, n_eval_episodes=1, best_model_save_path=args.folder),
 ]
 model.learn(args.timesteps, callback=callbacks)

@@ -12,7 +12,7 @@ __all__ = ["__version__", "register_envs"]
 __version__ = "0.1.0"
 
 MAX_EPISODE_STEPS = 3000
-"""Decisions after which an episode is truncated: five minutes at the default action repeat."""
+"""Timesteps after which an episode is truncated: five minutes at the default action repeat."""
 
 
 def register_envs() -> None:
@@ -22,7 +22,7 @@ def register_envs() -> None:
         ("Torcs-v0", "sb3_torcs.envs.torcs:TorcsEnv", "sb3_torcs.envs.torcs_vector:TorcsVectorEnv"),
     ):
         if name not in registry:
-            # Gymnasium's passive checker would look at the first steps of each environment and
+            # Gymnasium's passive checker would look at the first timesteps of each environment and
             # then stand in the way of all others; the tests run both libraries' full checks.
             register(
                 name,

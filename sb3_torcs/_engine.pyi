@@ -71,7 +71,7 @@ class Fleet:
     def __init__(self, engines: Sequence[Engine], threads: int) -> None: ...
     def begin(
         self,
-        place: int,
+        index: int,
         steering: float,
         throttle: float,
         brake: float,
@@ -79,7 +79,7 @@ class Fleet:
         ticks: int,
         clutch: float = 0.0,
     ) -> None: ...
-    def wait(self, place: int) -> CarState: ...
+    def wait(self, index: int) -> CarState: ...
     def finish(self) -> None: ...
 
 def scr_format_state(  # 79 numbers, SI, in the protocol's order

@@ -36,7 +36,7 @@ DEFAULT_CAR = "car1-trb1"
 """The car of the SCR championship, which all worlds have."""
 
 CONTROL_TICK = 0.02
-"""[s] The interval at which TORCS calls its robots; one decision lasts a whole number of them."""
+"""[s] The interval at which TORCS calls its robots; one timestep lasts a whole number of them."""
 
 
 MANY_LAPS = 1 << 30

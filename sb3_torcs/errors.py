@@ -6,7 +6,10 @@ Each message says what was received, what is allowed, and what to type next.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+import functools
+import warnings
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, TypeVar
 
 __all__ = [
     "BackendUnavailable",
@@ -45,7 +48,12 @@ __all__ = [
     "UnknownRobot",
     "WorkerLost",
     "ZooConfigError",
+    "near_miss",
+    "renamed",
+    "with_new_names",
 ]
+
+Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 class Sb3TorcsError(Exception):
@@ -205,3 +213,44 @@ def near_miss(name: str, known: Iterable[str], advice: str = "") -> str:
     suggestion = [f"did you mean '{close[0]}'?"] if close else []
     ending = " ".join([*suggestion, advice] if advice else suggestion)
     return f"; {ending}" if ending else ""
+
+
+def with_new_names(arguments: Mapping[str, Any], names: Mapping[str, str]) -> dict[str, Any]:
+    """
+    Replace older names of arguments, with a ``DeprecationWarning`` for each.
+
+    :param arguments: keyword arguments
+    :param names: the older names and what they are called now
+    :return: the arguments by their present names
+    :raises TypeError: if an argument is given by both names
+    """
+    result = dict(arguments)
+    for old in names.keys() & arguments.keys():
+        new = names[old]
+        if new in arguments:
+            raise TypeError(f"'{old}' is the older name of '{new}'; pass only '{new}'")
+        said = f"'{old}' is now called '{new}'; the older name will be removed in version 0.2"
+        warnings.warn(said, DeprecationWarning, stacklevel=3)
+        result[new] = result.pop(old)
+    return result
+
+
+def renamed(**names: str) -> Callable[[Function], Function]:
+    """
+    Let a function take keyword arguments by their older names, too.
+
+    The names are kept in the function's ``older_names``.
+
+    :param names: ``old="new"``
+    :return: the decorator
+    """
+
+    def decorate(function: Function) -> Function:
+        @functools.wraps(function)
+        def call(*args: Any, **kwargs: Any) -> Any:
+            return function(*args, **with_new_names(kwargs, names))
+
+        call.older_names = names  # type: ignore[attr-defined]
+        return call  # type: ignore[return-value]
+
+    return decorate

@@ -2,7 +2,7 @@
 
 Steering is in [-1, 1], throttle and brake in [0, 1]. SB3 adds noise to actions scaled to [-1, 1]
 and stores those; the conversion is done here. A noise has its own seeded generator, is saved with
-the model, and goes on after a resume with its count of frames.
+the model, and goes on after a resume with its count of timesteps.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class OUParameters(NamedTuple):
     """How one actuator is perturbed."""
 
     mu: float  # [actuator's unit] where the noise pulls: an action or an offset, see the noises
-    theta: float  # [1/decision], or [1/s] with a dt in seconds: how strongly
+    theta: float  # [1/timestep], or [1/s] with a dt in seconds: how strongly
     sigma: float  # [actuator's unit per root of theta's time] how much chance
 
     @classmethod
@@ -77,9 +77,9 @@ BLOG = (
 
 
 class StochasticBrake(NamedTuple):
-    """In some of the steps, the brake gets other parameters."""
+    """In some of the timesteps, the brake gets other parameters."""
 
-    probability: float  # [-] share of the steps
+    probability: float  # [-] share of the timesteps
     parameters: OUParameters
 
 
@@ -103,10 +103,10 @@ class _PolicyWatch:
 
     def action(self, index: int) -> FloatArray | None:
         """
-        Look up what the policy decided for the present step.
+        Look up what the policy decided for the present timestep.
 
         :param index: which of the parallel environments
-        :return: (3,) in environment units, ``None`` before the first decision
+        :return: (3,) in environment units, ``None`` before the first timestep
         """
         if self.last is None or index >= len(self.last):
             return None
@@ -118,7 +118,7 @@ class ActuatorNoise(ActionNoise):
     """
     What both noises share.
 
-    ``scale`` multiplies the noise, ``frames`` counts the steps of all parallel environments, and
+    ``scale`` multiplies the noise, ``timesteps`` counts those of all parallel environments, and
     ``stochastic_brake`` is :class:`StochasticBrake` or ``None``.
 
     :param steering: ``[mu, theta, sigma]`` in environment units
@@ -138,7 +138,7 @@ class ActuatorNoise(ActionNoise):
         super().__init__()
         self.parameters = tuple(OUParameters.of(value) for value in (steering, throttle, brake))
         self.scale = 1.0
-        self.frames = 0
+        self.timesteps = 0
         self.n_envs = 1
         self.stochastic_brake: StochasticBrake | None = None
         self._rng = np.random.default_rng(seed)
@@ -147,14 +147,14 @@ class ActuatorNoise(ActionNoise):
 
     def __call__(self) -> npt.NDArray[np.float32]:
         """
-        Draw the noise of one step.
+        Draw the noise of one timestep.
 
         :return: (3,) to add to SB3's scaled action; zeros while SB3 still acts by lot
         """
-        self.frames += self.n_envs
+        self.timesteps += self.n_envs
         if self._watch is not None and self._watch.warming_up():
             return np.zeros(len(GAIN), np.float32)
-        mu, theta, sigma = np.array(self._parameters_of_step()).T
+        mu, theta, sigma = np.array(self._parameters_of_timestep()).T
         noise = self._draw(mu, theta, sigma, self._rng.standard_normal(len(GAIN)))
         return (self.scale * noise * GAIN).astype(np.float32)
 
@@ -164,7 +164,7 @@ class ActuatorNoise(ActionNoise):
     ) -> FloatArray:
         """Return the noise (3,) in environment units, from standard normal numbers."""
 
-    def _parameters_of_step(self) -> tuple[OUParameters, ...]:
+    def _parameters_of_timestep(self) -> tuple[OUParameters, ...]:
         other = self.stochastic_brake
         if other is None or self._rng.random() >= other.probability:
             return self.parameters
@@ -190,6 +190,11 @@ class ActuatorNoise(ActionNoise):
         # Those of the callbacks of one training, not of the noise.
         return {**self.__dict__, "_watch": None, "stochastic_brake": None}
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        # Models of older versions count in `timesteps`.
+        counted = {"timesteps": state["timesteps"]} if "timesteps" in state else {}
+        self.__dict__.update({k: v for k, v in state.items() if k != "timesteps"} | counted)
+
     def __deepcopy__(self, memo: dict[int, Any]) -> ActuatorNoise:
         # SB3 makes the noises of parallel environments by deep copies: each needs a stream of
         # its own. Pickles, on the other hand, go on with the same stream.
@@ -199,14 +204,15 @@ class ActuatorNoise(ActionNoise):
         return twin
 
     def __repr__(self) -> str:
-        return f"{type(self).__name__}{self.parameters}, scale={self.scale}, frames={self.frames}"
+        counted = f"scale={self.scale}, timesteps={self.timesteps}"
+        return f"{type(self).__name__}{self.parameters}, {counted}"
 
 
 class SetPointNoise(ActuatorNoise):
     """
     The noise of the original code: ``scale * (theta * (mu - a) + sigma * N(0, 1))``.
 
-    It is a function of the policy's present action ``a``, without memory: at scale 1 and theta 1
+    It is a function of the policy's present action ``a`` alone: at scale 1 and theta 1
     the car does what ``mu`` says, whatever the policy says. It has to know the policy:
     :class:`~sb3_torcs.callbacks.NoiseCallback` binds it.
     """
@@ -229,10 +235,10 @@ class OUNoise(ActuatorNoise):
     The Ornstein-Uhlenbeck process dx = theta (mu - x) dt + sigma dW, added to the policy's action.
 
     Discretised exactly (Gillespie 1996, doi 10.1103/PhysRevE.54.2084), so that its stationary mean
-    ``mu`` and variance ``sigma^2 / (2 theta)`` do not depend on the time step. ``mu`` is an offset
+    ``mu`` and variance ``sigma^2 / (2 theta)`` do not depend on the timestep. ``mu`` is an offset
     here: 0 keeps the actions centred on the policy's. Each episode starts at ``mu``.
 
-    :param dt: duration of one decision in the unit of 1/theta: 1 decision, or its seconds
+    :param dt: duration of one timestep in the unit of 1/theta: 1 timestep, or its seconds
     :param kwargs: as in :class:`ActuatorNoise`
     """
 
@@ -258,13 +264,13 @@ class OUNoise(ActuatorNoise):
 
 def checked_dt(dt: float) -> float:
     """
-    Check a time step.
+    Check a timestep.
 
-    :param dt: duration of one decision
+    :param dt: duration of one timestep
     :return: the same
     """
     if not is_number(dt) or dt <= 0.0:
-        raise InvalidOption(f"dt={dt!r}: pass a duration above 0, e.g. dt=1.0 (one decision)")
+        raise InvalidOption(f"dt={dt!r}: pass a duration above 0, e.g. dt=1.0 (one timestep)")
     return float(dt)
 
 

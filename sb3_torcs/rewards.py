@@ -1,6 +1,6 @@
 """Rewards as sentences over measurements: named terms, weights, a sum.
 
-A term is a rate per second of simulated time, measured over one decision; a reward is the sum of
+A term is a rate per second of simulated time, measured over one timestep; a reward is the sum of
 weight × term × duration × scale, plus a single crash term when the episode ends badly. So the
 return of a drive does not depend on how often the agent decides.
 """
@@ -37,7 +37,7 @@ def speed_off_axis(before: CarState, after: CarState, controls: Controls) -> flo
 
 
 def progress(before: CarState, after: CarState, controls: Controls) -> float:
-    """Metres of road gained per second [m/s]: exact over a decision, where speeds are samples."""
+    """Metres of road gained per second [m/s]: exact over a timestep, where speeds are samples."""
     return (after.distance_raced - before.distance_raced) / (after.time - before.time)
 
 
@@ -147,16 +147,16 @@ class Reward:
         self, before: CarState, after: CarState, controls: Controls, end: str | None
     ) -> dict[str, float]:
         """
-        Value one decision.
+        Value one timestep.
 
-        :param before: the car when the decision was taken
+        :param before: the car at the beginning of the timestep
         :param after: the car when it had been carried out
         :param controls: what was done
         :param end: why the episode ended, or ``None``
         :return: the weighted terms, ``crash`` last; their sum is the reward
         """
         seconds = after.time - before.time
-        terms = {}  # filled in a loop: a comprehension is one more call per decision
+        terms = {}  # filled in a loop: a comprehension is one more call per timestep
         for name, term, weight in self._terms:
             # A car that is lost stays where and when it was: no time, no rate.
             terms[name] = weight * seconds * term(before, after, controls) if seconds else 0.0

@@ -114,7 +114,7 @@ def test_without_the_game_its_figures_stay_empty(monkeypatch):
 
 
 @pytest.mark.slow
-def test_environment_and_callbacks_are_a_small_part_of_a_training_step():
+def test_environment_and_callbacks_are_a_small_part_of_a_training_timestep():
     """Whoever trains waits for the networks, not for the simulator."""
     share = training_share(100)["training_env_share"]
     assert 0.0 < share <= 0.1

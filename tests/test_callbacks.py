@@ -13,6 +13,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 from toy import ToyRace
 
 from sb3_torcs.callbacks import (
+    DrivingMetricsCallback,
     GradientStepsCallback,
     MirrorCallback,
     NoiseCallback,
@@ -28,7 +29,7 @@ SET_POINT = {"steering": [0, 1, 0], "throttle": [0.5, 1, 0], "brake": [-0.1, 1, 
 
 
 class Spy(BaseCallback):
-    """Notes the noise's scale, the actions, the infos and the logged values of every step."""
+    """Notes the noise's scale, the actions, the infos and the logged values of every timestep."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -76,7 +77,7 @@ def test_noise_callback_installs_one_noise_per_environment(kind, cls, n_envs):
     learn(model, 12, NoiseCallback(kind=kind))
     assert [type(noise) for noise in noises_of(model)] == [cls] * n_envs
     assert isinstance(model.action_noise, VectorizedActionNoise) is (n_envs > 1)
-    assert [noise.frames for noise in noises_of(model)] == [12] * n_envs
+    assert [noise.timesteps for noise in noises_of(model)] == [12] * n_envs
 
 
 @pytest.mark.parametrize("n_envs", [1, 3])
@@ -128,7 +129,7 @@ def test_nothing_is_added_during_the_warm_up():
 @pytest.mark.parametrize("kind", ["set_point", "ou"])
 def test_a_resumed_model_goes_on_with_its_noise(tmp_path, kind, before, after):
     """Frames and scale survive save and load, also with another number of environments."""
-    callbacks = [NoiseCallback(kind=kind), NoiseDecayCallback(frames=100)]
+    callbacks = [NoiseCallback(kind=kind), NoiseDecayCallback(timesteps=100)]
     model = make_model(before)
     learn(model, 40, *callbacks)
     model.save(tmp_path / "model")
@@ -136,7 +137,7 @@ def test_a_resumed_model_goes_on_with_its_noise(tmp_path, kind, before, after):
     resumed = DDPG.load(tmp_path / "model", env=env, device="cpu")
     resumed.set_logger(Logger(None, []))
     spy = learn(resumed, 20, *callbacks)
-    assert [noise.frames for noise in noises_of(resumed)] == [60] * after
+    assert [noise.timesteps for noise in noises_of(resumed)] == [60] * after
     assert spy.scales[0] == 1.0 - (40 + after) / 100
     streams = {noise._rng.random() for noise in noises_of(resumed)}
     assert len(streams) == after
@@ -149,7 +150,7 @@ def test_a_resumed_noise_takes_the_new_parameters():
     noise = model.action_noise
     learn(model, 5, NoiseCallback(kind="ou", steering=[0, 1, 0.9], dt=0.2))
     assert model.action_noise is noise
-    assert (noise.parameters[0].sigma, noise.dt, noise.frames) == (0.9, 0.2, 10)
+    assert (noise.parameters[0].sigma, noise.dt, noise.timesteps) == (0.9, 0.2, 10)
 
 
 def test_another_kind_continues_the_count_of_frames():
@@ -158,7 +159,7 @@ def test_another_kind_continues_the_count_of_frames():
     learn(model, 5, NoiseCallback(kind="set_point"))
     learn(model, 5, NoiseCallback(kind="ou"))
     assert type(model.action_noise) is OUNoise
-    assert model.action_noise.frames == 10
+    assert model.action_noise.timesteps == 10
     assert len(model.actor._forward_hooks) == 1
 
 
@@ -199,21 +200,21 @@ def test_set_point_noise_without_the_callback_says_so():
 
 @pytest.mark.parametrize("n_envs", [1, 2])
 def test_decay_is_linear_down_to_the_floor(n_envs):
-    """1 - 0.8 k/20 after k frames, then 0.2 for ever; every environment counts."""
-    decay = NoiseDecayCallback(frames=20, floor=0.2)
+    """1 - 0.8 k/20 after k timesteps, then 0.2 for ever; every environment counts."""
+    decay = NoiseDecayCallback(timesteps=20, floor=0.2)
     spy = learn(make_model(n_envs), 30, decay, NoiseCallback(kind="ou"))
-    frames = np.arange(n_envs, 31, n_envs)
-    expected = [1.0 - (1.0 - 0.2) * min(k / 20, 1.0) for k in frames]
+    timesteps = np.arange(n_envs, 31, n_envs)
+    expected = [1.0 - (1.0 - 0.2) * min(k / 20, 1.0) for k in timesteps]
     np.testing.assert_array_equal(spy.scales, expected)
     assert spy.logged["noise/scale"] == pytest.approx(0.2)
     assert spy.logged["noise/frames"] == 30
 
 
 def test_decay_counts_for_a_noise_that_came_with_the_model():
-    """Without NoiseCallback: SB3 copies the noise for two environments, frames count double."""
+    """Without NoiseCallback: SB3 copies the noise for two environments, timesteps count double."""
     model = make_model(2, action_noise=OUNoise(seed=0))
-    learn(model, 20, NoiseDecayCallback(frames=40))
-    assert [noise.frames for noise in noises_of(model)] == [20, 20]
+    learn(model, 20, NoiseDecayCallback(timesteps=40))
+    assert [noise.timesteps for noise in noises_of(model)] == [20, 20]
     assert [noise.scale for noise in noises_of(model)] == [0.5, 0.5]
 
 
@@ -225,7 +226,24 @@ def test_steering_a_noise_that_is_not_there_is_an_error(callback):
 
 
 @pytest.mark.parametrize(
-    "bad", [{"frames": 0}, {"floor": -0.1}, {"floor": 1.1}, {"frames": "1e5"}, {"floor": None}]
+    ("callback", "older", "newer", "more"),
+    [
+        (NoiseDecayCallback, "timesteps", "timesteps", {}),
+        (GradientStepsCallback, "timesteps", "timesteps", {"gradient_steps": 2}),
+        (DrivingMetricsCallback, "line_timesteps", "line_timesteps", {}),
+    ],
+)
+def test_an_argument_keeps_its_older_name_for_one_version(callback, older, newer, more):
+    """It warns and does the same; both names at once would contradict each other."""
+    with pytest.warns(DeprecationWarning, match=f"'{older}' is now called '{newer}'"):
+        assert getattr(callback(**{older: 12}, **more), newer) == 12
+    with pytest.raises(TypeError, match=f"pass only '{newer}'"):
+        callback(**{older: 12, newer: 12}, **more)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [{"timesteps": 0}, {"floor": -0.1}, {"floor": 1.1}, {"timesteps": "1e5"}, {"floor": None}],
 )
 def test_a_decay_that_is_none_is_refused(bad):
     """Values that would divide by zero or grow."""
@@ -235,7 +253,7 @@ def test_a_decay_that_is_none_is_refused(bad):
 
 @pytest.mark.parametrize("kind", ["set_point", "ou"])
 @pytest.mark.parametrize("n_envs", [1, 2])
-def test_stochastic_brake_overrides_its_share_of_the_steps(kind, n_envs):
+def test_stochastic_brake_overrides_its_share_of_the_timesteps(kind, n_envs):
     """With probability 1 each step pulls to its mu; afterwards the noise is as before."""
     brake = [0, 1, 0]
     noise = NoiseCallback(kind=kind, brake=brake)
@@ -246,19 +264,19 @@ def test_stochastic_brake_overrides_its_share_of_the_steps(kind, n_envs):
     assert all(noise.stochastic_brake is None for noise in noises_of(model))
 
 
-def test_the_brake_of_the_post_brakes_in_every_tenth_step():
-    """mu 0.2 +- 0.1 in 10 % of the steps: above 5 % brake in 9.3 %, else in hardly any."""
+def test_the_brake_of_the_post_brakes_in_every_tenth_timestep():
+    """mu 0.2 +- 0.1 in 10 % of the timesteps: above 5 % brake in 9.3 %, else in hardly any."""
     model = make_model()
     spy = learn(model, 1500, NoiseCallback(seed=3), StochasticBrakeCallback())
     brake = np.array(spy.actions)[:, 2]
     share = (brake > 0.05).mean()
-    # 10 % times P(N > -1.5) = 93 %, and 0.13 % of the other steps; four standard errors.
+    # 10 % times P(N > -1.5) = 93 %, and 0.13 % of the other timesteps; four standard errors.
     assert share == pytest.approx(0.0945, abs=4 * np.sqrt(0.0945 * 0.9055 / 1500))
 
 
 def test_a_share_that_is_none_is_refused():
     """Ten per cent is 0.1, not 10."""
-    with pytest.raises(InvalidOption, match=r"share of the steps in \[0, 1\]"):
+    with pytest.raises(InvalidOption, match=r"share of the timesteps in \[0, 1\]"):
         StochasticBrakeCallback(probability=10)
 
 
@@ -316,7 +334,7 @@ def test_evaluation_keeps_its_reward_unless_asked(also_eval, expected):
         (RandomStartCallback, {"speed": "fast"}, "expected 0 to 150 m/s"),
         (NoiseCallback, {"kind": 5}, "pass 'set_point' or 'ou'"),
         (NoiseCallback, {"dt": "1e-1"}, "pass a duration above 0"),
-        (StochasticBrakeCallback, {"probability": "10 %"}, "a share of the steps"),
+        (StochasticBrakeCallback, {"probability": "10 %"}, "a share of the timesteps"),
     ],
 )
 def test_a_wrong_value_is_told_when_the_callback_is_made(callback, options, message):
@@ -352,10 +370,10 @@ class Updates(BaseCallback):
         return True
 
 
-def test_a_young_training_learns_more_from_each_decision():
+def test_a_young_training_learns_more_from_each_timestep():
     """Three updates in each of the first four rollouts, one thereafter; saved models say one."""
     model, updates = make_model(2, gradient_steps=1), Updates()
-    learn(model, 12, GradientStepsCallback(gradient_steps=3, frames=8), updates)
+    learn(model, 12, GradientStepsCallback(gradient_steps=3, timesteps=8), updates)
     assert updates.counts == [0, 3, 6, 9, 12, 13]
     assert updates.saved == [1] * 6
     assert (model._n_updates, model.gradient_steps) == (14, 1)
@@ -363,9 +381,9 @@ def test_a_young_training_learns_more_from_each_decision():
 
 @pytest.mark.parametrize("reset", [False, True])
 def test_a_training_that_goes_on_is_no_longer_young(reset):
-    """The decisions are counted over all its parts, whatever SB3 counts."""
+    """The timesteps are counted over all its parts, whatever SB3 counts."""
     model = make_model(gradient_steps=1)
-    callback = GradientStepsCallback(gradient_steps=3, frames=6)
+    callback = GradientStepsCallback(gradient_steps=3, timesteps=6)
     learn(model, 4, callback)
     model.learn(4, callback=callback, reset_num_timesteps=reset)
     assert model._n_updates == 6 * 3 + 2
@@ -375,16 +393,17 @@ def test_gradient_steps_need_an_algorithm_with_a_replay():
     """PPO has none to set."""
     model = PPO("MlpPolicy", make_vec_env(ToyRace), n_steps=8, batch_size=8, device="cpu")
     with pytest.raises(InvalidOption, match="off-policy algorithms, but the model is a PPO"):
-        model.learn(8, callback=GradientStepsCallback(gradient_steps=2, frames=10))
+        model.learn(8, callback=GradientStepsCallback(gradient_steps=2, timesteps=10))
 
 
 @pytest.mark.parametrize(
-    "options", [{"gradient_steps": 0}, {"frames": 0}, {"gradient_steps": 2.5}, {"frames": "1e5"}]
+    "options",
+    [{"gradient_steps": 0}, {"timesteps": 0}, {"gradient_steps": 2.5}, {"timesteps": "1e5"}],
 )
 def test_gradient_steps_are_at_least_one(options):
     """None at all is what `learning_starts` is for."""
     with pytest.raises(InvalidOption, match="whole numbers of at least 1"):
-        GradientStepsCallback(**{"gradient_steps": 2, "frames": 10, **options})
+        GradientStepsCallback(**{"gradient_steps": 2, "timesteps": 10, **options})
 
 
 @pytest.mark.parametrize(
@@ -396,7 +415,7 @@ def test_gradient_steps_are_at_least_one(options):
         RandomStartCallback,
         MirrorCallback,
         lambda *args: RewardCallback(*args, reward="blog"),
-        lambda *args: GradientStepsCallback(*args, gradient_steps=2, frames=10),
+        lambda *args: GradientStepsCallback(*args, gradient_steps=2, timesteps=10),
     ],
 )
 def test_arguments_are_by_name_only(callback):

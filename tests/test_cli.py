@@ -424,7 +424,7 @@ def test_a_model_of_several_tracks_has_to_be_told_one():
 
 
 def test_the_time_limit_cuts_no_lap_of_a_car_that_does_not_count_as_standing():
-    """Three laps of 2587.5 m at 5 km/h take 5589 s, and a decision takes 0.1 s."""
+    """Three laps of 2587.5 m at 5 km/h take 5589 s, and a timestep takes 0.1 s."""
     kwargs = {"track": "aalborg", "laps": 3}
     assert evaluation.time_limit(kwargs) > 55890
     assert evaluation.time_limit({**kwargs, "action_repeat": 1}) > 5 * 55890
@@ -449,18 +449,18 @@ def test_an_evaluation_writes_its_drives_as_the_robots_are_written(capsys, tmp_p
     assert [file.name for file in tmp_path.iterdir()] == ["drive.csv"]
 
 
-def decision(lap_time=None, distance=0.0):
-    return recording.Decision(None, types.SimpleNamespace(distance_raced=distance), lap_time)
+def timestep(lap_time=None, distance=0.0):
+    return recording.Timestep(None, types.SimpleNamespace(distance_raced=distance), lap_time)
 
 
 def test_the_best_stretch_is_the_fastest_whole_lap():
-    slow_then_fast = [decision(), decision(90.0), decision(), decision(80.0), decision()]
-    stretch = recording.best_stretch([[decision(), decision(85.0)], slow_then_fast])
+    slow_then_fast = [timestep(), timestep(90.0), timestep(), timestep(80.0), timestep()]
+    stretch = recording.best_stretch([[timestep(), timestep(85.0)], slow_then_fast])
     assert stretch == (1, 2, 4)
 
 
 def test_without_a_whole_lap_the_best_stretch_is_the_longest_drive():
-    episodes = [[decision(distance=5.0)], [decision(distance=1.0), decision(distance=9.0)]]
+    episodes = [[timestep(distance=5.0)], [timestep(distance=1.0), timestep(distance=9.0)]]
     assert recording.best_stretch(episodes) == (1, 0, 2)
 
 
@@ -486,12 +486,12 @@ def test_an_episode_is_driven_again_exactly(recorded):
     env.close()
 
 
-def test_a_stretch_is_filmed_in_real_time(recorded, tmp_path):
-    """12 decisions of 0.1 s at 25 frames per second."""
+def test_a_stretch_is_recorded_in_real_time(recorded, tmp_path):
+    """12 timesteps of 0.1 s at 25 frames per second."""
     frames = list(recorded._frames(recording.best_stretch(recorded.episodes), 5))
     assert len(frames) == 30
     assert {frame.shape for frame in frames} == {frames[0].shape}
-    recorded.film(tmp_path / "v.mp4")
+    recorded.save_video(tmp_path / "v.mp4")
     assert (tmp_path / "v.mp4").stat().st_size > 1000
 
 
@@ -507,7 +507,7 @@ def test_an_output_that_takes_no_more_is_told():
         process = subprocess.run(
             command, stdout=full, stderr=subprocess.PIPE, text=True, check=False
         )
-    said = "sb3-torcs: No space left on device: the output; make room, or choose another place\n"
+    said = "sb3-torcs: No space left on device: the output; make room, or choose another folder\n"
     assert (process.returncode, process.stderr) == (2, said)
 
 
@@ -605,9 +605,9 @@ def test_a_training_leaves_models_and_logs(capsys, tmp_path):
     status, out, err = run(capsys, "train", *words)
     folder = tmp_path / "logs" / "ddpg" / "TorcsLite-v0_1"
     assert status == 0
-    assert "100% 60/60 steps" in err
+    assert "100% 60/60 timesteps" in err
     assert f"best model by evaluation: {folder / 'best_model.zip'}" in out
-    assert models.saved_steps(folder / "TorcsLite-v0.zip") == 60
+    assert models.saved_timesteps(folder / "TorcsLite-v0.zip") == 60
     assert (folder / "rl_model_30_steps.zip").is_file()
     assert list((tmp_path / "logs" / "tensorboard").rglob("events.*")) != []
     for name in ("best_model.zip", "TorcsLite-v0.zip", "rl_model_30_steps.zip"):
@@ -642,14 +642,14 @@ def test_an_interrupted_training_keeps_what_it_learned_and_says_how_to_go_on(cap
     last_model = tmp_path / "logs" / "ddpg" / "TorcsLite-v0_1" / "TorcsLite-v0.zip"
     assert status == 130
     assert "saving what was learned" in err
-    assert models.saved_steps(last_model) == 40
+    assert models.saved_timesteps(last_model) == 40
     (command,) = [line for line in out.splitlines() if "--resume" in line]
     assert "--timesteps 20" in command
     status, out, _ = run(capsys, *shlex.split(command)[1:])
     folder = last_model.parent.with_name("TorcsLite-v0_2")
     assert (status, "learned from 20 of 20" in out) == (0, True)
     config = model_record._read_plain(folder / "TorcsLite-v0" / "config.yml")
-    assert config["learning_starts"] == 0  # it has its memory, so it needs no new warm-up
+    assert config["learning_starts"] == 0  # it has its replay buffer, so it needs no new warm-up
     assert signal.getsignal(signal.SIGINT) is handler
 
 
@@ -670,7 +670,7 @@ def test_a_training_in_processes_that_is_ended_from_outside_keeps_what_it_learne
     process.stdout.close()
     (os.killpg if by == signal.SIGINT else os.kill)(process.pid, by)
     process.wait(60)
-    assert models.saved_steps(folder / "TorcsLite-v0.zip") >= 200
+    assert models.saved_timesteps(folder / "TorcsLite-v0.zip") >= 200
     assert models.find_model(folder, prefer_last=True).name == "TorcsLite-v0.zip"
 
 
@@ -683,7 +683,7 @@ def test_the_shipped_hyperparameters_train(tmp_path):
 @pytest.mark.slow
 @pytest.mark.usefixtures("game")
 def test_those_of_the_real_game_train_and_go_on(tmp_path):
-    """With returns over several steps, whose memory SB3 makes anew in its own way."""
+    """With returns over several timesteps, whose replay buffer SB3 makes anew in its own way."""
     options = TrainOptions(env="Torcs-v0", timesteps=1100, folder=tmp_path, progress=False)
     first = training_run.train(options)
     second = training_run.train(dataclasses.replace(options, timesteps=100, resume=first))
@@ -696,7 +696,7 @@ def test_those_of_the_real_game_train_and_go_on(tmp_path):
 
 PARTS = (
     "python", "TorcsLite-v0", "compiler", "extension", "game", "tracks", "cars", "layout",
-    "Torcs-v0", "game program", "game libraries", "window", "film",
+    "Torcs-v0", "game program", "game libraries", "window", "video",
 )  # fmt: skip
 
 
@@ -763,8 +763,8 @@ def test_the_doctor_misses_what_only_the_games_own_program_needs(
     monkeypatch.setattr(game_process, "__file__", str(tmp_path / "torcs/process.py"))
     ok, found = doctor_says(capsys)
     assert ok, "both environments drive without"
-    assert found["film"]["found"].startswith("no Xvfb; type: `sb3-torcs install-torcs --video`")
-    assert "`watch --video` and render_mode 'game'" in found["film"]["found"]
+    assert found["video"]["found"].startswith("no Xvfb; type: `sb3-torcs install-torcs --video`")
+    assert "`watch --video` and render_mode 'game'" in found["video"]["found"]
     assert "no display; only for `watch`" in found["window"]["found"]
     assert "_scr_server" in found["game libraries"]["found"]
     assert building.build_command() in found["game libraries"]["found"]

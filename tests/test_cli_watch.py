@@ -1,4 +1,4 @@
-"""``sb3-torcs watch``: agents and robots in the game's window, and films of them."""
+"""``sb3-torcs watch``: agents and robots in the game's window, and videos of them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from sb3_torcs.torcs.display import VirtualDisplay
 pytestmark = pytest.mark.usefixtures("game", "nothing_is_left")
 
 TINY = ["--track", "a-speedway", "--size", "160x120"]
-SMALL = [*TINY, "--fps", "5"]  # films
+SMALL = [*TINY, "--fps", "5"]  # videos
 
 
 @pytest.fixture
@@ -45,70 +45,70 @@ class Turning:
 
 
 class Failing(Turning):
-    """Breaks down after some decisions."""
+    """Breaks down after some timesteps."""
 
-    decisions = 0
+    timesteps = 0
 
     def predict(self, observation, state=None, episode_start=None, deterministic=False):
-        self.decisions += 1
-        if self.decisions > 30:
+        self.timesteps += 1
+        if self.timesteps > 30:
             raise ZeroDivisionError("as told")
         return super().predict(observation)
 
 
 def stream(path):
-    """What ffmpeg says of a film: codec, pixels, size; and the number of frames."""
+    """What ffmpeg says of a video: codec, pixels, size; and the number of frames."""
     call = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", str(path)]
     said = subprocess.run(call, capture_output=True, text=True, check=False).stderr
     frames, _ = imageio_ffmpeg.count_frames_and_secs(str(path))
     return re.search(r"Video: (h264).*?(yuv420p).*? (\d+x\d+)", said).groups(), frames
 
 
-def test_a_film_of_a_robot_is_the_race_that_the_game_runs_without_one(tmp_path, capsys):
+def test_a_video_of_a_robot_is_the_race_that_the_game_runs_without_one(tmp_path, capsys):
     assert main(["robots", "inferno", "--track", "a-speedway", "--laps", "1", "--game"]) == 0
     alone = capsys.readouterr().out
-    film = tmp_path / "lap.mp4"
-    assert main(["watch", "inferno", *SMALL, "--video", str(film)]) == 0
-    filmed = capsys.readouterr().out
-    assert filmed == f"{alone}film: {film}\n"
+    video = tmp_path / "lap.mp4"
+    assert main(["watch", "inferno", *SMALL, "--video", str(video)]) == 0
+    recorded = capsys.readouterr().out
+    assert recorded == f"{alone}video: {video}\n"
     (lap,) = re.findall(r"best lap: ([\d.]+) s", alone)
-    kind, frames = stream(film)
+    kind, frames = stream(video)
     assert kind == ("h264", "yuv420p", "160x120")
     # A second before the start, the lap, a second after it.
     assert abs(frames - 5 * (float(lap) + 2.0)) <= 2
 
 
 def test_two_drivers_side_by_side(tmp_path, capsys):
-    film = tmp_path / "both.mp4"
-    words = ["watch", "scripted", *SMALL, "--beside", "inferno", "--video", str(film)]
+    video = tmp_path / "both.mp4"
+    words = ["watch", "scripted", *SMALL, "--beside", "inferno", "--video", str(video)]
     assert main(words) == 0
     out = capsys.readouterr().out
     assert "scripted, car1-trb1, a-speedway" in out
     assert "inferno 3, car1-trb1, a-speedway" in out
     slower = max(float(lap) for lap in re.findall(r"best lap: ([\d.]+) s", out))
-    kind, frames = stream(film)
+    kind, frames = stream(video)
     assert kind[2] == "160x120"
     assert abs(frames - 5 * (slower + 2.0)) <= 2
 
 
 def test_two_side_by_side_are_on_one_track(monkeypatch):
-    filmed = []
-    monkeypatch.setattr(watching, "film_shows", lambda shows, *_, **__: filmed.extend(shows))
+    recorded = []
+    monkeypatch.setattr(watching, "record_shows", lambda shows, *_, **__: recorded.extend(shows))
     words = ["--beside", "ddpg-aalborg", "--video", "both.mp4"]
     assert main(["watch", "ddpg-league", *words]) == 0
     assert main(["watch", "inferno", *words, "--track", "forza"]) == 0
     assert main(["watch", "bt", "--beside", "ddpg-league", "--video", "both.mp4"]) == 0
-    tracks = [show.track for show in filmed]
+    tracks = [show.track for show in recorded]
     assert tracks == ["corkscrew"] * 2 + ["forza"] * 2 + ["corkscrew"] * 2
-    assert [show.race.car for show in filmed[:2]] == ["car1-ow1", "car1-trb1"]
+    assert [show.race.car for show in recorded[:2]] == ["car1-ow1", "car1-trb1"]
 
 
-def test_a_film_ends_soon_after_the_agents_drive(tmp_path, monkeypatch, capsys):
+def test_a_video_ends_soon_after_the_agents_drive(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(driving, "load_driver", lambda *_: Turning())
-    film = tmp_path / "off.mp4"
-    assert main(["watch", "scripted", *SMALL, "--video", str(film)]) == 0
+    video = tmp_path / "off.mp4"
+    assert main(["watch", "scripted", *SMALL, "--video", str(video)]) == 0
     assert re.search(r"scripted: (off_track|backwards) after -?\d+ m", capsys.readouterr().out)
-    assert 10 < stream(film)[1] < 60
+    assert 10 < stream(video)[1] < 60
 
 
 def test_an_agent_that_breaks_down_ends_everything(tmp_path, monkeypatch):
@@ -126,8 +126,8 @@ def test_a_window_shows_the_race_and_closes(monkeypatch, capsys):
     assert re.search(r"scripted: (off_track|backwards) after", capsys.readouterr().out)
 
 
-@pytest.mark.parametrize("film", [[], ["--video", "killed.mp4"]])
-def test_a_game_that_is_killed_says_how_it_ended(film, tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize("video", [[], ["--video", "killed.mp4"]])
+def test_a_game_that_is_killed_says_how_it_ended(video, tmp_path, monkeypatch, capsys):
     started = []
 
     def start(*args, **options):
@@ -135,11 +135,11 @@ def test_a_game_that_is_killed_says_how_it_ended(film, tmp_path, monkeypatch, ca
         return started[-1]
 
     class Killing(Turning):
-        decisions = 0
+        timesteps = 0
 
         def predict(self, observation, state=None, episode_start=None, deterministic=False):
-            self.decisions += 1
-            if self.decisions == 20:
+            self.timesteps += 1
+            if self.timesteps == 20:
                 os.kill(started[0].pid, signal.SIGKILL)
             return super().predict(observation)
 
@@ -148,12 +148,12 @@ def test_a_game_that_is_killed_says_how_it_ended(film, tmp_path, monkeypatch, ca
     monkeypatch.setattr(driving, "load_driver", lambda *_: Killing())
     with VirtualDisplay((320, 240)) as display:
         monkeypatch.setenv("DISPLAY", display.name)
-        assert main(["watch", "scripted", *TINY, *film]) == 2
+        assert main(["watch", "scripted", *TINY, *video]) == 2
     assert "the game ended with SIGKILL" in capsys.readouterr().err
     assert list(Path().glob("*.mp4")) == []
 
 
-def test_without_a_display_it_offers_a_film(monkeypatch, capsys):
+def test_without_a_display_it_offers_a_video(monkeypatch, capsys):
     monkeypatch.delenv("DISPLAY", raising=False)
     assert main(["watch", "inferno"]) == 2
     said = capsys.readouterr().err
@@ -171,12 +171,12 @@ def test_without_a_display_it_offers_a_film(monkeypatch, capsys):
         (["inferno", "--beside", "bt:4", "--car", "buggy", "--video", "lap.mp4"], "--car is for"),
         (
             ["inferno", "--beside", "bt", "--size", "642x360", "--video", "lap.mp4"],
-            "size is 642x360; the width of a film with 2 side by side has to be a multiple of 4",
+            "size is 642x360; the width of a video with 2 side by side has to be a multiple of 4",
         ),
         (["inferno", "--video", "lap.avi"], "'lap.avi' should end in .mp4"),
         (["inferno", "--video", "lap.mp4", "--view", "behnd"], "did you mean 'behind'?"),
         (["inferno", "--video", "lap.mp4", "--fps", "0"], "fps is 0; expected 1 to 500"),
-        (["inferno", "--video", "lap.mp4", "--size", "161x120"], "a film needs even numbers"),
+        (["inferno", "--video", "lap.mp4", "--size", "161x120"], "a video needs even numbers"),
         (["inferno", "--video", "lap.mp4", "--track", "forzza"], "did you mean 'forza'?"),
         (["inferno", "--video", "lap.mp4", "--robots", "inferno"], "none of them twice"),
     ],

@@ -79,7 +79,7 @@ def rollout(world, seed, steps=300, **options):
 
 def assert_equal(first, second):
     for step, (one, other) in enumerate(zip(first, second, strict=True)):
-        assert data_equivalence(one, other, exact=True), f"step {step}: {one} != {other}"
+        assert data_equivalence(one, other, exact=True), f"timestep {step}: {one} != {other}"
 
 
 def test_gymnasium_finds_nothing_to_warn_of(world):
@@ -242,7 +242,7 @@ def test_no_checker_stands_between_the_agent_and_the_world(world):
         env = env.env
 
 
-def test_no_memory_is_shared_between_steps(world):
+def test_no_memory_is_shared_between_timesteps(world):
     env = world.make()
     first, info = env.reset(seed=0)
     kept, car = first.copy(), info["car"]

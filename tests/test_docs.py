@@ -36,7 +36,7 @@ from sb3_torcs.training.run import TrainOptions
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
 PACKAGE = ROOT / "sb3_torcs"
-TINY = "TIMESTEPS = 150"  # decisions of a training in a snippet
+TINY = "TIMESTEPS = 150"  # timesteps of a training in a snippet
 
 
 # ------------------------------------------------------------------------------ generated tables
@@ -331,7 +331,7 @@ def test_a_command_in_the_docs_parses_and_names_what_exists(page, line, parsed, 
             assert what == "."
         case ["sudo", "apt", "install", *packages]:
             tools = {"git", "make", "g++", "python3-dev", "python3-venv"}
-            assert set(packages) <= {*tools, *install_torcs.FILM_PACKAGES}
+            assert set(packages) <= {*tools, *install_torcs.VIDEO_PACKAGES}
         case other:
             pytest.fail(f"{other} is nothing that a test knows")
 

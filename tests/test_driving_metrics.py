@@ -143,7 +143,7 @@ def test_no_lap_time_is_logged_before_there_is_a_lap(oval):
     assert not [key for key in values if "lap_time" in key]
 
 
-def test_speed_braking_and_saturation_are_means_over_steps(oval):
+def test_speed_braking_and_saturation_are_means_over_timesteps(oval):
     states = [{"speed_x": 10.0}, {"speed_x": 20.0}, {"speed_x": 30.0, "distance_from_axis": 6.0}]
     actions = np.array([[1.0, 0.5, 0.06], [-0.985, 0.995, 0.04], [0.9, 0.5, 0.0]], np.float32)
     values = logged(scripted_model(oval, *states), actions)
@@ -154,7 +154,7 @@ def test_speed_braking_and_saturation_are_means_over_steps(oval):
     assert values["driving/saturation_brake"] == 1 / 3
 
 
-def test_means_over_steps_start_anew_with_each_row_of_the_logger(oval):
+def test_means_over_timesteps_start_anew_with_each_row_of_the_logger(oval):
     ends = {"distance_from_axis": 6.0}
     metrics = DrivingMetricsCallback()
     model = scripted_model(oval, {"speed_x": 10.0, **ends}, {"speed_x": 30.0, **ends})
@@ -222,7 +222,7 @@ def test_a_line_that_is_drawn_changes_no_later_evaluation(vec_env_cls, monkeypat
             used.close()
         return evaluation.last_mean_reward, evaluation.best_mean_reward
 
-    assert races(DrivingMetricsCallback(line_decisions=10)) == races()
+    assert races(DrivingMetricsCallback(line_timesteps=10)) == races()
 
 
 def test_q_is_the_critics_value_of_the_stored_transitions():
@@ -251,7 +251,7 @@ def test_a_line_is_drawn_once_after_each_evaluation(metrics_first, monkeypatch):
     pictures = Pictures()
     model.set_logger(Logger(None, [pictures]))
     evaluation = EvalCallback(lite(), n_eval_episodes=1, eval_freq=50, verbose=0)
-    metrics = DrivingMetricsCallback(line_decisions=10)
+    metrics = DrivingMetricsCallback(line_timesteps=10)
     callbacks = [metrics, evaluation] if metrics_first else [CallbackList([evaluation]), metrics]
     model.learn(100, callback=callbacks, log_interval=None)
     assert pictures.steps == ([51, 100] if metrics_first else [50, 100])
@@ -366,7 +366,7 @@ def test_an_environment_that_is_no_racing_one_is_refused():
         model.learn(10, callback=DrivingMetricsCallback())
 
 
-@pytest.mark.parametrize("name", ["q_every", "q_size", "line_decisions"])
+@pytest.mark.parametrize("name", ["q_every", "q_size", "line_timesteps"])
 def test_an_interval_below_one_is_refused(name):
     with pytest.raises(InvalidOption, match=f"{name} is 0"):
         DrivingMetricsCallback(**{name: 0})

@@ -120,13 +120,13 @@ def test_one_failed_part_of_the_show_does_not_lose_the_others(demo, monkeypatch,
     monkeypatch.setattr(demo, "runs", lambda folder: [folder])
     monkeypatch.setattr(demo, "keep_models", lambda folder: "models kept")
     monkeypatch.setattr(demo, "draw", broken)
-    monkeypatch.setattr(demo, "film", lambda folder: "filmed")
+    monkeypatch.setattr(demo, "video", lambda folder: "recorded")
     assert demo.show(tmp_path, interrupted=False)
     out = capsys.readouterr().out
     assert out.splitlines() == [
         "models kept",
         "the picture: failed: RuntimeError: no encoder",
-        "filmed",
+        "recorded",
     ]
 
 
@@ -151,12 +151,12 @@ def test_the_demo_learns_shows_goes_on_and_shows_again(demo, capsys, tmp_path):
     for name in ("model.zip", "last_model.zip", "lap.mp4", "line.png", "tensorboard"):
         assert (folder / name).exists(), name
     out = capsys.readouterr().out
-    assert "Learned from 400 of 400 decisions." in out
+    assert "Learned from 400 of 400 timesteps." in out
     assert f"evaluate {folder / 'model.zip'}" in out
     assert "Loading replay buffer" not in (folder / "training.log").read_text()
 
     assert demo.main(["--continue", "--timesteps", "600", "--folder", str(folder)]) == 0
-    assert "Learned from 600 of 600 decisions." in capsys.readouterr().out
+    assert "Learned from 600 of 600 timesteps." in capsys.readouterr().out
     assert "Loading replay buffer" in (folder / "training.log").read_text()
     assert len(list(folder.rglob("replay_buffer.pkl"))) == 1
 

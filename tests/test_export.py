@@ -149,7 +149,7 @@ def test_a_file_that_cannot_be_written_is_told(tmp_path):
 
 def test_a_policy_that_remembers_is_refused(tmp_path):
     model = ALGOS["ppo_lstm"]("MlpLstmPolicy", race(), device="cpu", seed=0)
-    with pytest.raises(ModelMismatch, match="remembers what it saw, and an export has no memory"):
+    with pytest.raises(ModelMismatch, match="remembers what it saw, and an export keeps no state"):
         export_actor(model, tmp_path / "driver.onnx")
 
 

@@ -51,8 +51,8 @@ def env():
     env.close()
 
 
-def drive(env, decisions):
-    for _ in range(decisions):
+def drive(env, timesteps):
+    for _ in range(timesteps):
         env.step(GAS)
     return env.render()
 
@@ -239,13 +239,13 @@ def test_both_checkers_find_nothing():
 
 def test_a_wrapper_records_it(tmp_path):
     """At the speed of the drive, also if there is less than one picture in a second."""
-    env = RecordVideo(gym.make(TORCS, **GAME, action_repeat=100), str(tmp_path / "films"))
+    env = RecordVideo(gym.make(TORCS, **GAME, action_repeat=100), str(tmp_path / "videos"))
     env.reset(seed=1)
     for _ in range(3):
         env.step(GAS)
     env.close()
-    film = str(*tmp_path.glob("films/*.mp4"))
-    assert imageio_ffmpeg.count_frames_and_secs(film) == (4, 8.0)
+    video = str(*tmp_path.glob("videos/*.mp4"))
+    assert imageio_ffmpeg.count_frames_and_secs(video) == (4, 8.0)
 
 
 def test_a_wrapper_observes_it():
@@ -270,10 +270,10 @@ def test_stable_baselines3_records_it(vectorize, tmp_path):
     for _ in range(6):
         env.step([GAS, GAS])
     env.close()
-    film = str(*tmp_path.glob("*.mp4"))
-    # That of the reset, and one for each of four steps.
-    assert imageio_ffmpeg.count_frames_and_secs(film) == (5, 0.5)
-    assert next(imageio_ffmpeg.read_frames(film))["size"] == (160, 240)  # one above the other
+    video = str(*tmp_path.glob("*.mp4"))
+    # That of the reset, and one for each of four timesteps.
+    assert imageio_ffmpeg.count_frames_and_secs(video) == (5, 0.5)
+    assert next(imageio_ffmpeg.read_frames(video))["size"] == (160, 240)  # one above the other
     assert children() == before
 
 

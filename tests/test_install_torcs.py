@@ -118,7 +118,7 @@ def test_with_root_apt_installs(machine, own, tmp_path, monkeypatch, capsys):
     assert not own.exists()
 
 
-def test_film_gets_a_display_too_and_only_once(machine, monkeypatch, capsys):
+def test_video_gets_a_display_too_and_only_once(machine, monkeypatch, capsys):
     monkeypatch.setattr(os, "geteuid", lambda: 0)
     for _ in range(2):
         assert main(["install-torcs", "--video"]) == 0

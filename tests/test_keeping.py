@@ -108,9 +108,9 @@ def tiny(env=None, algorithm=DDPG, **kwargs):
 def test_the_model_is_kept_with_its_replay_buffer(tmp_path):
     model = tiny(buffer_size=50)
     model.learn(12, callback=keeper(tmp_path))
-    assert models.saved_steps(tmp_path / "last.zip") == 10
+    assert models.saved_timesteps(tmp_path / "last.zip") == 10
     kept = load_from_pkl(tmp_path / REPLAY_BUFFER)
-    assert kept.size() == 9  # SB3 stores a step after the callbacks
+    assert kept.size() == 9  # SB3 stores a timestep after the callbacks
     np.testing.assert_array_equal(kept.actions[:9], model.replay_buffer.actions[:9])
 
 
@@ -118,7 +118,7 @@ def test_statistics_are_kept_where_the_zoo_looks_for_them(tmp_path):
     env = VecNormalize(DummyVecEnv([ToyRace]))
     tiny(env, PPO, n_steps=8, batch_size=8).learn(8, callback=keeper(tmp_path))
     statistics = pickle.loads((tmp_path / "last" / STATISTICS).read_bytes())
-    assert statistics.obs_rms.count == pytest.approx(6.0001)  # the first reset and five steps
+    assert statistics.obs_rms.count == pytest.approx(6.0001)  # the first reset and five timesteps
     assert not (tmp_path / REPLAY_BUFFER).exists()
 
 
@@ -196,7 +196,7 @@ def test_a_file_that_cannot_be_written_is_named_and_the_training_goes_on_from_wh
     assert not (folder / UNFINISHED).exists()
     command = said.partition("go on with: ")[2]
     assert main(shlex.split(command)[1:]) == 0
-    assert models.saved_steps(run_folder(tmp_path, 2) / "TorcsLite-v0.zip") == 30
+    assert models.saved_timesteps(run_folder(tmp_path, 2) / "TorcsLite-v0.zip") == 30
 
 
 @pytest.mark.slow
@@ -215,7 +215,7 @@ def test_what_was_learned_until_an_error_is_kept(capsys, tmp_path, error, said):
     assert status == 2
     assert said.format(folder=folder) in err
     assert "45 of 60 timesteps" in err
-    assert models.saved_steps(folder / "TorcsLite-v0.zip") == 45
+    assert models.saved_timesteps(folder / "TorcsLite-v0.zip") == 45
     assert load_from_pkl(folder / REPLAY_BUFFER).size() == 44
 
 
@@ -226,7 +226,7 @@ def test_a_training_without_evaluations_is_kept_too(tmp_path):
     )
     with pytest.raises(ZeroDivisionError):
         main([*words, "--eval-freq", "-1"])
-    assert models.saved_steps(run_folder(tmp_path) / "TorcsLite-v0.zip") == 9
+    assert models.saved_timesteps(run_folder(tmp_path) / "TorcsLite-v0.zip") == 9
     assert not (run_folder(tmp_path) / "best_model.zip").exists()
 
 
@@ -256,7 +256,7 @@ def whole(folder):
     steps = 0
     for file in folder.glob("*.zip"):
         DDPG.load(file)
-        steps = max(steps, models.saved_steps(file))
+        steps = max(steps, models.saved_timesteps(file))
     if (folder / REPLAY_BUFFER).is_file():
         load_from_pkl(folder / REPLAY_BUFFER)
     if (folder / "evaluations.npz").is_file():
@@ -285,4 +285,4 @@ def test_a_training_that_was_killed_goes_on(tmp_path):
         resumed = ["--resume", str(folder)]
     words = words_of(tmp_path, buffer_size=200_000)
     assert main([*words, *resumed, "--timesteps", "30"]) == 0
-    assert models.saved_steps(run_folder(tmp_path, 4) / "TorcsLite-v0.zip") == 30
+    assert models.saved_timesteps(run_folder(tmp_path, 4) / "TorcsLite-v0.zip") == 30

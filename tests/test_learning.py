@@ -14,7 +14,7 @@ EPISODES = 25  # at either end of the training
 @pytest.mark.slow
 def test_the_shipped_ddpg_drives_further_after_a_seventh_of_its_training(tmp_path):
     """
-    Episodes of an untrained agent end within some 50 m; after 16,000 decisions those of three
+    Episodes of an untrained agent end within some 50 m; after 16,000 timesteps those of three
     seeds drove 250 to 300 m before they ended. The threshold has slack, since another CPU rounds
     otherwise and learns another way.
     """

@@ -171,7 +171,7 @@ def test_a_buffer_that_is_saved_while_the_algorithm_learns_is_a_stock_one(tmp_pa
 
 
 def test_what_has_no_mirror_image_is_told_at_once():
-    """An algorithm without memory, statistics with a side, beams with a side, another world."""
+    """No replay buffer, statistics with a side, beams with a side, another world."""
 
     class OneSided(MirrorToy):
         range_finder_angles = np.linspace(-1.0, 0.5, 19)

@@ -230,7 +230,7 @@ def test_statistics_that_are_none_are_refused(saved, env, content):
 
 @pytest.fixture
 def learned(saved, env):
-    """A model with its memory and its record, and what `check_resumable` is asked about it."""
+    """A model with replay buffer and record, and what `check_resumable` is asked about it."""
     model, path = saved
     zoo_record(path.parent)
     model.save_replay_buffer(path.parent / "replay_buffer.pkl")
@@ -258,9 +258,9 @@ def test_what_does_not_belong_together_is_not_gone_on_with(learned):
         check(narrow)
     with pytest.raises(ModelMismatch, match=r"replay_buffer.*of 1 cars at once, not 4.*remove it"):
         check(n_envs=4)
-    memory = path.parent / "replay_buffer.pkl"
-    memory.write_bytes(memory.read_bytes()[:-10])
-    with pytest.raises(ModelMismatch, match=r"replay_buffer.pkl' is no memory"):
+    buffer = path.parent / "replay_buffer.pkl"
+    buffer.write_bytes(buffer.read_bytes()[:-10])
+    with pytest.raises(ModelMismatch, match=r"replay_buffer.pkl' is no replay buffer"):
         check()
 
 
@@ -308,4 +308,4 @@ def test_the_steps_of_a_training_are_read_from_its_model(env, tmp_path):
     model = DDPG("MlpPolicy", env, buffer_size=8, learning_starts=100, **SMALL)
     model.learn(7)
     model.save(tmp_path / "m.zip")
-    assert models.saved_steps(tmp_path / "m.zip") == 7
+    assert models.saved_timesteps(tmp_path / "m.zip") == 7

@@ -157,7 +157,7 @@ class TestEqualToItself:
             other.step(*row, None, 1)
         assert whole(one) == whole(other)
 
-    def test_a_decision_of_many_ticks_is_many_of_one(self):
+    def test_a_timestep_of_many_ticks_is_many_of_one(self):
         one, other = race_of("aalborg", AMONG), race_of("aalborg", AMONG)
         one.start()
         other.start()

@@ -87,7 +87,7 @@ def test_each_environment_is_perturbed_by_its_own_action():
     np.testing.assert_array_equal(found, [[-0.5, -1.0, -0.5], [0.5, -0.5, 0.0]])
 
 
-def test_updates_do_not_count_as_decisions():
+def test_updates_do_not_count_as_timesteps():
     """Updates call the actor with gradients, on other observations."""
     noise = SetPointNoise(steering=[0, 1, 0], throttle=[0, 1, 0], brake=[0, 1, 0])
     model = bound(noise)
@@ -176,10 +176,10 @@ def test_a_pedal_is_half_as_wide_as_sb3s_action():
 
 
 def test_nothing_is_added_while_sb3_acts_by_lot():
-    """Before learning_starts the action is random already; frames count all the same."""
+    """Before learning_starts the action is random already; timesteps count all the same."""
     model = bound(OUNoise(seed=0), learning_starts=10)
     np.testing.assert_array_equal(model.action_noise(), np.zeros(3))
-    assert model.action_noise.frames == 1
+    assert model.action_noise.timesteps == 1
     model.num_timesteps = 10
     assert model.action_noise().any()
 
@@ -212,7 +212,7 @@ def test_parallel_environments_have_independent_streams():
 @pytest.mark.parametrize("cls", [OUNoise, SetPointNoise])
 @pytest.mark.parametrize("n_envs", [1, 3])
 def test_a_pickled_noise_goes_on_as_if_nothing_had_happened(cls, n_envs):
-    """Generator, process, frames and scale; the binding is dropped."""
+    """Generator, process, timesteps and scale; the binding is dropped."""
     actions = [(0.1, 0.2, 0.3)] * n_envs
     model = bound(cls(seed=2), n_envs)
     for noise in noises_of(model):
@@ -226,7 +226,18 @@ def test_a_pickled_noise_goes_on_as_if_nothing_had_happened(cls, n_envs):
     bind(twin)
     for _ in range(5):
         np.testing.assert_array_equal(act(twin, *actions), act(model, *actions))
-    assert noises_of(twin)[0].frames == noises_of(model)[0].frames == 10 * n_envs
+    assert noises_of(twin)[0].timesteps == noises_of(model)[0].timesteps == 10 * n_envs
+
+
+def test_a_noise_that_was_saved_by_an_older_version_goes_on_counting():
+    """It counted in timesteps, which are timesteps now."""
+    noise = OUNoise(seed=0)
+    state = {**noise.__getstate__(), "timesteps": 70}
+    del state["timesteps"]
+    noise.__setstate__(state)
+    noise()
+    assert noise.timesteps == 71
+    assert not hasattr(noise, "timesteps")
 
 
 def test_a_deep_copy_of_a_bound_noise_does_not_copy_the_model():
@@ -238,7 +249,7 @@ def test_a_deep_copy_of_a_bound_noise_does_not_copy_the_model():
 
 @pytest.mark.parametrize("cls", [OUNoise, SetPointNoise])
 def test_stochastic_brake_comes_in_its_share_of_the_steps(cls):
-    """10 % of the steps brake at 0.2 +- 0.1; the others hardly ever brake."""
+    """10 % of the timesteps brake at 0.2 +- 0.1; the others hardly ever brake."""
     brake = OUParameters(-0.1, 50.0 if cls is OUNoise else 1.0, 0.0)
     other = OUParameters(0.2, brake.theta, 0.0)
     model = bound(cls(brake=brake, seed=0))

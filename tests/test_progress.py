@@ -44,7 +44,7 @@ def test_a_terminal_shows_steps_episode_distance_lap_and_time_left(oval):
     stream = Terminal()
     learned(oval, {"laps": 1, "last_lap_time": 61.234}, OFF, stream=stream)
     last = stream.getvalue().rstrip().split("\r")[-1]
-    for part in ("64/64 steps", "episode 1", "last 70 m", "best lap 61.23 s", "0 s left"):
+    for part in ("64/64 timesteps", "episode 1", "last 70 m", "best lap 61.23 s", "0 s left"):
         assert part in last
 
 
@@ -53,7 +53,8 @@ def test_a_log_file_gets_whole_lines_and_no_bar(oval):
     learned(oval, OFF, stream=stream)
     assert "\r" not in stream.getvalue()
     assert (
-        stream.getvalue() == "100% 64/64 steps, episode 1, last 70 m, no whole lap yet, 0 s left\n"
+        stream.getvalue()
+        == "100% 64/64 timesteps, episode 1, last 70 m, no whole lap yet, 0 s left\n"
     )
 
 
@@ -74,7 +75,8 @@ def test_lines_come_at_their_interval(oval, monkeypatch):
     stream = io.StringIO()
     learned(oval, stream=stream)
     lines = stream.getvalue().splitlines()
-    assert [line.split(" steps")[0] for line in lines] == ["46% 30/64", "93% 60/64", "100% 64/64"]
+    shares = [line.split(" timesteps")[0] for line in lines]
+    assert shares == ["46% 30/64", "93% 60/64", "100% 64/64"]
     assert lines[0].endswith("34 s left")
 
 

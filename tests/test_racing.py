@@ -57,7 +57,7 @@ def test_a_standing_car_is_stuck_after_the_grace_of_the_start(oval):
     env = RacingEnv(ScriptedBackend(oval, *[{"speed_x": 0.0}] * 40))
     env.reset(seed=0)
     ended = [env.step(GAS)[2] for _ in range(31)]
-    assert ended == [False] * 30 + [True]  # 3.0 s of 0.1 s decisions may pass
+    assert ended == [False] * 30 + [True]  # 3.0 s of 0.1 s timesteps may pass
 
 
 def test_a_car_that_stops_on_the_way_is_stuck_sooner(oval):
@@ -65,7 +65,7 @@ def test_a_car_that_stops_on_the_way_is_stuck_sooner(oval):
     env = RacingEnv(ScriptedBackend(oval, *states))
     env.reset(seed=0)
     ended = [env.step(GAS)[2] for _ in range(17)]
-    assert ended == [False] * 16 + [True]  # 1.5 s after the one fast decision
+    assert ended == [False] * 16 + [True]  # 1.5 s after the one fast timestep
 
 
 def test_lap_time_is_0_unless_a_lap_was_just_completed(oval):
@@ -80,7 +80,7 @@ def test_lap_time_is_0_unless_a_lap_was_just_completed(oval):
 
 @pytest.mark.parametrize("reward", ["progress", dict.fromkeys([*TERMS, "crash"], -1.0)])
 def test_a_car_that_is_lost_ends_the_episode_only(oval, reward):
-    """Where the decision before has left it, as a crash; the next episode is like any other."""
+    """Where the timestep before has left it, as a crash; the next episode is like any other."""
 
     class Losing(ScriptedBackend):
         def step(self, controls, ticks):

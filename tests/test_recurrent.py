@@ -57,7 +57,7 @@ def test_each_episode_of_an_evaluation_begins_with_an_empty_mind():
 
 
 def test_an_evaluation_is_that_of_stable_baselines(recurrent):
-    """And another one than that of a model whose memory is dropped."""
+    """And another one than that of a model whose state is dropped."""
     with lite(max_episode_steps=60) as env:
         races = evaluate(env, recurrent, episodes=2)
     expected, _ = evaluate_policy(
@@ -81,7 +81,7 @@ def test_a_saved_recurrent_model_drives_as_before(recurrent, tmp_path):
         assert evaluate(env, load_driver(tmp_path / "m.zip", env)) == [expected]
 
 
-def test_normalized_observations_leave_the_memory_alone(recurrent):
+def test_normalized_observations_leave_the_state_alone(recurrent):
     statistics = VecNormalize(DummyVecEnv([lite]))
     driver = Driver(recurrent, statistics)
     observation = np.full(29, 0.5, np.float32)

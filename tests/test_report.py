@@ -15,11 +15,11 @@ from sb3_torcs.studies.report import read_results, write_report
 LAPS = (97.0, 84.0, 83.5)
 
 
-def row(seed, phase="train", decisions=100, track="aalborg", laps=LAPS, ladder="finishes", **more):
+def row(seed, phase="train", timesteps=100, track="aalborg", laps=LAPS, ladder="finishes", **more):
     whole = len(laps) == 3
     return {
-        "study": "demo", "variant": "base", "seed": seed, "phase": phase, "decisions": decisions,
-        "episodes": decisions // 10, "wall_s": decisions / 2, "cpu_s": decisions / 3,
+        "study": "demo", "variant": "base", "seed": seed, "phase": phase, "decisions": timesteps,
+        "episodes": timesteps // 10, "wall_s": timesteps / 2, "cpu_s": timesteps / 3,
         "track": track, "laps": len(laps), "completes": int(whole),
         "lap_times_s": " ".join(map(str, laps)), "best_flying_lap_s": min(laps[1:], default=""),
         "race_time_s": sum(laps) if whole else "", "distance_m": 7000.0 if whole else 900.0,
@@ -44,15 +44,15 @@ def study(tmp_path):
     for seed in (0, 1):
         rows += [
             row(seed, laps=()),
-            row(seed, decisions=200, laps=LAPS[:2]),
-            row(seed, decisions=300),
+            row(seed, timesteps=200, laps=LAPS[:2]),
+            row(seed, timesteps=300),
         ]
         rows += [row(seed, "final", 300, ladder=("finishes", "beats bt")[seed])]
         rows += [row(seed, "final", 300, "alpine-1", laps=LAPS if seed else ())]
     rows += [
         row(2, laps=(), kept=1),
-        row(2, decisions=200, laps=()),
-        row(2, decisions=300, laps=()),
+        row(2, timesteps=200, laps=()),
+        row(2, timesteps=300, laps=()),
     ]
     rows += [row(2, "final", 100, laps=()), row(2, "final", 100, "alpine-1", laps=())]
     return written(tmp_path / "study", rows)
@@ -89,7 +89,7 @@ def test_the_same_results_give_the_same_report_to_the_byte(study, tmp_path, caps
 
 def test_a_study_that_still_runs_can_be_reported(tmp_path):
     """One seed is two evaluations ahead, and nothing is measured yet."""
-    rows = [row(0), row(0, decisions=200), row(0, decisions=300), row(1, laps=(), kept=1)]
+    rows = [row(0), row(0, timesteps=200), row(0, timesteps=300), row(1, laps=(), kept=1)]
     report = write_report(written(tmp_path / "study", rows), tmp_path / "out")
     assert lines_of(report, "| base, 0 | not measured |")
     assert [len(trial.train) for trial in read_results(tmp_path / "study")] == [3, 1]
@@ -190,7 +190,7 @@ def test_an_interval_lies_around_its_figure_and_is_the_same_each_time():
 
 
 def test_a_study_in_which_nobody_laps_is_reported_too(tmp_path):
-    rows = [row(seed, laps=(), kept=1, decisions=n) for seed in (0, 1) for n in (100, 200)]
+    rows = [row(seed, laps=(), kept=1, timesteps=n) for seed in (0, 1) for n in (100, 200)]
     report = write_report(written(tmp_path / "study", rows), tmp_path / "out")
     assert lines_of(report, "| base |") == [
         "| base | 0 of 0, 2 not measured | - | - | - | - | - | - |"
@@ -200,10 +200,10 @@ def test_a_study_in_which_nobody_laps_is_reported_too(tmp_path):
 def test_one_picture_shows_all_variants(tmp_path):
     """Where there are several; each has its own beside it."""
     rows = [
-        row(seed, variant=variant, decisions=decisions)
+        row(seed, variant=variant, timesteps=timesteps)
         for variant in ("base", "wide")
         for seed in (0, 1, 2)
-        for decisions in (100, 200)
+        for timesteps in (100, 200)
     ]
     folder = written(tmp_path / "study", rows)
     text = write_report(folder, tmp_path / "out").read_text()

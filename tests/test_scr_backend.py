@@ -87,7 +87,7 @@ def gone(pid, seconds=5.0):
 )
 def test_a_lap_is_that_of_the_engine(track, start):
     answer = COMPARE["compare"](track, ScriptedDriver(), None if start == "grid" else start)
-    assert answer.decisions > 300
+    assert answer.timesteps > 300
     assert answer.laps[0]
     assert answer.equal
 
@@ -417,7 +417,7 @@ def test_both_sides_count_the_same_lost_ticks(think):
         agent.driver = SimpleNamespace(predict=predict)
         agent.drive()
         game.wait(20.0)
-        (told,) = re.findall(r"decisions, (\d+) late", game.words())
+        (told,) = re.findall(r"timesteps, (\d+) late", game.words())
     assert agent.backend.lost_ticks > 0
     assert abs(int(told) - agent.backend.lost_ticks) <= 2
 

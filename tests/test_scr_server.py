@@ -140,7 +140,7 @@ def skip_countdown(client):
 
 
 def drive(client, state, ticks):
-    """Return the states of so many decisions."""
+    """Return the states of so many timesteps."""
     states = []
     for _ in range(ticks):
         states.append(state)
@@ -358,7 +358,7 @@ class TestRace:
         assert number(states[-2], "lastLapTime") > 60
         client.nothing_comes()
         process.wait(PATIENCE)
-        told = re.search(r"scr_server 0: [\d.:]+: (\d+) decisions, 0 late", process.words())
+        told = re.search(r"scr_server 0: [\d.:]+: (\d+) timesteps, 0 late", process.words())
         assert told
         assert int(told[1]) == pytest.approx(len(states), abs=2)
 
@@ -725,7 +725,7 @@ class TestTheEnd:
         while not message.startswith(b"***"):
             message = client.receive()
         assert message == b"***shutdown***\0"
-        assert re.search(r"scr_server 0: Ann Other at 127.0.0.1:\d+: 5\d decisions, ",
+        assert re.search(r"scr_server 0: Ann Other at 127.0.0.1:\d+: 5\d timesteps, ",
                          process.words())  # fmt: skip
         assert '<attstr name="name" val="Ann Other"/>' in self.results(process)
 
@@ -736,7 +736,7 @@ class TestTheEnd:
         process.end_race()
         assert process.poll() == 0
         assert second.receive() == b"***shutdown***\0"
-        assert "scr_server 0: nobody: 0 decisions, 0 late" in process.words()
+        assert "scr_server 0: nobody: 0 timesteps, 0 late" in process.words()
         del first
 
     def test_who_has_no_name_goes_by_the_address(self, serve):
@@ -927,7 +927,7 @@ class TestDeadline:
         while not state.startswith(b"***"):
             state = client.ask(action(state))
         process.wait(PATIENCE)
-        assert re.search(r"\d+ decisions, 3 late", process.words())
+        assert re.search(r"\d+ timesteps, 3 late", process.words())
 
     def test_late_answers_are_counted_and_used(self, serve):
         """A client that thinks for three deadlines: the game goes on meanwhile."""

@@ -206,8 +206,8 @@ def test_a_damaged_checkpoint_is_told_once(begun, capsys):
     ("change", "told"),
     [
         (
-            {"callback": [{"sb3_torcs.callbacks.NoiseDecayCallback": {"frames": -1}}]},
-            "pass a whole number of at least 1 frame",
+            {"callback": [{"sb3_torcs.callbacks.NoiseDecayCallback": {"timesteps": -1}}]},
+            "pass a whole number of at least 1 timestep",
         ),
         ({"learning_rate": "fast"}, "learning_rate is 'fast'"),
         ({"policy_kwargs": {"head_bias": [0.0]}}, "head_bias"),

@@ -40,7 +40,7 @@ def test_the_shipped_studies_can_be_run(path):
         ({"seeds": 20240101}, "too many; one seed is a list: [20240101]"),
         ({"seeds": None}, "key 'seeds' is missing"),
         ({"sedes": 3}, "unknown key 'sedes'; did you mean 'seeds'?"),
-        ({"eval_interval": 0}, "eval_interval is 0; expected decisions, e.g. 5000"),
+        ({"eval_interval": 0}, "eval_interval is 0; expected timesteps, e.g. 5000"),
         ({"name": "..."}, "name is '...'; expected a word"),
         ({"final_tracks": ["aalbrg"]}, "no track 'aalbrg'; did you mean 'aalborg'?"),
         ({"final_tracks": ["aalborg", "road/aalborg"]}, "one is there twice"),
@@ -95,6 +95,15 @@ def test_a_file_that_is_no_study_is_told(tmp_path, text, says):
         read_study(tmp_path / "s.yml")
     with pytest.raises(StudyError, match="there is no study file"):
         read_study(tmp_path / "none.yml")
+
+
+def test_an_older_name_of_an_argument_changes_the_newer_one():
+    """Study files of older versions say what they said, also of an entry with the newer name."""
+    path = "sb3_torcs.callbacks.NoiseDecayCallback"
+    entry = {"callback": [{path: {"timesteps": 5, "floor": 0.1}}]}
+    with pytest.warns(DeprecationWarning, match="'frames' is now called 'timesteps'"):
+        changed = merged(entry, {"callback": {path: {"frames": 9}}})
+    assert changed == {"callback": [{path: {"timesteps": 9, "floor": 0.1}}]}
 
 
 def test_changes_are_merged_into_an_entry():

@@ -31,8 +31,8 @@ CASES = {
         "callback": {
             "sb3_torcs.callbacks.RandomStartCallback": {"speed": 30.0},
             "sb3_torcs.callbacks.NoiseCallback": {"kind": "ou", "dt": 0.1},
-            "sb3_torcs.callbacks.NoiseDecayCallback": {"frames": 200, "floor": 0.35},
-            "sb3_torcs.callbacks.GradientStepsCallback": {"gradient_steps": 5, "frames": 120},
+            "sb3_torcs.callbacks.NoiseDecayCallback": {"timesteps": 200, "floor": 0.35},
+            "sb3_torcs.callbacks.GradientStepsCallback": {"gradient_steps": 5, "timesteps": 120},
             "sb3_torcs.callbacks.MirrorCallback": {},
         },
     },
@@ -122,7 +122,7 @@ BEHIND_WRAPPERS = {
 
 
 @pytest.mark.parametrize("changes", [PPO, BEHIND_WRAPPERS], ids=["bare", "behind wrappers"])
-def test_an_algorithm_without_memory_goes_on_the_same(tmp_path, changes):
+def test_an_algorithm_without_a_replay_buffer_goes_on_the_same(tmp_path, changes):
     wanted = trial(tmp_path, changes)
     undisturbed = Training(wanted)
     undisturbed.run(lambda: None)
@@ -137,7 +137,7 @@ def test_a_callback_that_stops_the_training_is_told(tmp_path):
     changes = {**TINY, "callback": {path: {"max_episodes": 1}}}
     training = Training(trial(tmp_path, changes, n_timesteps=5000, eval_interval=5000))
     with pytest.raises(
-        StudyError, match=r"a callback stopped the training at .* of 5000 decisions"
+        StudyError, match=r"a callback stopped the training at .* of 5000 timesteps"
     ):
         training.run(lambda: None)
     training.close()

@@ -188,7 +188,7 @@ class TestSettings:
         assert values["current driver"] == "scr_server 0"
         assert values["driver board"] == "2"  # the one with the driver's messages
 
-    def test_a_film_is_silent(self, game, monkeypatch):
+    def test_a_video_is_silent(self, game, monkeypatch):
         monkeypatch.setenv("PULSE_SERVER", "somewhere")
         for window, state in ((Window(), "openal"), (Window(frames=5), "disabled")):
             values = self.values(game, window, "config/sound.xml", "Sound Settings")

@@ -119,7 +119,7 @@ def test_a_run_is_judged_behind_its_wrappers(run, capsys):
     assert [episode["return"]] == close_to(returns(model, env, 1))
 
 
-def test_what_the_car_did_is_filmed_and_drawn(run, tmp_path):
+def test_what_the_car_did_is_recorded_and_drawn(run, tmp_path):
     """Behind RescaleAction the actions of the model are other ones."""
     video, line = tmp_path / "lap.mp4", tmp_path / "line.png"
     words = ["evaluate", str(run), "--laps", "1", "--video", str(video), "--line", str(line)]

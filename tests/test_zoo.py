@@ -29,6 +29,11 @@ def accepted(entry, algo="ddpg"):
     zoo.check_entry({**MINIMAL, **entry}, algo, "TorcsLite-v0", zoo.Place(zoo.Path("x"), "here"))
 
 
+def test_an_older_name_of_an_argument_is_read():
+    """By the constructor, which warns; an older hyperparameter file goes on working."""
+    accepted({"callback": [{"sb3_torcs.callbacks.NoiseDecayCallback": {"timesteps": 9}}]})
+
+
 def test_a_file_is_shipped_for_ddpg():
     assert "ddpg" in [path.stem for path in SHIPPED]
 
@@ -180,7 +185,7 @@ def test_a_time_limit_is_among_the_arguments_of_the_environment(tmp_path):
     """``gym.make`` itself takes it."""
     accepted({"env_kwargs": {"track": "aalborg", "max_episode_steps": 200}})
     said = complaint(tmp_path, {"env_kwargs": {"max_episode_steps": 0.5}})
-    assert said == "max_episode_steps is 0.5; expected a whole number of decisions >= 1"
+    assert said == "max_episode_steps is 0.5; expected a whole number of timesteps >= 1"
 
 
 def test_monitor_gets_both_of_its_lists_or_none(tmp_path):

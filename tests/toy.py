@@ -8,7 +8,7 @@ from gymnasium import spaces
 
 
 class ToyRace(gym.Env[np.ndarray, np.ndarray]):
-    """Random observations; the reward says which reward function is set; ten steps an episode."""
+    """Random observations, ten timesteps an episode; the reward says which reward is set."""
 
     observation_space = spaces.Box(-1.0, 1.0, (29,), np.float32)
     action_space = spaces.Box(np.array([-1, 0, 0], np.float32), np.array([1, 1, 1], np.float32))

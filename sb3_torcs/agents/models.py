@@ -45,7 +45,7 @@ __all__ = [
     "load_driver",
     "one_track",
     "saved_spaces",
-    "saved_steps",
+    "saved_timesteps",
     "shipped_agents",
     "training_record",
 ]
@@ -216,9 +216,9 @@ def one_track(track: Any) -> Any:
     return track
 
 
-def saved_steps(model: Path) -> int:
+def saved_timesteps(model: Path) -> int:
     """
-    Return how many decisions the last training of a model had.
+    Return how many timesteps the last training of a model had.
 
     :param model: the file
     :return: ``num_timesteps``
@@ -293,13 +293,13 @@ def check_resumable(
     """
     Make sure that a training can go on from a model.
 
-    :param model: the file; its memory and its record lie beside it
+    :param model: the file; its replay buffer and its record lie beside it
     :param env: that the training is to go on in
     :param algo: that is to learn, as the zoo calls it
     :param n_envs: number of environments in which it is to learn
     :param frames: observations that it is to see at once
     :param trust: whether the model need not tell how it was trained
-    :return: whether there is a memory to go on with
+    :return: whether there is a replay buffer to go on with
     :raises ModelMismatch: if they do not belong together
     :raises ModelNotTrusted: if nothing tells that a training made it
     """
@@ -327,11 +327,11 @@ def check_resumable(
             f"'{model}' has learned with range_finders {seen!r}, and would go on with others; give "
             "the --env, --entry or --conf-file of before"
         )
-    memory = model.parent / "replay_buffer.pkl"
-    if not memory.is_file():
+    buffer = model.parent / "replay_buffer.pkl"
+    if not buffer.is_file():
         return False
-    said = f"'{memory}' is no memory that can be gone on with"
-    with as_mismatch(said, "remove it, or give"), memory.open("rb") as file:
+    said = f"'{buffer}' is no replay buffer that can be gone on with"
+    with as_mismatch(said, "remove it, or give"), buffer.open("rb") as file:
         buffer = load_from_pkl(file)
         if buffer.n_envs != n_envs:
             raise ValueError(f"of {buffer.n_envs} cars at once, not {n_envs}")
@@ -400,7 +400,7 @@ def _as_sb3_does(file: Path, algo: str | None) -> Any:
     # On the CPU: for one timestep at a time it is the fastest, and it is always there. The
     # schedules are of no use to a driver, and the saved ones may be from another version.
     # Nor is a replay buffer: SB3 warns of the class that it chose itself for returns over several
-    # steps.
+    # timesteps.
     kwargs = {"device": "cpu", "buffer_size": 1, "replay_buffer_class": None}
     with as_mismatch(f"'{file}' does not load as {name}", "give an --algo that fits, or"):
         model = algorithm.load(io.BytesIO(file.read_bytes()), **kwargs)

@@ -92,7 +92,7 @@ class Agent:
         """
         Keep what is told afterwards.
 
-        :param info: of a step
+        :param info: of a timestep
         :param terminated: whether an episode would be over
         """
         self.time = info["car"].time

@@ -42,7 +42,7 @@ class Backend(Protocol):
 
         :param rng: the environment's generator: the only source of chance that may be used
         :param start: where to begin; ``None`` is the grid, standing
-        :return: the car before the first decision
+        :return: the car before the first timestep
         """
 
     def step(self, controls: Controls, ticks: int) -> CarState:

@@ -136,7 +136,7 @@ def starting_list(
     :param opponents: robots, e.g. ``("inferno", "berniw:3")``
     :param grid_place: of the agent among them, 1 in front; ``None`` is behind them all
     :return: names and indices, and :data:`AGENT`
-    :raises InvalidOption: if there is no such place, or the opponents are no list
+    :raises InvalidOption: if there is no such slot, or the opponents are no list
     :raises UnknownRobot: if there is no such robot
     """
     if not isinstance(opponents, (list, tuple)) or not all(isinstance(o, str) for o in opponents):
@@ -144,12 +144,12 @@ def starting_list(
             f"opponents is {opponents!r}; expected a list of names, e.g. ['inferno', 'berniw:3']"
         )
     entries = [game.parse_robot(name) for name in opponents]
-    place = len(entries) + 1 if grid_place is None else grid_place
-    if not is_count(place) or place > len(entries) + 1:
+    slot = len(entries) + 1 if grid_place is None else grid_place
+    if not is_count(slot) or slot > len(entries) + 1:
         raise InvalidOption(
             f"grid_place is {grid_place!r}; expected 1 to {len(entries) + 1}, or None"
         )
-    entries.insert(place - 1, AGENT)
+    entries.insert(slot - 1, AGENT)
     return entries
 
 
@@ -317,29 +317,29 @@ class Fleet:
         self._begun: dict[int, tuple[Controls, int]] = {}  # the latest step of each
         self._fleet = _extension().Fleet([backend.engine for backend in backends], threads)
 
-    def begin(self, place: int, controls: Controls, ticks: int) -> None:
+    def begin(self, index: int, controls: Controls, ticks: int) -> None:
         """
         Begin a step of one of them, and return at once. It must not be used until it is waited for.
 
-        :param place: of the backend
+        :param index: of the backend
         :param controls: as of ``step``
         :param ticks: as of ``step``
         """
-        self._begun[place] = controls, ticks
+        self._begun[index] = controls, ticks
         steering, throttle, brake, gear, clutch = controls
-        self._fleet.begin(place, steering, throttle, brake, gear, ticks, clutch)
+        self._fleet.begin(index, steering, throttle, brake, gear, ticks, clutch)
 
-    def wait(self, place: int) -> CarState:
+    def wait(self, index: int) -> CarState:
         """
         Drive until the step of one of them is done.
 
-        :param place: of the backend
+        :param index: of the backend
         :return: as of ``step``
         """
-        state: CarState = self._fleet.wait(place)
-        backend = self._backends[place]
+        state: CarState = self._fleet.wait(index)
+        backend = self._backends[index]
         backend._state = state
-        backend._drive.append(self._begun[place])
+        backend._drive.append(self._begun[index])
         return state
 
     def finish(self) -> None:

@@ -21,7 +21,7 @@ RESETS = 200
 
 def environments(seconds: float) -> Figures:
     """
-    Measure TorcsLite-v0's control ticks and racetrack-v1's steps, in turns.
+    Measure TorcsLite-v0's control ticks and racetrack-v1's timesteps, in turns.
 
     :param seconds: of processor time, at least one turn each [s]
     :return: the medians over the turns

@@ -1,4 +1,4 @@
-"""What part of a training step the environment and the callbacks take."""
+"""What part of a training timestep the environment and the callbacks take."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from sb3_torcs.bench.torcs import Figures
 __all__ = ["training_share"]
 
 
-WARM_UP = 50  # training steps before the clock starts
+WARM_UP = 50  # training timesteps before the clock starts
 
 
 class _TimedVecEnv(VecEnvWrapper):
-    """Adds up the time that steps take, with everything that wraps the environment."""
+    """Adds up the time that timesteps take, with everything that wraps the environment."""
 
     def __init__(self, venv: VecEnv) -> None:
         super().__init__(venv)
@@ -40,7 +40,7 @@ class _TimedVecEnv(VecEnvWrapper):
 
 
 class _TimedCallbacks(CallbackList):
-    """Runs callbacks, adds up their time, and holds the clock of whole training steps."""
+    """Runs callbacks, adds up their time, and holds the clock of whole training timesteps."""
 
     def __init__(self, callbacks: list[BaseCallback], env: _TimedVecEnv, start: int) -> None:
         super().__init__(callbacks)
@@ -64,12 +64,12 @@ class _TimedCallbacks(CallbackList):
 
 def training_share(steps: int) -> Figures:
     """
-    Measure what part of a DDPG training step the environment and the callbacks take.
+    Measure what part of a DDPG training timestep the environment and the callbacks take.
 
-    The shipped hyperparameters are used, with a short warm-up and a small memory; evaluations are
-    no training steps and are left out.
+    The shipped hyperparameters are used, with a short warm-up and a small replay buffer;
+    evaluations are no training timesteps and are left out.
 
-    :param steps: training steps to measure
+    :param steps: training timesteps to measure
     :return: ``training_env_share``, in [0, 1]
     """
     import torch as th

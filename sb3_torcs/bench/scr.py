@@ -59,7 +59,7 @@ def resets() -> Figures:
 
 def pictures() -> Figures:
     """
-    Measure ``env.render()`` of the game's own pictures, one per decision.
+    Measure ``env.render()`` of the game's own pictures, one per timestep.
 
     :return: ``game_frames_per_s``
     """

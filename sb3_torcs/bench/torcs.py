@@ -20,7 +20,7 @@ from sb3_torcs.car import FloatArray
 __all__ = ["REPEAT", "TORCS", "Figures", "loads", "resets", "scripted_actions", "ticks", "vector"]
 
 TORCS = "sb3_torcs:Torcs-v0"
-REPEAT = 5  # control ticks per decision, the default
+REPEAT = 5  # control ticks per timestep, the default
 TICKS_PER_TURN = 3000  # a minute of driving
 PHYSICS_STEPS = 10  # of 0.002 s in a control tick
 STRETCH = 50  # ticks of the drive between two places where the bare physics is measured
@@ -29,7 +29,7 @@ RESETS = 100  # of each kind
 SLOWEST_TRACK = "road/spring"  # has by far the most segments
 LOADS = 5
 RACES = 16
-BATCHES = 100  # decisions of all races per measurement of the threads: a sixth of a second
+BATCHES = 100  # timesteps of all races per measurement of the threads: a sixth of a second
 SLICE = 0.15  # [s] of wall time per measurement of the processes
 
 Figures = dict[str, float | None]
@@ -45,14 +45,14 @@ def ticks(seconds: float) -> Figures:
     """
     single, repeated = (gym.make(TORCS, action_repeat=repeat) for repeat in (1, REPEAT))
     actions = scripted_actions(single, TICKS_PER_TURN)
-    decisions = scripted_actions(repeated, TICKS_PER_TURN // REPEAT)
+    timesteps = scripted_actions(repeated, TICKS_PER_TURN // REPEAT)
     controls = np.array(actions, np.float64)
     engine = single.get_wrapper_attr("backend").engine
     measurements: dict[str, Callable[[], float]] = {
         "torcs_limit_ticks_per_s": lambda: _limit(engine, controls),
         "torcs_cpp_ticks_per_s": lambda: _replay(engine, controls),
         "torcs_env_ticks_per_s": lambda: _drive(single, actions),
-        "torcs_env_repeat5_ticks_per_s": lambda: REPEAT * _drive(repeated, decisions),
+        "torcs_env_repeat5_ticks_per_s": lambda: REPEAT * _drive(repeated, timesteps),
     }
     rates: dict[str, list[float]] = {name: [] for name in measurements}
     begin = time.process_time()
@@ -103,7 +103,7 @@ def _replay(engine: Any, controls: FloatArray) -> float:
 
 
 def _drive(env: gym.Env[Any, Any], actions: Actions) -> float:
-    """Time the drive in an environment, decisions per second."""
+    """Time the drive in an environment, timesteps per second."""
     env.reset(seed=0)
     begin = time.process_time()
     for action in actions:
@@ -192,7 +192,7 @@ def _scripted_batches(envs: gym.vector.VectorEnv[Any, Any, Any]) -> Actions:
 
 
 def _sweep(envs: gym.vector.VectorEnv[Any, Any, Any], actions: Actions) -> float:
-    """Time the drive in a vector environment by the wall clock, steps per second."""
+    """Time the drive in a vector environment by the wall clock, timesteps per second."""
     envs.reset(seed=0)
     begin = time.perf_counter()
     for action in actions:

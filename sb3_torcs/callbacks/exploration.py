@@ -9,7 +9,7 @@ from stable_baselines3.common.noise import VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_torcs.car import is_count, is_number
-from sb3_torcs.errors import InvalidOption, near_miss
+from sb3_torcs.errors import InvalidOption, near_miss, renamed
 from sb3_torcs.noise import (
     BLOG,
     ActuatorNoise,
@@ -38,13 +38,13 @@ class NoiseCallback(BaseCallback):
     """
     Give the model a noise of :mod:`sb3_torcs.noise`, one stream per parallel environment.
 
-    A model that was saved with such a noise goes on with it: its generator, frames and scale.
+    A model that was saved with such a noise goes on with it: its generator, count and scale.
 
     :param kind: ``"set_point"`` (as in the original code) or ``"ou"``
     :param steering: ``[mu, theta, sigma]`` in environment units
     :param throttle: ``[mu, theta, sigma]`` in environment units
     :param brake: ``[mu, theta, sigma]`` in environment units
-    :param dt: duration of one decision in the unit of 1/theta, for ``"ou"``
+    :param dt: duration of one timestep in the unit of 1/theta, for ``"ou"``
     :param seed: of a new noise; by default the model's own
     :param verbose: as in ``BaseCallback``
     """
@@ -95,7 +95,7 @@ class NoiseCallback(BaseCallback):
             return saved
         saved.release()
         noise = self._new()
-        noise.frames, noise.scale = saved.frames, saved.scale
+        noise.timesteps, noise.scale = saved.timesteps, saved.scale
         return noise
 
     def _on_step(self) -> bool:
@@ -103,7 +103,7 @@ class NoiseCallback(BaseCallback):
 
 
 class _NoiseUser(BaseCallback):
-    """Base of callbacks that steer the noise: finds it before the first step."""
+    """Base of callbacks that steer the noise: finds it before the first timestep."""
 
     noises: Sequence[ActuatorNoise] = ()
 
@@ -134,30 +134,31 @@ class _NoiseUser(BaseCallback):
 
 class NoiseDecayCallback(_NoiseUser):
     """
-    Let the noise fade linearly. Its frames are counted across resumes.
+    Let the noise fade linearly. Its timesteps are counted across resumes.
 
-    :param frames: environment steps until the floor is reached
+    :param timesteps: of all environments together until the floor is reached
     :param floor: share of the noise that stays for ever
     :param verbose: as in ``BaseCallback``
     """
 
-    def __init__(self, *, frames: int = 100_000, floor: float = 0.0, verbose: int = 0) -> None:
+    @renamed(timesteps="timesteps")
+    def __init__(self, *, timesteps: int = 100_000, floor: float = 0.0, verbose: int = 0) -> None:
         super().__init__(verbose)
-        if not is_count(frames) or not is_number(floor) or not 0.0 <= floor <= 1.0:
+        if not is_count(timesteps) or not is_number(floor) or not 0.0 <= floor <= 1.0:
             raise InvalidOption(
-                f"frames={frames!r}, floor={floor!r}: pass a whole number of at least 1 frame, and "
-                "a floor in [0, 1]"
+                f"timesteps={timesteps!r}, floor={floor!r}: pass a whole number of at least 1 "
+                "timestep, and a floor in [0, 1]"
             )
-        self.frames = frames
+        self.timesteps = timesteps
         self.floor = floor
 
     def _apply(self) -> None:
-        done = min(self.noises[0].frames / self.frames, 1.0)
+        done = min(self.noises[0].timesteps / self.timesteps, 1.0)
         scale = 1.0 - (1.0 - self.floor) * done
         for noise in self.noises:
             noise.scale = scale
         self.logger.record("noise/scale", scale)
-        self.logger.record("noise/frames", self.noises[0].frames)
+        self.logger.record("noise/frames", self.noises[0].timesteps)
 
     def _on_step(self) -> bool:
         self._apply()
@@ -166,12 +167,12 @@ class NoiseDecayCallback(_NoiseUser):
 
 class StochasticBrakeCallback(_NoiseUser):
     """
-    Give the brake other parameters in some of the steps, so that braking is explored at all.
+    Give the brake other parameters in some of the timesteps, so that braking is explored at all.
 
-    :param probability: share of the steps
-    :param mu: of the brake in these steps, in [0, 1]
-    :param theta: of the brake in these steps
-    :param sigma: of the brake in these steps
+    :param probability: share of the timesteps
+    :param mu: of the brake in these timesteps, in [0, 1]
+    :param theta: of the brake in these timesteps
+    :param sigma: of the brake in these timesteps
     :param verbose: as in ``BaseCallback``
     """
 
@@ -186,7 +187,9 @@ class StochasticBrakeCallback(_NoiseUser):
     ) -> None:
         super().__init__(verbose)
         if not is_number(probability) or not 0.0 <= probability <= 1.0:
-            raise InvalidOption(f"probability={probability!r}: pass a share of the steps in [0, 1]")
+            raise InvalidOption(
+                f"probability={probability!r}: pass a share of the timesteps in [0, 1]"
+            )
         self.brake = StochasticBrake(probability, OUParameters.of((mu, theta, sigma)))
 
     def _apply(self) -> None:

@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_torcs.callbacks.switches import require_method
 from sb3_torcs.car import is_count
-from sb3_torcs.errors import InvalidOption
+from sb3_torcs.errors import InvalidOption, renamed
 from sb3_torcs.policies.mirror import mirror_half
 from sb3_torcs.sensors import look_both_ways
 
@@ -46,25 +46,26 @@ class _WhileLearning(BaseCallback):
 
 class GradientStepsCallback(_WhileLearning):
     """
-    Learn more from each decision at the beginning of a training, when there are few.
+    Learn more from each timestep at the beginning of a training, when there are few.
 
-    A training that goes on with its memory is not at its beginning. Models that callbacks save keep
-    their own ``gradient_steps``.
+    A training that goes on with its replay buffer is not at its beginning. Models that callbacks
+    save keep their own ``gradient_steps``.
 
-    :param gradient_steps: instead of the model's own, for the first decisions
-    :param frames: number of these decisions, of all environments together
+    :param gradient_steps: instead of the model's own, for the first timesteps
+    :param timesteps: number of these timesteps, of all environments together
     :param verbose: as in ``BaseCallback``
     """
 
-    def __init__(self, *, gradient_steps: int, frames: int, verbose: int = 0) -> None:
+    @renamed(timesteps="timesteps")
+    def __init__(self, *, gradient_steps: int, timesteps: int, verbose: int = 0) -> None:
         super().__init__(verbose)
-        if not is_count(gradient_steps) or not is_count(frames):
+        if not is_count(gradient_steps) or not is_count(timesteps):
             raise InvalidOption(
-                f"gradient_steps={gradient_steps!r}, frames={frames!r}: pass whole numbers of at "
-                "least 1"
+                f"gradient_steps={gradient_steps!r}, timesteps={timesteps!r}: pass whole "
+                "numbers of at least 1"
             )
         self.gradient_steps = gradient_steps
-        self.frames = frames
+        self.timesteps = timesteps
 
     def _on_training_start(self) -> None:
         if not isinstance(self.model, OffPolicyAlgorithm):
@@ -75,9 +76,9 @@ class GradientStepsCallback(_WhileLearning):
         self._algorithm, self._own = self.model, self.model.gradient_steps
 
     def _on_rollout_end(self) -> None:
-        memory = self._algorithm.replay_buffer
-        remembered = 0 if memory is None else memory.size() * memory.n_envs
-        if max(self.num_timesteps, remembered) <= self.frames:
+        buffer = self._algorithm.replay_buffer
+        remembered = 0 if buffer is None else buffer.size() * buffer.n_envs
+        if max(self.num_timesteps, remembered) <= self.timesteps:
             self._algorithm.gradient_steps = self.gradient_steps
 
     def _undo(self) -> None:

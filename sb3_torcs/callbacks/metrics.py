@@ -25,7 +25,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_torcs.actions import ACTIONS, PEDALS, layout_of_width
 from sb3_torcs.car import CarState
-from sb3_torcs.errors import InvalidOption
+from sb3_torcs.errors import InvalidOption, renamed
 from sb3_torcs.tracks.track import Track
 
 __all__ = [
@@ -58,7 +58,7 @@ ENDS = ("off_track", "backwards", "stuck", "damage", "lost", "laps", "time_limit
 
 BRAKING = 0.05  # [-] of the pedal's way; less is a network's idea of nothing
 SATURATED = 0.01  # [-] of an actuator's range: nearer to a limit than this counts as at it
-RECORD_EVERY = 100  # calls between two records of the means over steps
+RECORD_EVERY = 100  # calls between two records of the means over timesteps
 TEXT_FORMATS = ("stdout", "log", "json", "csv")  # these refuse pictures
 
 
@@ -80,7 +80,7 @@ def callbacks_in(callback: BaseCallback | None) -> Iterator[BaseCallback]:
 
 
 class DrivenLine(NamedTuple):
-    """Where a car went, one row per decision."""
+    """Where a car went, one row per timestep."""
 
     track: Track
     x: npt.NDArray[np.float64]  # (n,) [m] in the track's frame
@@ -96,7 +96,7 @@ def drive_lap(model: BaseAlgorithm, env: VecEnv, limit: int = 1500) -> DrivenLin
 
     :param model: the driver
     :param env: racing environments; what the first one does is kept
-    :param limit: decisions after which to give up
+    :param limit: timesteps after which to give up
     :return: the line of the lap, or of what there was of it
     """
     cars: list[CarState] = []
@@ -168,7 +168,7 @@ def mean_q(model: BaseAlgorithm, size: int = 256) -> float | None:
 
 @dataclass
 class _Steps:
-    """Sums over steps, and how many there were."""
+    """Sums over timesteps, and how many there were."""
 
     count: int = 0
     speed: float = 0.0  # [m/s]
@@ -216,8 +216,8 @@ class DrivingMetricsCallback(BaseCallback):
     ``laps``, ``distance``                    mean of the episodes that ended             -, m
     ``end_off_track``, ``end_stuck``, …       share of the episodes that ended this way   -
     ``speed``                                 mean along the car                          m/s
-    ``brake_share``                           share of steps with the brake beyond 5 %    -
-    ``saturation_steering`` (… ``_brake``)    share of steps within 1 % of a limit        -
+    ``brake_share``                           share of timesteps with the brake beyond 5 %    -
+    ``saturation_steering`` (… ``_brake``)    share of timesteps within 1 % of a limit        -
     ``q``                                     mean Q of the newest transitions            -
     ``noise_scale``                           of the action noise, if it has one          -
     ``evaluation_lap_time``                   of the driven line                          s
@@ -228,34 +228,35 @@ class DrivingMetricsCallback(BaseCallback):
     ``EvalCallback`` anywhere in the training's callbacks, one more lap is driven in its environment
     and drawn, if TensorBoard listens.
 
-    :param q_every: steps of the vector of environments between two looks at Q
+    :param q_every: timetimesteps of the vector of environments between two looks at Q
     :param q_size: transitions to ask the critic about
     :param line: whether to draw the line after evaluations
-    :param line_decisions: decisions after which a lap is given up
+    :param line_timesteps: timesteps after which a lap is given up
     :param verbose: as in ``BaseCallback``
     """
 
+    @renamed(line_timesteps="line_timesteps")
     def __init__(
         self,
         *,
         q_every: int = 1000,
         q_size: int = 256,
         line: bool = True,
-        line_decisions: int = 1500,
+        line_timesteps: int = 1500,
         verbose: int = 0,
     ) -> None:
         super().__init__(verbose)
         for name, value in (
             ("q_every", q_every),
             ("q_size", q_size),
-            ("line_decisions", line_decisions),
+            ("line_timesteps", line_timesteps),
         ):
             if not isinstance(value, int) or value < 1:
                 raise InvalidOption(f"{name} is {value!r}; expected a whole number >= 1")
         self.q_every = q_every
         self.q_size = q_size
         self.line = line
-        self.line_decisions = line_decisions
+        self.line_timesteps = line_timesteps
         self.best_lap_time: float | None = None  # [s] of the training
         self.best_evaluation_lap_time: float | None = None  # [s] of the lines driven
 
@@ -359,7 +360,7 @@ class DrivingMetricsCallback(BaseCallback):
         if not self.line or not any(isinstance(f, TensorBoardOutputFormat) for f in formats):
             return
         chance = copy.deepcopy(env.get_attr("np_random"))
-        line = drive_lap(self.model, env, self.line_decisions)
+        line = drive_lap(self.model, env, self.line_timesteps)
         for index, generator in enumerate(chance):  # later evaluations are as if nobody had looked
             env.set_attr("np_random", generator, index)
         if line.lap_time is not None:

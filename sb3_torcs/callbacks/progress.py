@@ -15,7 +15,7 @@ from sb3_torcs.errors import InvalidOption
 
 __all__ = ["RacingProgressCallback", "Unbroken", "spoken_time"]
 
-BAR = "{percentage:3.0f}% {bar} {n_fmt}/{total_fmt} steps{postfix}"
+BAR = "{percentage:3.0f}% {bar} {n_fmt}/{total_fmt} timesteps{postfix}"
 REDRAW = 0.2  # [s] between two looks of the bar
 
 
@@ -63,7 +63,7 @@ class Unbroken:
 
 class RacingProgressCallback(BaseCallback):
     """
-    A live line: steps, episode, distance of the last one, best lap, time left.
+    A live line: timesteps, episode, distance of the last one, best lap, time left.
 
     On a terminal it is a bar; elsewhere (a log file, CI) a line now and then. The clock is only
     read for display: nothing that is learned depends on it. Lap times of evaluations come from the
@@ -138,7 +138,7 @@ class RacingProgressCallback(BaseCallback):
 
     def describe(self, now: float) -> str:
         """
-        Say everything but the steps.
+        Say everything but the timesteps.
 
         :param now: the present time of the monotonic clock [s]
         :return: e.g. ``"episode 12, last 345 m, best lap 91.20 s, 4 min left"``
@@ -168,5 +168,5 @@ class RacingProgressCallback(BaseCallback):
             self._bar.refresh()
             return
         share = 100 * self.num_timesteps // max(self._total, 1)
-        self._out.write(f"{share}% {self.num_timesteps}/{self._total} steps, {text}\n")
+        self._out.write(f"{share}% {self.num_timesteps}/{self._total} timesteps, {text}\n")
         self._out.flush()

@@ -87,7 +87,7 @@ def _run(args: argparse.Namespace) -> int:
         return READER_LEFT
     except OSError as error:
         where = error.filename or "the output"
-        said = f"{error.strerror or error}: {where}; make room, or choose another place"
+        said = f"{error.strerror or error}: {where}; make room, or choose another folder"
         print(f"sb3-torcs: {said}", file=sys.stderr)
         _drop_output()
         return USAGE_ERROR

@@ -20,10 +20,10 @@ torcs_cpp_ticks_per_s: that drive in the engine, with rules and sensors; torcs_e
 Torcs-v0 on it. torcs_reset_ms: to the grid and to random places by turns. torcs_load_ms: gym.make
 on the track that takes longest. torcs_vector2_ratio: what a second thread brings to gym.make_vec
 with 16 races, over what a second process brings to bare engines. scr_ticks_per_s: env.step with
-backend="scr", five ticks per decision; scr_reset_ms: as torcs_reset_ms; game_frames_per_s: of
+backend="scr", five ticks per timestep; scr_reset_ms: as torcs_reset_ms; game_frames_per_s: of
 render_mode="game", 640x480. These last four are by the wall clock, since processes take turns.
 policy_*: updates of a DDPG with SplitHeadPolicy, batch 64. training_env_share: part of a DDPG
-training step (shipped hyperparameters) that the environment and the callbacks take.
+training timestep (shipped hyperparameters) that the environment and the callbacks take.
 What cannot be measured here is null.
 """
 

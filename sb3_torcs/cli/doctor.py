@@ -103,7 +103,7 @@ def checks() -> list[Check]:
     for look in (_tracks, _cars, _layout):
         missing = Check(look.__name__.strip("_"), False, "there is no game to look at", game.fix)
         results.append(_guarded(look) if game.ok else missing)
-    extras = (_game_program, _game_libraries, _window, _film)
+    extras = (_game_program, _game_libraries, _window, _video)
     return results + [_guarded(check) for check in (_torcs, *extras)]
 
 
@@ -178,7 +178,7 @@ def _video_encoder() -> Check:
 
 
 def _torcslite() -> Check:
-    """Drive one decision."""
+    """Drive one timestep."""
     import gymnasium as gym
 
     env = gym.make("TorcsLite-v0")
@@ -298,15 +298,15 @@ def _window() -> Check:
     return _optional("window", f"{library}, {where}", "`watch` and `serve --window`")
 
 
-def _film() -> Check:
+def _video() -> Check:
     """Look for the display that nobody sees."""
     from sb3_torcs.torcs.display import INSTALL, PROGRAM
 
     program = shutil.which(PROGRAM)
     if program is not None:
-        return Check("film", True, program, None)
+        return Check("video", True, program, None)
     found = f"no {PROGRAM}; type: {INSTALL}"
-    return _optional("film", found, "`watch --video` and render_mode 'game'")
+    return _optional("video", found, "`watch --video` and render_mode 'game'")
 
 
 def _optional(name: str, found: str, users: str) -> Check:

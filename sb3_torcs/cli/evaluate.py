@@ -59,12 +59,12 @@ def add_parser(subparsers: Any) -> None:
     add("--episodes", type=positive, default=1, metavar="N", help="default: 1")
     add("--laps", type=positive, default=3, metavar="L", help="laps per episode; default: 3")
     add("--seed", type=seed, default=0, metavar="S", help="of the first reset; default: 0")
-    add("--action-repeat", type=positive, metavar="N", help="control ticks of 0.02 s per decision")
+    add("--action-repeat", type=positive, metavar="N", help="control ticks of 0.02 s per timestep")
     add("--range-finders", metavar="SET", help="scr or narrow")
     add("--algo", help="the model's algorithm, if it cannot be found out")
     add("--trust", action="store_true", help=TRUST_HELP)
     add("--json", action="store_true", help="print one JSON object and nothing else")
-    add("--video", metavar="FILE.mp4", help="film the best lap from above")
+    add("--video", metavar="FILE.mp4", help="record the best lap from above")
     add("--line", metavar="FILE.png", help="draw the line of the best lap, coloured by speed")
     add("--telemetry", metavar="FILE.csv", help="write the drives themselves down")
     parser.set_defaults(run=run)
@@ -81,7 +81,7 @@ def run(args: argparse.Namespace) -> int:
     with quiet_output(args.json):
         result, recorder = _drive(args)
         if video is not None:
-            recorder.film(video)
+            recorder.save_video(video)
         if line is not None:
             recorder.draw_line(line)
         if telemetry is not None:

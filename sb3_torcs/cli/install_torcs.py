@@ -21,7 +21,7 @@ from sb3_torcs.torcs.installation import HOME_VARIABLE, Game, find_game, user_fo
 __all__ = ["add_parser", "run"]
 
 PACKAGES = ("torcs", "torcs-data")
-FILM_PACKAGES = ("xvfb", "libgl1-mesa-dri")  # a display without a screen, and what draws on it
+VIDEO_PACKAGES = ("xvfb", "libgl1-mesa-dri")  # a display without a screen, and what draws on it
 LOOK_AGAIN = 0.1  # [s] between two looks at a running program
 LAST_LINES = 5  # of what a failed program said
 LOCK_PATIENCE = 120  # [s] to wait for another apt
@@ -33,7 +33,7 @@ Debian and Ubuntu: as root by apt-get; otherwise, or with --user, its packages a
 libraries that this system lacks are downloaded and unpacked into your own data folder, which
 needs no root and changes nothing else.
 
-With --video also Xvfb, as root only: a film or a picture of the game needs it where there is no
+With --video also Xvfb, as root only: a video or a picture of the game needs it where there is no
 display.
 """
 ELSEWHERE = """\
@@ -106,10 +106,10 @@ def _get_display(check: bool) -> None:
     if shutil.which("Xvfb"):
         print(f"Xvfb is installed: {shutil.which('Xvfb')}")
         return
-    by_hand = f"sudo apt-get install {' '.join(FILM_PACKAGES)}"
+    by_hand = f"sudo apt-get install {' '.join(VIDEO_PACKAGES)}"
     if check or os.geteuid() != 0 or not shutil.which("apt-get"):
         raise InstallFailed(f"Xvfb is not installed, and only root can; type: {by_hand}")
-    _apt_install(FILM_PACKAGES, by_hand)
+    _apt_install(VIDEO_PACKAGES, by_hand)
     _get_display(check=True)
 
 

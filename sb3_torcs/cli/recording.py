@@ -1,4 +1,4 @@
-"""What was driven, kept: the best lap as a film and as a line on the map."""
+"""What was driven, kept: the best lap as a video and as a line on the map."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ import numpy.typing as npt
 from sb3_torcs.car import CarState, Controls
 from sb3_torcs.telemetry import CONTROL_FIELDS, STATE_FIELDS, write_telemetry
 
-__all__ = ["Decision", "Recorder", "Stretch", "best_stretch"]
+__all__ = ["Recorder", "Stretch", "Timestep", "best_stretch"]
 
-FILM_TICKS = 2  # control ticks per frame: 25 frames per second, in real time
-FILM_FPS = 25
+VIDEO_TICKS = 2  # control ticks per frame: 25 frames per second, in real time
+VIDEO_FPS = 25
 
 
-class Decision(NamedTuple):
-    """One decision of a drive, and where it led."""
+class Timestep(NamedTuple):
+    """One timestep of a drive, and where it led."""
 
     action: npt.NDArray[np.float32]
     car: CarState
@@ -29,28 +29,28 @@ class Decision(NamedTuple):
 
 
 class Stretch(NamedTuple):
-    """Some decisions of an episode."""
+    """Some timesteps of an episode."""
 
     episode: int
     first: int
     last: int  # exclusive
 
 
-def best_stretch(episodes: list[list[Decision]]) -> Stretch:
+def best_stretch(episodes: list[list[Timestep]]) -> Stretch:
     """
     Find the fastest whole lap, or the longest drive if there is none.
 
-    :param episodes: of an evaluation, each with at least one decision
+    :param episodes: of an evaluation, each with at least one timestep
     :return: where it is
     """
     best, best_time = None, float("inf")
-    for number, decisions in enumerate(episodes):
+    for number, timesteps in enumerate(episodes):
         first = 0
-        for index, decision in enumerate(decisions):
-            if not decision.lap_time:
+        for index, timestep in enumerate(timesteps):
+            if not timestep.lap_time:
                 continue
-            if decision.lap_time < best_time:
-                best, best_time = Stretch(number, first, index + 1), decision.lap_time
+            if timestep.lap_time < best_time:
+                best, best_time = Stretch(number, first, index + 1), timestep.lap_time
             first = index + 1
     if best is not None:
         return best
@@ -64,12 +64,12 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
 
     :param env_id: a registered environment
     :param kwargs: of the environment
-    :param max_episode_steps: decisions after which an episode is truncated
+    :param max_episode_steps: timesteps after which an episode is truncated
     """
 
     def __init__(self, env_id: str, kwargs: dict[str, Any], max_episode_steps: int) -> None:
         self.env_id = env_id
-        self.episodes: list[list[Decision]] = []
+        self.episodes: list[list[Timestep]] = []
         self._kwargs = kwargs
         self._limit = max_episode_steps
         self._seed: int | None = None
@@ -91,7 +91,7 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """
-        Do one decision, as ``gymnasium.Env.step``.
+        Do one timestep, as ``gymnasium.Env.step``.
 
         :param action: of the driver
         :return: observation, reward, terminated, truncated, info
@@ -99,7 +99,7 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
         result = self.env.step(action)
         info = result[4]
         controls = self.get_wrapper_attr("controls")
-        self.episodes[-1].append(Decision(action, info["car"], info["lap_time"], controls))
+        self.episodes[-1].append(Timestep(action, info["car"], info["lap_time"], controls))
         return result
 
     def names(self) -> dict[str, str]:
@@ -118,9 +118,9 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
         write_telemetry(
             path,
             (
-                (driver, number, *decision.car[:state], *decision.controls[:controls])
-                for number, decisions in enumerate(self.episodes, 1)
-                for decision in decisions
+                (driver, number, *timestep.car[:state], *timestep.controls[:controls])
+                for number, timesteps in enumerate(self.episodes, 1)
+                for timestep in timesteps
             ),
         )
 
@@ -139,9 +139,9 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
         with self._again(stretch.episode, action_repeat=1) as env:
             plot_track(env.get_wrapper_attr("backend").track, path, line=line, speed=speed)
 
-    def film(self, path: Path) -> None:
+    def save_video(self, path: Path) -> None:
         """
-        Film the best lap from above, in real time.
+        Record the best lap from above, in real time.
 
         :param path: of the video
         """
@@ -149,19 +149,19 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
 
         stretch = best_stretch(self.episodes)
         repeat = self.get_wrapper_attr("action_repeat")
-        total = (stretch.last - stretch.first) * repeat // FILM_TICKS
-        write_video(path, self._frames(stretch, repeat), FILM_FPS, total=total)
+        total = (stretch.last - stretch.first) * repeat // VIDEO_TICKS
+        write_video(path, self._frames(stretch, repeat), VIDEO_FPS, total=total)
 
     def _frames(self, stretch: Stretch, repeat: int) -> Iterator[npt.NDArray[np.uint8]]:
         """Drive the episode again, tick by tick, and look at the stretch."""
-        decisions = self.episodes[stretch.episode]
+        timesteps = self.episodes[stretch.episode]
         with self._again(stretch.episode, action_repeat=1, render_mode="rgb_array") as env:
             tick = 0
-            for index, decision in enumerate(decisions[: stretch.last]):
+            for index, timestep in enumerate(timesteps[: stretch.last]):
                 for _ in range(repeat):
-                    env.step(decision.action)
+                    env.step(timestep.action)
                     tick += 1
-                    if index >= stretch.first and tick % FILM_TICKS == 0:
+                    if index >= stretch.first and tick % VIDEO_TICKS == 0:
                         yield env.render()  # type: ignore[misc]
 
     def _again(self, episode: int, **changes: Any) -> gym.Env[Any, Any]:

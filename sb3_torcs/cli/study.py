@@ -19,7 +19,7 @@ __all__ = ["Board", "add_parser", "run"]
 
 INTERRUPTED = 130
 REFRESHES = 2  # [1/s] of the table
-COLUMNS = ("variant", "seed", "decisions", "laps", "best lap s", "completes", "state")
+COLUMNS = ("variant", "seed", "timesteps", "laps", "best lap s", "completes", "state")
 
 DESCRIPTION = """\
 Run a study: every variant with every seed is trained, evaluated while it learns, and its best model

@@ -43,7 +43,7 @@ def add_parser(subparsers: Any) -> None:
     add("--entry", metavar="NAME", help='entry of the file, e.g. "as the post"; default: the id')
     add("--conf-file", metavar="FILE", help="hyperparameter file; default: the shipped one")
     add("--track", metavar="T", help="instead of the entry's; `sb3-torcs tracks` lists them")
-    add("--timesteps", type=positive, metavar="N", help="decisions; default: what the entry says")
+    add("--timesteps", type=positive, metavar="N", help="timesteps; default: what the entry says")
     add("--seed", type=seed, default=0, metavar="S", help="default: 0")
     add("--folder", default="logs", help="for models and logs; default: logs")
     add("--tensorboard", metavar="DIR", help="default: FOLDER/tensorboard")
@@ -51,7 +51,7 @@ def add_parser(subparsers: Any) -> None:
         "--eval-freq",
         type=int,
         metavar="N",
-        help="decisions between evaluations; default: a fortieth",
+        help="timesteps between evaluations; default: a fortieth",
     )
     add("--eval-episodes", type=positive, default=1, metavar="N", help="per evaluation; default: 1")
     add(
@@ -101,13 +101,14 @@ def _closing_words(options: TrainOptions, result: Run) -> list[str]:
     """Say what there is now, and what to type next."""
     if result.last_model is None:
         return [f"the RL Zoo has searched; its reports: {result.folder / 'report_*.csv'}"]
-    lines = [f"learned from {result.steps} of {result.wanted} decisions; folder: {result.folder}"]
+    learned = f"learned from {result.timesteps} of {result.wanted} timesteps"
+    lines = [f"{learned}; folder: {result.folder}"]
     evaluated = result.best_model != result.last_model
     lines += [f"best model by evaluation: {result.best_model}"] if evaluated else []
     lines += [f"last model: {result.last_model}"]
     if options.resume is not None:
         lines += [f"before that, which may be better still: {options.resume}"]
-    if result.steps < result.wanted:
+    if result.timesteps < result.wanted:
         lines += ["go on with:", f"  {_going_on(options, result)}"]
     track = result.track[0] if isinstance(result.track, list) else result.track
     words = ["sb3-torcs", "evaluate", str(result.best_model), "--env", options.env]

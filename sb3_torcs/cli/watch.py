@@ -1,4 +1,4 @@
-"""``sb3-torcs watch``: an agent or a robot in the game's own 3D window, or in a film of it."""
+"""``sb3-torcs watch``: an agent or a robot in the game's own 3D window, or in a video of it."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def add_parser(subparsers: Any) -> None:
 
     parser = subparsers.add_parser(
         "watch",
-        help="see an agent or a robot in the game's own window, or film it",
+        help="see an agent or a robot in the game's own window, or record a video of it",
         description=DESCRIPTION,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -82,25 +82,25 @@ def run(args: argparse.Namespace) -> int:
     :return: the exit status
     """
     from sb3_torcs.errors import InvalidOption
-    from sb3_torcs.evaluation.watching import film_shows
+    from sb3_torcs.evaluation.watching import record_shows
     from sb3_torcs.torcs.installation import find_game
 
     for option in ("beside", "fps"):
         if getattr(args, option) is not None and args.video is None:
             raise InvalidOption(f"--{option} is for videos; add --video FILE.mp4")
-    film = writable_file(args.video, (".mp4",)) if args.video else None
+    video = writable_file(args.video, (".mp4",)) if args.video else None
     game = find_game()
     names = [args.name] if args.beside is None else [args.name, args.beside]
     shows = _shows(game, names, args)
-    if film is None:
+    if video is None:
         _in_window(shows[0], args)
     else:
         fps = {} if args.fps is None else {"fps": args.fps}
-        film_shows(shows, film, size=args.size, view=args.view, **fps)
+        record_shows(shows, video, size=args.size, view=args.view, **fps)
     for name, show in zip(names, shows, strict=True):
         _report(name, show)
-    if film is not None:
-        print(f"film: {film}")
+    if video is not None:
+        print(f"video: {video}")
     return 0
 
 
@@ -180,7 +180,7 @@ def _in_window(show: Show, args: argparse.Namespace) -> None:
     from sb3_torcs.torcs.display import find_display
     from sb3_torcs.torcs.window import Window
 
-    display = find_display("`--video FILE.mp4` films the race without one")
+    display = find_display("`--video FILE.mp4` records the race without one")
     window = Window(size=args.size, view=args.view, display=display, driver=show.driver_name)
     show_in_window(show, window)
 

@@ -37,7 +37,7 @@ __all__ = ["RacingEnv", "RacingInfo"]
 
 Observation = npt.NDArray[np.float32]
 
-MAX_ACTION_REPEAT = 50_000  # [-] a decision every quarter of an hour
+MAX_ACTION_REPEAT = 50_000  # [-] a timestep every quarter of an hour
 
 STUCK_SPEED = 5.0 / 3.6  # [m/s] along the road; slower than walking counts as standing
 STUCK_TICKS = 75  # control ticks of standing that end an episode: 1.5 s
@@ -57,7 +57,7 @@ class RacingInfo(TypedDict):
     """What ``info`` holds, from the reset to the end. What has not happened is 0 or empty."""
 
     laps: int  # whole laps driven in this episode
-    lap_time: float  # [s] of the lap that this step has completed, else 0
+    lap_time: float  # [s] of the lap that this timestep has completed, else 0
     best_lap_time: float  # [s] of the best whole lap, 0 before there is one
     distance: float  # [m] along the road since the episode began
     off_track: bool
@@ -74,7 +74,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
     :param backend: the world
     :param action: which numbers; see :func:`sb3_torcs.actions.action_layout`
     :param reward: a preset, or a mapping from terms to weights; see :mod:`sb3_torcs.rewards`
-    :param action_repeat: control ticks of 0.02 s per decision
+    :param action_repeat: control ticks of 0.02 s per timestep
     :param start: ``"grid"``, or ``"random"``: anywhere on the track, moving
     :param laps: whole laps after which the episode is truncated; ``None`` drives on
     :param render_mode: ``None``, or one of ``metadata["render_modes"]``
@@ -141,7 +141,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
 
     def set_reward(self, reward: str | Mapping[str, float]) -> str | Mapping[str, float] | None:
         """
-        Value decisions by another reward from now on.
+        Value timesteps by another reward from now on.
 
         :param reward: as in the constructor
         :return: the reward until now
@@ -247,7 +247,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
             after = drive()
             end = self._end(after)
         except CarLost:
-            # A training of millions of decisions shall not end with this episode.
+            # A training of millions of timesteps shall not end with this episode.
             after, end = before, "lost"
         self.car = after
         terms = self._reward(before, after, self._controls, end)

@@ -50,7 +50,7 @@ class TorcsEnv(RacingEnv):
         them: each episode is on one, drawn from the seed
     :param car: any of the game's, e.g. ``"car1-trb1"``
     :param reward: ``"progress"``, ``"blog"``, ``"apex"``, or a dict of weights
-    :param action_repeat: control ticks of 0.02 s per decision
+    :param action_repeat: control ticks of 0.02 s per timestep
     :param range_finders: ``"scr"``, ``"narrow"``, or 19 angles in degrees, left to right
     :param action: ``"pedals"``: steering, throttle, brake; ``"pedal"``: steering and one signed
         pedal; or ``"manual"``: steering, throttle, brake, gear, clutch

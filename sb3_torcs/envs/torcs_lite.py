@@ -50,7 +50,7 @@ class TorcsLiteEnv(RacingEnv):
         See :data:`sb3_torcs.rewards.PRESETS`; ``info["reward_terms"]`` sums to the reward.
 
     Starting state
-        ``"grid"``: standing on the first place of the grid. ``"random"``: anywhere, moving.
+        ``"grid"``: standing in the first grid slot. ``"random"``: anywhere, moving.
         ``reset(options={"distance": 100.0, "speed": 20.0})`` puts the car where one wants it.
 
     Episode end
@@ -66,7 +66,7 @@ class TorcsLiteEnv(RacingEnv):
         episode is on one of them
     :param car: ``"car1-trb1"``
     :param reward: ``"progress"``, ``"blog"``, ``"apex"``, or a dict of weights
-    :param action_repeat: control ticks of 0.02 s per decision
+    :param action_repeat: control ticks of 0.02 s per timestep
     :param range_finders: ``"scr"``, ``"narrow"``, or 19 angles in degrees, left to right
     :param action: ``"pedals"``: steering, throttle, brake; ``"pedal"``: steering and one signed
         pedal; or ``"manual"``: steering, throttle, brake, gear, clutch

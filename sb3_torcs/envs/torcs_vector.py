@@ -46,7 +46,7 @@ class TorcsVectorEnv(SyncVectorEnv):
     :param num_envs: races
     :param threads: that share the work, at least 1; ``None`` is one per core, and one per race at
         most
-    :param max_episode_steps: decisions after which an episode is truncated, as in ``gym.make``:
+    :param max_episode_steps: timesteps after which an episode is truncated, as in ``gym.make``:
         ``None`` is the limit that ``Torcs-v0`` is registered with, -1 is none
     :param autoreset_mode: when a race that has ended begins anew
     :param options: of :class:`~sb3_torcs.envs.torcs.TorcsEnv`, the same for all races
@@ -82,11 +82,11 @@ class TorcsVectorEnv(SyncVectorEnv):
             raise InvalidOption(
                 f"max_episode_steps is {limit!r}; expected a whole number >= 1, or -1 for no limit"
             )
-        decisions = math.inf if limit == NO_LIMIT else limit
+        timesteps = math.inf if limit == NO_LIMIT else limit
         self.envs: list[_Race]  # type: ignore[assignment]  # a list of Env, says Gymnasium
         self._env_obs: list[Observation | None]  # type: ignore[assignment]  # of None, says Gymnasium
         super().__init__(
-            [lambda: _Race(decisions, **options)] * int(num_envs), autoreset_mode=autoreset_mode
+            [lambda: _Race(timesteps, **options)] * int(num_envs), autoreset_mode=autoreset_mode
         )
         self.threads = min(threads or len(os.sched_getaffinity(0)), self.num_envs)
         self._fleet = Fleet([env.backend for env in self.envs], self.threads)
@@ -111,20 +111,20 @@ class TorcsVectorEnv(SyncVectorEnv):
         ticks = self.envs[0].action_repeat
         # All before any drives: a wrong one leaves all races where they are.
         controls = {
-            place: env.begin_step(rows[place])
-            for place, env in enumerate(self.envs)
-            if not anew[place]
+            index: env.begin_step(rows[index])
+            for index, env in enumerate(self.envs)
+            if not anew[index]
         }
         try:
-            for place, asked in controls.items():
-                self._fleet.begin(place, asked, ticks)
+            for index, asked in controls.items():
+                self._fleet.begin(index, asked, ticks)
             return self._collect(anew)
         except BaseException:
             self._fleet.finish()  # so that a reset finds no thread at work
             raise
 
     def _begin_anew(self) -> list[bool]:
-        """Say for each race whether this step begins an episode instead."""
+        """Say for each race whether this timestep begins an episode instead."""
         ended: list[bool] = self._autoreset_envs.tolist()
         if self.autoreset_mode == AutoresetMode.NEXT_STEP:
             return ended
@@ -143,32 +143,32 @@ class TorcsVectorEnv(SyncVectorEnv):
         terminated, truncated = np.zeros(number, np.bool_), np.zeros(number, np.bool_)
         infos: dict[str, Any] = {}
         same_step = self.autoreset_mode == AutoresetMode.SAME_STEP
-        for place, env in enumerate(self.envs):
-            if anew[place]:
+        for index, env in enumerate(self.envs):
+            if anew[index]:
                 observation, info = env.reset()
             else:
                 observation, reward, end, cut, info = env.finish_step(
-                    partial(self._fleet.wait, place)
+                    partial(self._fleet.wait, index)
                 )
-                rewards[place] = reward
+                rewards[index] = reward
                 if end or cut:
-                    terminated[place], truncated[place] = end, cut
+                    terminated[index], truncated[index] = end, cut
                     if same_step:
-                        self._gather(infos, {"final_obs": observation, "final_info": info}, place)
+                        self._gather(infos, {"final_obs": observation, "final_info": info}, index)
                         observation, info = env.reset()
-            observations[place] = observation
-            self._env_obs[place] = observation
-            self._gather(infos, info, place)
+            observations[index] = observation
+            self._env_obs[index] = observation
+            self._gather(infos, info, index)
         self._autoreset_envs = terminated | truncated
         return observations, rewards, terminated, truncated, infos
 
-    def _gather(self, infos: dict[str, Any], info: dict[str, Any], place: int) -> None:
+    def _gather(self, infos: dict[str, Any], info: dict[str, Any], index: int) -> None:
         """
         Do what ``_add_info`` does in half its time, for the kinds of values that are here.
 
         :param infos: values by name, and masks of who has one by ``_`` and the name
         :param info: of one race, added to them
-        :param place: of the race
+        :param index: of the race
         """
         for name, value in info.items():
             mask_name = f"_{name}"
@@ -176,10 +176,10 @@ class TorcsVectorEnv(SyncVectorEnv):
                 infos[name] = self._room(value)
                 infos[mask_name] = np.zeros(self.num_envs, np.bool_)
             if isinstance(value, dict):
-                self._gather(infos[name], value, place)
+                self._gather(infos[name], value, index)
             else:
-                infos[name][place] = value
-            infos[mask_name][place] = True
+                infos[name][index] = value
+            infos[mask_name][index] = True
 
     def _room(self, value: Any) -> Any:
         """Make room for what all races say, by what the first of them does."""
@@ -200,11 +200,11 @@ class TorcsVectorEnv(SyncVectorEnv):
 
 
 class _Race(TorcsEnv):
-    """One of the races, which counts its decisions as ``TimeLimit`` would."""
+    """One of the races, which counts its timesteps as ``TimeLimit`` would."""
 
-    def __init__(self, decisions: float, **options: Any) -> None:
+    def __init__(self, timesteps: float, **options: Any) -> None:
         super().__init__(**options)
-        self._decisions = decisions
+        self._timesteps = timesteps
         self._elapsed = 0
 
     def reset(self, **kwargs: Any) -> tuple[Observation, dict[str, Any]]:
@@ -214,5 +214,5 @@ class _Race(TorcsEnv):
     def finish_step(self, drive: Callable[[], CarState]) -> Answer:
         observation, reward, terminated, truncated, info = super().finish_step(drive)
         self._elapsed += 1
-        truncated = truncated or self._elapsed >= self._decisions
+        truncated = truncated or self._elapsed >= self._timesteps
         return observation, reward, terminated, truncated, info

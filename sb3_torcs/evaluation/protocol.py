@@ -23,7 +23,7 @@ __all__ = [
     "Driver",
     "Episode",
     "Merit",
-    "Step",
+    "Timestep",
     "World",
     "choose_world",
     "drive",
@@ -55,8 +55,8 @@ class Driver(Protocol):
 
 
 @dataclass(frozen=True)
-class Step:
-    """One decision of a drive."""
+class Timestep:
+    """One timestep of a drive."""
 
     car: CarState  # after it
     action: npt.NDArray[np.float32]
@@ -160,7 +160,7 @@ def time_limit(kwargs: Mapping[str, Any]) -> int:
     Compute the time limit of an evaluation, long enough for the slowest car that is not stuck.
 
     :param kwargs: of the environment, with ``laps``
-    :return: decisions
+    :return: timesteps
     """
     from sb3_torcs.envs.racing import STUCK_SPEED
     from sb3_torcs.tracks.catalogue import load_track
@@ -198,14 +198,14 @@ def race_environment(
     return wrapped(env, hyperparameters, trust=trust)
 
 
-def drive(env: gym.Env[Any, Any], driver: Driver, *, seed: int | None = None) -> Iterator[Step]:
+def drive(env: gym.Env[Any, Any], driver: Driver, *, seed: int | None = None) -> Iterator[Timestep]:
     """
     Drive one episode, deterministically.
 
     :param env: a racing environment
     :param driver: chooses the actions
     :param seed: of the reset
-    :return: the decisions, one by one
+    :return: the timesteps, one by one
     """
     observation, _ = env.reset(seed=seed)
     state, episode_start, done = None, np.ones(1, dtype=bool), False
@@ -214,7 +214,7 @@ def drive(env: gym.Env[Any, Any], driver: Driver, *, seed: int | None = None) ->
         episode_start = np.zeros(1, dtype=bool)
         observation, reward, terminated, truncated, info = env.step(action)
         done = terminated or truncated
-        yield Step(info["car"], action, float(reward), info, done)
+        yield Timestep(info["car"], action, float(reward), info, done)
 
 
 def evaluate(
@@ -233,9 +233,9 @@ def evaluate(
     for number in range(episodes):
         lap_times, total = [], 0.0
         info: dict[str, Any] = {}
-        for step in drive(env, driver, seed=seed if number == 0 else None):
-            info = step.info
-            total += step.reward
+        for timestep in drive(env, driver, seed=seed if number == 0 else None):
+            info = timestep.info
+            total += timestep.reward
             if info["lap_time"]:
                 lap_times.append(info["lap_time"])
         results.append(

@@ -1,4 +1,4 @@
-"""Races that people look at: agents and robots in the game's window, or in a film of it."""
+"""Races that people look at: agents and robots in the game's window, or in a video of it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from sb3_torcs.agents.scripted import SCRIPTED
 from sb3_torcs.car import DEFAULT_CAR
 from sb3_torcs.errors import GameFailed, InvalidOption, ServerLost
 from sb3_torcs.rendering.encoder import PHOTOGRAPHIC, write_video
-from sb3_torcs.rendering.game_video import FPS, Film, side_by_side
+from sb3_torcs.rendering.game_video import FPS, GameVideo, side_by_side
 from sb3_torcs.scr.protocol import plain_name
 from sb3_torcs.scr.server import open_ports, start_server
 from sb3_torcs.torcs.installation import Game
@@ -29,7 +29,7 @@ from sb3_torcs.torcs.results import read_results
 from sb3_torcs.torcs.window import Window, window_arguments
 from sb3_torcs.tracks.trial import check_track
 
-__all__ = ["Show", "film_shows", "show_in_window"]
+__all__ = ["Show", "record_shows", "show_in_window"]
 
 AFTERMATH = 2.0  # [s] of the race that are shown after an agent's drive has ended
 SCR_DRIVER = (SCR_SERVER, 0)
@@ -60,7 +60,7 @@ class Show:
     trust: bool = False
     agent: Agent | None = None
     results: list[RobotResult] = field(default_factory=list)
-    share: float = 0.0  # of the race that is filmed, 0 to 1
+    share: float = 0.0  # of the race that is recorded, 0 to 1
 
     @property
     def race(self) -> RaceSetup:
@@ -132,7 +132,7 @@ def show_in_window(show: Show, window: Window) -> None:
         show.finish(process)
 
 
-def film_shows(
+def record_shows(
     shows: Sequence[Show],
     path: Path,
     *,
@@ -141,10 +141,10 @@ def film_shows(
     fps: float = FPS,
 ) -> None:
     """
-    Film races, side by side if there are several.
+    Record races, side by side if there are several.
 
     :param shows: the races, from left to right
-    :param path: of the film, ending in ``.mp4``
+    :param path: of the video, ending in ``.mp4``
     :param size: width and height of the whole picture [pixels]
     :param view: one of :data:`sb3_torcs.torcs.window.VIEWS`
     :param fps: frames per second of simulated time
@@ -156,18 +156,18 @@ def film_shows(
     part = (size[0] // len(shows), size[1])
     if len(shows) > 1 and size[0] % (2 * len(shows)):
         raise InvalidOption(
-            f"size is {size[0]}x{size[1]}; the width of a film with {len(shows)} side by side has "
+            f"size is {size[0]}x{size[1]}; the width of a video with {len(shows)} side by side has "
             f"to be a multiple of {2 * len(shows)}"
         )
     with ExitStack() as stack:
-        films = [
+        videos = [
             stack.enter_context(
-                Film(show.start, size=part, view=view, fps=fps, driver=show.driver_name)
+                GameVideo(show.start, size=part, view=view, fps=fps, driver=show.driver_name)
             )
             for show in shows
         ]
-        threads = [_begin(show, film) for show, film in zip(shows, films, strict=True)]
-        pictures = [_pictures(show, film) for show, film in zip(shows, films, strict=True)]
+        threads = [_begin(show, video) for show, video in zip(shows, videos, strict=True)]
+        pictures = [_pictures(show, video) for show, video in zip(shows, videos, strict=True)]
         try:
             joint = side_by_side(*pictures)
             write_video(
@@ -175,18 +175,18 @@ def film_shows(
                 share=lambda: min(show.share for show in shows),
             )  # fmt: skip
         finally:
-            for film in films:
-                film.game.stop()
+            for video in videos:
+                video.game.stop()
             for thread in threads:
                 thread.join()
 
 
-def _begin(show: Show, film: Film) -> threading.Thread:
+def _begin(show: Show, video: GameVideo) -> threading.Thread:
     """
     Let an agent drive beside the camera.
 
     :param show: with the agent
-    :param film: of it
+    :param video: of it
     :return: the thread
     """
 
@@ -197,33 +197,33 @@ def _begin(show: Show, film: Film) -> threading.Thread:
             show.agent.drive(AFTERMATH)
         except BaseException as error:
             # A game that ended by itself knows better why.
-            if not isinstance(error, ServerLost) or film.game.poll() is None:
+            if not isinstance(error, ServerLost) or video.game.poll() is None:
                 show.agent.error = error
-            film.game.stop()  # which otherwise waits for an answer
+            video.game.stop()  # which otherwise waits for an answer
 
     thread = threading.Thread(target=drive, name="agent")
     thread.start()
     return thread
 
 
-def _pictures(show: Show, film: Film) -> Iterator[npt.NDArray[np.uint8]]:
+def _pictures(show: Show, video: GameVideo) -> Iterator[npt.NDArray[np.uint8]]:
     """
-    Yield a film to the end of the race, or a little beyond the end of the agent's drive.
+    Yield a video to the end of the race, or a little beyond the end of the agent's drive.
 
     :param show: the race
-    :param film: of it
+    :param video: of it
     """
     agent = show.agent
     try:
-        for frame in film.frames():
+        for frame in video.frames():
             show.share = frame.share
             yield frame.picture
             if agent is not None and agent.end_time is not None:
                 left = agent.end_time + AFTERMATH - frame.time
-                if left < 1.0 / film.fps:
+                if left < 1.0 / video.fps:
                     return
     except GameFailed:
         if agent is not None and agent.error is not None:
             raise agent.error from None
         raise
-    show.finish(film.game)
+    show.finish(video.game)

@@ -100,17 +100,17 @@ public:
         }
     }
 
-    void begin(std::size_t place, const Controls& controls, int ticks) {
-        Task& task = tasks_.at(place);
-        pool_.wait(place);
+    void begin(std::size_t index, const Controls& controls, int ticks) {
+        Task& task = tasks_.at(index);
+        pool_.wait(index);
         task.controls = controls;
         task.ticks = ticks;
-        pool_.begin(place);
+        pool_.begin(index);
     }
 
-    const Reading& wait(std::size_t place) {
-        Task& task = tasks_.at(place);
-        pool_.wait(place);
+    const Reading& wait(std::size_t index) {
+        Task& task = tasks_.at(index);
+        pool_.wait(index);
         if (task.failure) std::rethrow_exception(task.failure);
         return task.reading;
     }
@@ -126,8 +126,8 @@ private:
         std::exception_ptr failure;
     };
 
-    void work(std::size_t place) {
-        Task& task = tasks_[place];
+    void work(std::size_t index) {
+        Task& task = tasks_[index];
         task.failure = nullptr;
         try {
             Engine::Access race(*task.engine);
@@ -342,20 +342,20 @@ PYBIND11_MODULE(_engine, module) {
         .def(py::init<const std::vector<Engine*>&, int>(), py::keep_alive<1, 2>(), "engines"_a,
              "threads"_a)
         .def("begin",
-             [](Fleet& fleet, std::size_t place, double steering, double throttle, double brake,
+             [](Fleet& fleet, std::size_t index, double steering, double throttle, double brake,
                 std::optional<int> gear, int ticks, double clutch) {
                  const Controls controls = controls_of(steering, throttle, brake, gear, clutch);
                  const WithoutPython released;
-                 fleet.begin(place, controls, ticks);
+                 fleet.begin(index, controls, ticks);
              },
-             "place"_a, "steering"_a, "throttle"_a, "brake"_a, "gear"_a, "ticks"_a,
+             "index"_a, "steering"_a, "throttle"_a, "brake"_a, "gear"_a, "ticks"_a,
              "clutch"_a = 0.0)
         .def("wait",
-             [](Fleet& fleet, std::size_t place) {
+             [](Fleet& fleet, std::size_t index) {
                  const Reading* reading;
                  {
                      const WithoutPython released;
-                     reading = &fleet.wait(place);
+                     reading = &fleet.wait(index);
                  }
                  return as_state(*reading);
              })

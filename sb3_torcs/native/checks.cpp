@@ -175,7 +175,7 @@ void check_simulation(const SimulatedCar* simulated, const CarElement* cars, int
             refuse(car, "does not come to rest on its wheels");
         expect("its x", own.global.pos.x, car.pub.global.pos.x);
         expect("its yaw", own.local.pos.az, car.pub.local.pos.az);
-        expect("its engine speed", own.engine_speed, car.priv.engine_speed);
+        expect("its motor speed", own.engine_speed, car.priv.engine_speed);
         expect("its fuel", own.fuel, car.priv.fuel);
         expect("its gear", own.gear, car.priv.gear);
         expect("its damage", own.damage, car.priv.damage);

@@ -144,7 +144,7 @@ def _check_policy(policy: Any, statistics: Any) -> None:
         )
     if hasattr(policy, "lstm_actor"):
         raise ModelMismatch(
-            f"{name} remembers what it saw, and an export has no memory; export a model whose "
+            f"{name} remembers what it saw, and an export keeps no state; export a model whose "
             "policy has none, e.g. MlpPolicy"
         )
     for space in (policy.observation_space, policy.action_space):
@@ -154,7 +154,7 @@ def _check_policy(policy: Any, statistics: Any) -> None:
     if found is not None and np.shape(found.mean) != policy.observation_space.shape:
         raise ModelMismatch(
             f"{name} sees stacked frames that are normalized one by one, and an export has no "
-            "memory for them; export a model that was trained without normalize or frame_stack"
+            "state for them; export a model that was trained without normalize or frame_stack"
         )
 
 

@@ -1,6 +1,6 @@
-"""Films of the game: every frame is drawn, however long it takes, and none is drawn twice.
+"""Videos of the game: every frame is drawn, however long it takes, and none is drawn twice.
 
-Between two frames the game goes on by exactly one frame's time. A film begins one second before
+Between two frames the game goes on by exactly one frame's time. A video begins one second before
 the start and ends one second after the race.
 """
 
@@ -25,7 +25,7 @@ from sb3_torcs.torcs.display import VirtualDisplay
 from sb3_torcs.torcs.process import GameProcess
 from sb3_torcs.torcs.window import Window
 
-__all__ = ["FPS", "Film", "Frame", "read_frame", "side_by_side"]
+__all__ = ["FPS", "Frame", "GameVideo", "read_frame", "side_by_side"]
 
 FPS = 30.0
 PATIENCE = 120.0  # [s] for one frame, on a busy machine
@@ -39,7 +39,7 @@ MARK = b"SB3F"
 @dataclass(frozen=True)
 class Frame:
     """
-    One picture of a film.
+    One picture of a video.
 
     :param number: from 0
     :param time: simulated [s], negative before the start
@@ -53,9 +53,9 @@ class Frame:
     share: float = 0.0
 
 
-class Film:
+class GameVideo:
     """
-    A race that is filmed instead of shown, under a display of its own.
+    A race that is recorded instead of shown, under a display of its own.
 
     Use it in a ``with`` statement; leaving it ends the game.
 
@@ -80,7 +80,7 @@ class Film:
     ) -> None:
         window = Window(size, view, driver=driver, fps=fps)
         if any(side % 2 for side in size):
-            raise InvalidOption(f"size is {size[0]}x{size[1]}; a film needs even numbers")
+            raise InvalidOption(f"size is {size[0]}x{size[1]}; a video needs even numbers")
         self.fps = fps
         with ExitStack() as stack:
             self.display = stack.enter_context(VirtualDisplay(size))
@@ -95,7 +95,7 @@ class Film:
             stack.callback(self.game.stop)
             self._stack = stack.pop_all()
 
-    def __enter__(self) -> Film:
+    def __enter__(self) -> GameVideo:
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -132,7 +132,7 @@ class Film:
 
     def save(self, path: str | os.PathLike[str], total: int | None = None) -> Path:
         """
-        Film the race from now to its end.
+        Record the race from now to its end.
 
         :param path: of the file, ending in ``.mp4``
         :param total: number of frames, for the progress bar, if known
@@ -145,15 +145,15 @@ class Film:
         return write_video(path, self.pictures(), self.fps, total, PHOTOGRAPHIC)
 
 
-def side_by_side(*films: Iterator[npt.NDArray[np.uint8]]) -> Iterator[npt.NDArray[np.uint8]]:
+def side_by_side(*videos: Iterator[npt.NDArray[np.uint8]]) -> Iterator[npt.NDArray[np.uint8]]:
     """
-    Join films of one height. Of one that ends before the others the last picture stays.
+    Join videos of one height. Of one that ends before the others the last picture stays.
 
-    :param films: pictures of each, from left to right
+    :param videos: pictures of each, from left to right
     :return: joint pictures
     """
     last: list[npt.NDArray[np.uint8]] = []
-    for pictures in zip_longest(*films):
+    for pictures in zip_longest(*videos):
         last = [
             last[place] if picture is None else picture for place, picture in enumerate(pictures)
         ]

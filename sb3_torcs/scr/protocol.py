@@ -182,7 +182,7 @@ def parse_state(message: bytes) -> ScrState:
 
 def parse_engine(message: bytes) -> EngineReading:
     """
-    Read only what a gearbox needs: for the states between two decisions.
+    Read only what a gearbox needs: for the states between two timesteps.
 
     :param message: as of :func:`parse_state`
     :return: a part of the state

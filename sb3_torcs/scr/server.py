@@ -76,7 +76,7 @@ def start_server(
     :param sockets: bound, the k-th for driver k; they can be closed here afterwards
     :param deadline: for an answer [s]; ``None`` waits for it, however long it takes
     :param options: of :data:`SCR_OPTIONS`
-    :param window: in which the race is shown or filmed; ``None`` runs it without one
+    :param window: in which the race is shown or recorded; ``None`` runs it without one
     :return: the game; its clients are awaited now
     """
     numbers = [bound.fileno() for bound in sockets]

@@ -18,7 +18,7 @@ import gymnasium as gym
 import yaml
 
 from sb3_torcs.agents.wrapping import unrebuilt
-from sb3_torcs.errors import StudyError, near_miss
+from sb3_torcs.errors import StudyError, near_miss, with_new_names
 from sb3_torcs.plain_yaml import read_yaml
 from sb3_torcs.tracks.catalogue import available_tracks, load_track
 from sb3_torcs.training import zoo
@@ -54,7 +54,7 @@ class Trial:
     algo: str  # as the zoo calls it
     env_id: str
     entry: dict[str, Any]  # of a hyperparameter file, changes applied
-    eval_interval: int  # decisions
+    eval_interval: int  # timesteps
     eval_tracks: tuple[str, ...]  # that choose the model
     final_tracks: tuple[str, ...]  # that the chosen model is measured on
 
@@ -65,7 +65,7 @@ class Trial:
 
     @property
     def budget(self) -> int:
-        """Decisions to learn from."""
+        """Timesteps to learn from."""
         return int(self.entry["n_timesteps"])
 
     @property
@@ -141,7 +141,7 @@ def merged(entry: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, An
                 raise StudyError(f"null takes '{key}' away, but it is not there; leave it out")
             del result[key]
         elif key == "callback" and isinstance(value, Mapping):
-            by_path = merged(_by_path(result.get(key)), value)
+            by_path = merged(_by_path(result.get(key)), _by_path([value]))
             result[key] = [{path: kwargs} if kwargs else path for path, kwargs in by_path.items()]
         elif isinstance(value, Mapping) and isinstance(result.get(key), Mapping):
             result[key] = merged(result[key], value)
@@ -241,11 +241,11 @@ def _trials(
         raise StudyError(f"{place}: {error}") from None
     entry = as_data(entry)
     zoo.check_entry(entry, algo, env_id, place)
-    entry["n_timesteps"] = zoo.decisions(entry)
+    entry["n_timesteps"] = zoo.timesteps(entry)
     _check_evaluable(entry, place)
     interval = said["eval_interval"]
     if type(interval) is not int or interval < 1:
-        raise StudyError(f"{file}: eval_interval is {interval!r}; expected decisions, e.g. 5000")
+        raise StudyError(f"{file}: eval_interval is {interval!r}; expected timesteps, e.g. 5000")
     env_kwargs = entry.get("env_kwargs") or {}
     own = env_kwargs.get("track", "aalborg")
     given = source["eval_tracks"]
@@ -313,4 +313,13 @@ def _by_path(callbacks: Any) -> dict[str, Any]:
     result: dict[str, Any] = {}
     for item in items:
         result.update({item: {}} if isinstance(item, str) else item)
-    return result
+    return {path: _with_new_names(path, arguments) for path, arguments in result.items()}
+
+
+def _with_new_names(path: str, arguments: Any) -> Any:
+    """Let the older name of a callback's argument change what an entry says by the new one."""
+    from sb3_torcs import callbacks
+
+    ours = getattr(callbacks, str(path).removeprefix("sb3_torcs.callbacks."), None)
+    names = getattr(getattr(ours, "__init__", None), "older_names", {})
+    return with_new_names(arguments, names) if isinstance(arguments, Mapping) else arguments

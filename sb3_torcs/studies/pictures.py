@@ -23,7 +23,7 @@ def _curves(trial: Results) -> dict[str, Array]:
     Arrange the evaluations of a trial, means over its tracks.
 
     :param trial: that was evaluated
-    :return: decisions, distance [m], best lap so far [s], and whether all laps were driven, each
+    :return: timesteps, distance [m], best lap so far [s], and whether all laps were driven, each
         (evaluations,)
     """
 
@@ -31,7 +31,7 @@ def _curves(trial: Results) -> dict[str, Array]:
         return np.array([np.mean([value(row) for row in tracks]) for tracks in trial.evaluations])
 
     return {
-        "decisions": curve(lambda row: row["decisions"]),
+        "timesteps": curve(lambda row: row["decisions"]),
         "distance": curve(lambda row: row["distance_m"]),
         "lap": np.minimum.accumulate(curve(lambda row: row["best_flying_lap_s"] or NO_LAP)),
         "completes": curve(lambda row: row["completes"]),
@@ -39,26 +39,26 @@ def _curves(trial: Results) -> dict[str, Array]:
 
 
 def draw_variant(variant: str, group: Sequence[Results]) -> bytes:
-    """Draw distance, lap time and success of one variant over decisions, as PNG."""
+    """Draw distance, lap time and success of one variant over timesteps, as PNG."""
     figure, panels = _figure(group)
     every = [_curves(trial) for trial in group]
     for panel, (name, _) in zip(panels, PANELS, strict=False):
         for curves in every:
-            own = curves["decisions"] / 1000.0, _drawable(curves[name])
+            own = curves["timesteps"] / 1000.0, _drawable(curves[name])
             panel.plot(*own, color="tab:blue", alpha=0.35, linewidth=0.8)
     if not any(np.isfinite(curves["lap"]).any() for curves in every):
         panels[1].set_yticks([])
         panels[1].text(0.5, 0.5, "no seed has one", ha="center", transform=panels[1].transAxes)
-    decisions, shared = _bands(panels, every, "tab:red")
+    timesteps, shared = _bands(panels, every, "tab:red")
     so_far = np.maximum.accumulate(shared["completes"], axis=1).mean(axis=0)
-    panels[2].plot(decisions, so_far, color="tab:blue", linestyle="--")
+    panels[2].plot(timesteps, so_far, color="tab:blue", linestyle="--")
     panels[2].legend(["in this evaluation", "95 %", "in one so far"], fontsize=8)
     figure.suptitle(f"{variant}: {len(group)} seeds", fontsize=11)
     return _as_png(figure)
 
 
 def draw_together(variants: Mapping[str, Sequence[Results]]) -> bytes:
-    """Draw the means of all variants over decisions, each with its interval, as PNG."""
+    """Draw the means of all variants over timesteps, each with its interval, as PNG."""
     from matplotlib import colormaps
 
     figure, panels = _figure([trial for group in variants.values() for trial in group])
@@ -80,7 +80,7 @@ def _figure(trials: Sequence[Results]) -> tuple[Any, Any]:
     labels = [label for _, label in PANELS]
     for panel, label in zip(panels, [*labels, "share of races that complete"], strict=True):
         panel.set_ylabel(label)
-        panel.set_xlabel("thousand decisions learned from")
+        panel.set_xlabel("thousand timesteps learned from")
         panel.set_xlim(0.0, 1.02 * max(trial.train[-1]["decisions"] for trial in trials) / 1000.0)
         panel.grid(alpha=0.3)
     panels[0].set_ylim(bottom=0.0)
@@ -95,15 +95,15 @@ def _bands(panels: Any, every: Sequence[dict[str, Array]], colour: Any) -> tuple
     :param panels: of :func:`_figure`
     :param every: curves of each seed
     :param colour: of the lines
-    :return: decisions in thousands, and the curves that far, each (seeds, evaluations)
+    :return: timesteps in thousands, and the curves that far, each (seeds, evaluations)
     """
-    length = min(len(curves["decisions"]) for curves in every)
+    length = min(len(curves["timesteps"]) for curves in every)
     shared = {name: np.array([curves[name][:length] for curves in every]) for name in every[0]}
-    decisions = shared["decisions"].mean(axis=0) / 1000.0
+    timesteps = shared["timesteps"].mean(axis=0) / 1000.0
     for panel, (name, _) in zip(panels, PANELS, strict=False):
-        _band(panel, decisions, estimate(shared[name]), colour)
-    _band(panels[2], decisions, estimate(shared["completes"], share), colour)
-    return decisions, shared
+        _band(panel, timesteps, estimate(shared[name]), colour)
+    _band(panels[2], timesteps, estimate(shared["completes"], share), colour)
+    return timesteps, shared
 
 
 def _as_png(figure: Any) -> bytes:
@@ -112,14 +112,14 @@ def _as_png(figure: Any) -> bytes:
     return picture.getvalue()
 
 
-def _band(panel: Any, decisions: Array, figure: Estimate, colour: Any) -> None:
+def _band(panel: Any, timesteps: Array, figure: Estimate, colour: Any) -> None:
     """Draw a figure and its interval, which ends where the axes do if it has no end."""
     value = _drawable(figure.value)
-    panel.plot(decisions, value, color=colour, linewidth=2.0)
+    panel.plot(timesteps, value, color=colour, linewidth=2.0)
     top = np.where(np.isfinite(figure.high), figure.high, panel.get_ylim()[1])
     shown = np.isfinite(value) & np.isfinite(figure.low)
     panel.fill_between(
-        decisions, figure.low, top, where=shown, color=colour, alpha=0.2, linewidth=0.0
+        timesteps, figure.low, top, where=shown, color=colour, alpha=0.2, linewidth=0.0
     )
 
 

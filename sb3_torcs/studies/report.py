@@ -180,7 +180,7 @@ def _summary(trials: Sequence[Results]) -> list[str]:
         )
     headers = [
         "variant", "seeds that complete", "best flying lap s", "median s", "IQM s",
-        "first whole lap: decisions", "episodes", "minutes",
+        "first whole lap: timesteps", "episodes", "minutes",
     ]  # fmt: skip
     return _markdown(f"Summary, {_homes(trials)}", headers, rows)
 
@@ -237,7 +237,7 @@ def _seeds(trials: Sequence[Results]) -> list[str]:
         )
     headers = [
         "variant, seed", "completes", "laps s", "distance m", "end", "model kept at",
-        "evaluations that complete", "first whole lap: decisions", "episodes", "minutes",
+        "evaluations that complete", "first whole lap: timesteps", "episodes", "minutes",
     ]  # fmt: skip
     return _markdown(f"Every seed, {_homes(trials)}", headers, rows)
 

@@ -198,7 +198,7 @@ def _ray(place: StudyFolder, jobs: int | None, address: str | None) -> Iterator[
         except (OSError, RuntimeError, ValueError) as error:
             raise RayUnavailable(
                 f"Ray does not start in '{scratch}' ({error}); is there room, and the path short? "
-                "Otherwise choose another place: TMPDIR=/tmp"
+                "Otherwise choose another folder: TMPDIR=/tmp"
                 if address is None
                 else f"no Ray cluster at '{address}' ({error}); start one with `ray start --head` "
                 "and give the address that it prints, or leave --address out"

@@ -134,7 +134,7 @@ class StudyFolder:
         Say whether the training of a trial is over.
 
         :param trial: of the study
-        :return: whether all its decisions were learned from
+        :return: whether all its timesteps were learned from
         """
         learned = [row["decisions"] for row in self.rows(trial) if row["phase"] == "train"]
         return bool(learned) and learned[-1] >= trial.budget

@@ -39,7 +39,7 @@ __all__ = ["Row", "Training", "final_row"]
 
 Row = dict[str, Any]
 
-LAST_MODEL, MEMORY, STATE = "last_model.zip", "replay.npz", "state.json"
+LAST_MODEL, REPLAY, STATE = "last_model.zip", "replay.npz", "state.json"
 STATISTICS, BEST_STATISTICS = "statistics.pkl", "vecnormalize.pkl"
 RECORDS = ("config.yml", "args.yml")  # as the zoo writes them: evaluate and watch read them
 
@@ -106,7 +106,7 @@ class Training:
             if self.model.num_timesteps < self.trial.budget:
                 raise StudyError(
                     f"a callback stopped the training at {self.model.num_timesteps} of "
-                    f"{self.trial.budget} decisions; those of a study go to the end of the budget: "
+                    f"{self.trial.budget} timesteps; those of a study go to the end of the budget: "
                     "take that callback away"
                 )
             slices.end()
@@ -156,8 +156,8 @@ class Training:
         """
         self._save_model(folder / LAST_MODEL)
         if getattr(self.model, "replay_buffer", None) is not None:
-            memory: dict[str, Any] = dict(_memory(self.model.replay_buffer))
-            np.savez(folder / MEMORY, **memory)
+            arrays: dict[str, Any] = dict(_buffer_arrays(self.model.replay_buffer))
+            np.savez(folder / REPLAY, **arrays)
         if self.normalizer is not None:
             self.normalizer.save(str(folder / STATISTICS))
         for name, content in {**self._best_files, **self._records}.items():
@@ -181,9 +181,9 @@ class Training:
         if (folder / STATISTICS).is_file():
             env = _with_statistics(env, folder / STATISTICS)
         self.model = type(self.model).load(folder / LAST_MODEL, env=env, device="cpu")
-        if (folder / MEMORY).is_file():
-            with np.load(folder / MEMORY) as memory:
-                _remember(self.model.replay_buffer, memory)
+        if (folder / REPLAY).is_file():
+            with np.load(folder / REPLAY) as arrays:
+                _refill(self.model.replay_buffer, arrays)
         state = json.loads((folder / STATE).read_text(encoding="utf-8"))
         self.rows, self.episodes = state["rows"], state["episodes"]
         self._best, self._spent = Merit(*state["best"]), np.array(state["spent"])
@@ -200,7 +200,7 @@ class Training:
     def _save_model(self, file: Path | io.BytesIO) -> None:
         trial = self.trial
         write_record(self.model, recipe(trial.algo, trial.env_id, trial.entry))
-        # A class of memory that SB3 chose itself would be taken for the user's when it is loaded.
+        # A class of replay buffer that SB3 chose would be taken for the user's when it is loaded.
         chosen = "replay_buffer_class" not in self.trial.entry
         self.model.save(file, exclude=["replay_buffer_class"] if chosen else None)
 
@@ -337,7 +337,7 @@ def _cut_episodes(model: Any, running: np.ndarray) -> None:
     """
     Let the replay buffer know that these episodes end here, as by a time limit.
 
-    Otherwise returns over several steps would reach into the next episode.
+    Otherwise returns over several timesteps would reach into the next episode.
     """
     buffer = getattr(model, "replay_buffer", None)
     if buffer is not None and buffer.handle_timeout_termination:
@@ -346,7 +346,7 @@ def _cut_episodes(model: Any, running: np.ndarray) -> None:
 
 
 def _rings(buffer: Any) -> dict[str, np.ndarray]:
-    """Return the arrays of a replay buffer that have one row per step."""
+    """Return the arrays of a replay buffer that have one row per timestep."""
     return {
         name: value
         for name, value in vars(buffer).items()
@@ -354,15 +354,15 @@ def _rings(buffer: Any) -> dict[str, np.ndarray]:
     }
 
 
-def _memory(buffer: Any) -> dict[str, np.ndarray]:
+def _buffer_arrays(buffer: Any) -> dict[str, np.ndarray]:
     """Return what a replay buffer holds; the rows that it never filled are left out."""
     rows = buffer.size()
     rings = {name: ring[:rows] for name, ring in _rings(buffer).items()}
     return {**rings, "pos": np.array(buffer.pos), "full": np.array(buffer.full)}
 
 
-def _remember(buffer: Any, memory: Any) -> None:
+def _refill(buffer: Any, arrays: Any) -> None:
     """Fill a new replay buffer with what another one held."""
     for name, ring in _rings(buffer).items():
-        ring[: len(memory[name])] = memory[name]
-    buffer.pos, buffer.full = int(memory["pos"]), bool(memory["full"])
+        ring[: len(arrays[name])] = arrays[name]
+    buffer.pos, buffer.full = int(arrays["pos"]), bool(arrays["full"])

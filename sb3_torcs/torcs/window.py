@@ -1,4 +1,4 @@
-"""What the game's window shows: its size, the camera, the boards; and what a film takes of it."""
+"""What the game's window shows: its size, the camera, the boards; and what a video takes of it."""
 
 from __future__ import annotations
 

@@ -80,7 +80,7 @@ class Segment(NamedTuple):
 
 
 class Grid(NamedTuple):
-    """The first starting place."""
+    """The first grid slot."""
 
     distance: float  # [m] along the axis before the start line
     offset: float  # [m] from the axis, left positive
@@ -117,7 +117,7 @@ class Track:
     :param start_x: of the axis at the start line [m]
     :param start_y: of the axis at the start line [m]
     :param start_heading: of the axis at the start line [rad]
-    :param grid: the first starting place
+    :param grid: the first grid slot
     :param steps: the same road as the game's loader lays it, step by step and with its gap at the
         start line; empty for what is no file of the game
     """

@@ -75,7 +75,7 @@ class KeepCallback(BaseCallback):
     Keep the last model while it learns, with all that a training goes on from.
 
     That is the replay buffer of an off-policy algorithm, and the statistics of ``VecNormalize``.
-    What the callbacks before this one have written aside is moved to its place in each step.
+    What the callbacks before this one have written aside is moved to its place in each timestep.
 
     :param files: folder of the run
     :param name: of the model's file, without ``.zip``; and of the folder of the statistics

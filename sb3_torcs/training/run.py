@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from sb3_torcs.training.manager import Manager
 
 EVALUATIONS = 40  # of a whole training, unless --eval-freq says otherwise
-SHORTEST_EVAL_FREQ = 1000  # decisions
+SHORTEST_EVAL_FREQ = 1000  # timesteps
 
 PROGRESS = "sb3_torcs.callbacks.RacingProgressCallback"
 WORKER = "sb3_torcs.training.zoo.UninterruptedWorker"
@@ -42,11 +42,11 @@ class TrainOptions:
     :param entry: of the hyperparameter file; ``None`` is the environment's own
     :param conf_file: hyperparameter file; ``None`` is the shipped one of the algorithm
     :param track: instead of the entry's
-    :param timesteps: decisions to learn from; ``None`` is what the entry says
+    :param timesteps: to learn from; ``None`` is what the entry says
     :param seed: of everything
     :param folder: gets ``ALGO/ENV_1``, ``ALGO/ENV_2``, ...
     :param tensorboard: its log folder; ``None`` is ``FOLDER/tensorboard``
-    :param eval_freq: decisions between evaluations; ``None`` is a fortieth of the
+    :param eval_freq: timesteps between evaluations; ``None`` is a fortieth of the
         training, and at least 1000 where it has as many
     :param eval_episodes: per evaluation
     :param resume: a saved model (.zip) or a run's folder to go on from
@@ -77,8 +77,8 @@ class Run:
     """What came of a training."""
 
     folder: Path
-    steps: int  # decisions learned from
-    wanted: int  # decisions that were asked for
+    timesteps: int  # that it learned from
+    wanted: int  # timesteps that were asked for
     interrupted: bool
     last_model: Path | None  # None: the zoo has searched hyperparameters, as its words asked for
     track: Any  # a name, or a list of them
@@ -127,7 +127,7 @@ def train_run(options: TrainOptions) -> Run:
         resume = _resumed(options, entry, wrapped(env, changed, trust=True), changed)
     folder = writable_folder(options.folder)
     tensorboard = _for_tensorboard(options.tensorboard or folder / "tensorboard")
-    wanted = options.timesteps or zoo.decisions(changed)
+    wanted = options.timesteps or zoo.timesteps(changed)
     if any(word.endswith("subproc") for word in options.zoo_args):
         wrappers = entry.get("env_wrapper") or []
         entry["env_wrapper"] = [*(wrappers if isinstance(wrappers, list) else [wrappers]), WORKER]
@@ -199,7 +199,7 @@ def _resumed(
     options: TrainOptions, entry: dict[str, Any], env: Any, changed: Mapping[str, Any]
 ) -> Path | None:
     """
-    Find and check the model to go on from; with its memory it needs no new warm-up.
+    Find and check the model to go on from; with its replay buffer it needs no new warm-up.
 
     :param options: what to train
     :param entry: of the hyperparameter file; is adapted
@@ -214,11 +214,11 @@ def _resumed(
 
     path = find_model(options.resume, prefer_last=True)
     n_envs, frames = changed.get("n_envs", 1), frames_of(changed)
-    memory = check_resumable(path, env, options.algo, n_envs, frames=frames, trust=options.trust)
-    if "learning_starts" in entry and memory:
+    buffer = check_resumable(path, env, options.algo, n_envs, frames=frames, trust=options.trust)
+    if "learning_starts" in entry and buffer:
         entry["learning_starts"] = 0
     if "n_steps" in entry:
-        # SB3 chooses the class of the memory as before; given its own choice, it would warn.
+        # SB3 chooses the class of the replay buffer as before; given its own choice, it would warn.
         entry.setdefault("replay_buffer_class", None)
     return path
 
@@ -268,7 +268,7 @@ def _run_zoo(options: TrainOptions, words: list[str], wanted: int, track: Any) -
 
     :param options: what to train
     :param words: of the zoo's command line
-    :param wanted: decisions to learn from
+    :param wanted: timesteps to learn from
     :param track: a name, or a list of them
     """
     from sb3_torcs.callbacks.progress import Unbroken
@@ -290,27 +290,27 @@ def _run_zoo(options: TrainOptions, words: list[str], wanted: int, track: Any) -
 
 def _result(manager: Manager, wanted: int, track: Any, interrupted: bool) -> Run:
     """Find out what came of a training."""
-    from sb3_torcs.agents.models import saved_steps
+    from sb3_torcs.agents.models import saved_timesteps
 
     if manager.optimize_hyperparameters:
         return Run(Path(manager.log_path), 0, wanted, interrupted, None, track)
     folder = Path(manager.save_path)
     last_model = folder / f"{manager.env_name}.zip"
-    steps = saved_steps(last_model) if last_model.is_file() else 0
-    return Run(folder, steps, wanted, interrupted, last_model, track)
+    timesteps = saved_timesteps(last_model) if last_model.is_file() else 0
+    return Run(folder, timesteps, wanted, interrupted, last_model, track)
 
 
 def _told(error: OSError | WorkerLost, result: Run, options: TrainOptions) -> Exception:
     """Say what has ended a training, what is kept of it, and what to type."""
-    if result.steps > 0:
-        kept = f"kept: '{result.last_model}', {result.steps} of {result.wanted} timesteps"
+    if result.timesteps > 0:
+        kept = f"kept: '{result.last_model}', {result.timesteps} of {result.wanted} timesteps"
         more = f"go on with: {_going_on(options, result)}"
     else:
         kept, more = "nothing was kept yet", "start again"
     if isinstance(error, WorkerLost):
         return WorkerLost(f"{error}; {kept}; see above why, and {more}")
     said = f"cannot write '{error.filename}': {error.strerror or error}"
-    return OutputNotWritable(f"{said}; {kept}; make room, or choose another place, and {more}")
+    return OutputNotWritable(f"{said}; {kept}; make room, or choose another folder, and {more}")
 
 
 @contextlib.contextmanager
@@ -336,7 +336,7 @@ def _noted_interrupts() -> Iterator[list[int]]:
 
 def _going_on(options: TrainOptions, result: Run) -> str:
     """Compose the command line that learns what is left."""
-    left = result.wanted - result.steps
+    left = result.wanted - result.timesteps
     return _command(dataclasses.replace(options, resume=result.last_model, timesteps=left))
 
 

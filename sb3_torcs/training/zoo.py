@@ -35,9 +35,9 @@ __all__ = [
     "check_racing",
     "check_registered",
     "config_file",
-    "decisions",
     "read_config",
     "read_entry",
+    "timesteps",
 ]
 
 Entry = dict[str, Any]
@@ -228,7 +228,7 @@ def _check_env_kwargs(env_kwargs: Any, env_id: str, place: Place) -> None:
         limit = env_kwargs[TIME_LIMIT]
         if not is_count(limit):
             raise ZooConfigError(
-                f"{place}: {TIME_LIMIT} is {limit!r}; expected a whole number of decisions >= 1"
+                f"{place}: {TIME_LIMIT} is {limit!r}; expected a whole number of timesteps >= 1"
             )
         env_kwargs = {key: value for key, value in env_kwargs.items() if key != TIME_LIMIT}
     _check_call("env_kwargs", _env_class(env_id), env_kwargs, place)
@@ -279,9 +279,9 @@ def check_racing(env_id: str) -> None:
         raise ZooConfigError(f"{env_id} is no racing environment; ours: {', '.join(OURS)}")
 
 
-def decisions(entry: Entry) -> int:
+def timesteps(entry: Entry) -> int:
     """
-    Read how many decisions an entry asks for; YAML takes ``1e5`` for a word.
+    Read how many timesteps an entry asks for; YAML takes ``1e5`` for a word.
 
     :param entry: that :func:`check_entry` has seen
     :return: its ``n_timesteps``
@@ -423,6 +423,7 @@ def _arguments(function: Callable[..., Any]) -> set[str] | None:
         parameters = inspect.signature(own).parameters.values()
         kinds = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
         names.update(p.name for p in parameters if p.kind in kinds)
+        names.update(getattr(own, "older_names", ()))
         if not any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters):
             return names
     return None

@@ -52,7 +52,7 @@ public:
     // Name and address, where both are known.
     std::string description() const;
 
-    long decisions() const { return decisions_; }  // states that were sent
+    long timesteps() const { return timesteps_; }  // states that were sent
     long late() const { return late_; }            // of them, answered too late
 
 private:
@@ -101,7 +101,7 @@ private:
     std::optional<Action> answer_, late_answer_;
     long owed_ = 0;  // states that may still be answered, by who does not say which one he answers
     char message_[LONGEST_MESSAGE];
-    long decisions_ = 0, late_ = 0;
+    long timesteps_ = 0, late_ = 0;
 };
 
 // Ends the game when nobody is left for whom it runs. Looks only now and then.

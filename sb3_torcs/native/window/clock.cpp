@@ -1,4 +1,4 @@
-// The game's clock. Real time, but for films: there it goes from frame to frame, however long
+// The game's clock. Real time, but for videos: there it goes from frame to frame, however long
 // the drawing takes.
 
 #include <cmath>
@@ -60,5 +60,5 @@ bool run_out() {
 
 INSTEAD double GfTimeClock() {
     static auto* const real = window::original<double()>("_Z11GfTimeClockv");
-    return window::filming() ? window::now : real();
+    return window::recording() ? window::now : real();
 }

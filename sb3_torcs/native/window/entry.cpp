@@ -64,7 +64,7 @@ void start_race() {
     GfParmSetStr(ReInfo->params, race, "splash menu", "no");
     GfParmSetStr(ReInfo->params, race, "display mode", "normal");
     original_init_view = std::exchange(ReInfo->graphics.init_view, init_view);
-    if (filming()) send_frames();
+    if (recording()) send_frames();
     // To close the window is Escape, too. Not every GLUT tells of it.
     if (auto* const on_close = original<void(void (*)())>("glutCloseFunc"))
         on_close([] { ReStateApply(reinterpret_cast<void*>(STOP_RACE)); });
@@ -106,7 +106,7 @@ INSTEAD int ReUpdate() {
     window::owner().check();
     if (window::acting()) {
         window::take_appearance();
-    } else if (window::filming()) {
+    } else if (window::recording()) {
         window::advance_clock();
     }
     return real();

@@ -1,4 +1,4 @@
-// The pictures of a race, sent to whoever films it.
+// The pictures of a race, sent to whoever records it.
 
 #include <algorithm>
 #include <cerrno>
@@ -97,16 +97,16 @@ int draw_and_send(torcs::Situation* situation) {
 
 }  // namespace
 
-bool filming() { return frames_descriptor() >= 0; }
+bool recording() { return frames_descriptor() >= 0; }
 
 void send_frames() { draw = std::exchange(ReInfo->graphics.refresh, draw_and_send); }
 
 }  // namespace window
 
-// Nobody looks at the window of a film: it is not shown, which takes time.
+// Nobody looks at the window of a video: it is not shown, which takes time.
 extern "C" INSTEAD void glutSwapBuffers() {
     static auto* const real = window::original<void()>("glutSwapBuffers");
-    if (!window::filming()) {
+    if (!window::recording()) {
         real();
     } else if (window::drawn) {
         window::send_picture();

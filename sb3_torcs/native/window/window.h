@@ -32,16 +32,16 @@ torcs::Owner& owner();
 // Let the clock go on by exactly as much as there is between two frames.
 void advance_clock();
 
-// Whether the picture that is drawn now belongs to the film.
+// Whether the picture that is drawn now belongs to the video.
 bool rolling();
 
-// Whether the film goes on although the race is over.
+// Whether the video goes on although the race is over.
 bool run_out();
 
 // ---- frames.cpp: what comes out -----------------------------------------------------------------
 
 // Whether frames are sent to somebody, not shown.
-bool filming();
+bool recording();
 
 // Send a frame after every picture of the race that is drawn.
 void send_frames();

@@ -1,4 +1,4 @@
-"""Films of the game: every frame once, at its time."""
+"""Videos of the game: every frame once, at its time."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from sb3_torcs.errors import (
     InvalidOption,
     OutputNotWritable,
 )
-from sb3_torcs.rendering import game_video as film_module
-from sb3_torcs.rendering.game_video import HEADER, Film, read_frame, side_by_side
+from sb3_torcs.rendering import game_video as video_module
+from sb3_torcs.rendering.game_video import HEADER, GameVideo, read_frame, side_by_side
 from sb3_torcs.torcs.process import GameProcess
 from sb3_torcs.torcs.race_setup import RaceSetup
 from sb3_torcs.torcs.window import window_arguments
@@ -47,18 +47,18 @@ def nothing_is_left(tmp_path, monkeypatch):
     assert list(private.iterdir()) == []
 
 
-def filmed(game, race=LAP, size=SIZE, **options):
+def recorded(game, race=LAP, size=SIZE, **options):
     def start(window):
         return GameProcess(game, race, check=check_track, **window_arguments(game, window))
 
-    return Film(start, size=size, **{"fps": FPS, **options})
+    return GameVideo(start, size=size, **{"fps": FPS, **options})
 
 
 @pytest.fixture(scope="module")
 def lap(game):
     """A whole lap."""
-    with filmed(game) as film:
-        return list(film.frames())
+    with recorded(game) as video:
+        return list(video.frames())
 
 
 class TestFrames:
@@ -75,7 +75,7 @@ class TestFrames:
         assert shares[len(lap) // 2] == pytest.approx(0.5, abs=0.2)
         assert shares[-1] == pytest.approx(1.0, abs=0.05)
 
-    def test_the_last_crossing_of_the_line_is_on_film(self, game, lap):
+    def test_the_last_crossing_of_the_line_is_in_the_video(self, game, lap):
         (result,) = run(game, "a-speedway", LAP.drivers, laps=1)
         after_the_race = lap[-1].time - result.laps[0].time
         assert 1.0 - 1e-9 <= after_the_race < 1.0 + 2 / FPS
@@ -89,8 +89,8 @@ class TestFrames:
 
     @pytest.mark.parametrize("view", ["helicopter", "tv"])
     def test_no_view_begins_in_the_dark(self, game, view):
-        with filmed(game, view=view) as film:
-            frame = next(film.frames())
+        with recorded(game, view=view) as video:
+            frame = next(video.frames())
         assert (frame.number, frame.time) == (0, pytest.approx(-1.0))
         middle = frame.picture[40:80, 60:120]
         assert middle.mean() > 30
@@ -99,16 +99,16 @@ class TestFrames:
         picture = lap[0].picture
         assert picture[:40, 60:120].mean() > picture[-40:, 60:120].mean() + 30
 
-    def test_the_same_race_gives_the_same_film(self, game, lap):
-        with filmed(game) as film:
-            again = list(film.frames())
+    def test_the_same_race_gives_the_same_video(self, game, lap):
+        with recorded(game) as video:
+            again = list(video.frames())
         assert [frame.time for frame in again] == [frame.time for frame in lap]
         for one, other in zip(lap, again, strict=True):
             np.testing.assert_array_equal(one.picture, other.picture)
 
     def test_frames_that_fall_between_two_steps_are_of_the_nearest(self, game):
-        with filmed(game, fps=29.97) as film:
-            times = [frame.time for frame in islice(film.frames(), 90)]
+        with recorded(game, fps=29.97) as video:
+            times = [frame.time for frame in islice(video.frames(), 90)]
         expected = -1.0 + np.arange(90) / 29.97
         np.testing.assert_allclose(times, expected, rtol=0, atol=0.001 + 1e-9)
 
@@ -116,15 +116,15 @@ class TestFrames:
         race = RaceSetup("a-speedway", [("inferno", 3), ("bt", 2)], laps=1, session="race")
         pictures = []
         for driver in (None, "bt 3"):
-            with filmed(game, race, driver=driver) as film:
-                pictures.append(next(film.pictures()))
+            with recorded(game, race, driver=driver) as video:
+                pictures.append(next(video.pictures()))
         assert (pictures[0] != pictures[1]).any()
 
 
 class TestFiles:
-    def test_a_film_plays_in_a_browser(self, game, tmp_path, lap):
-        with filmed(game) as film:
-            path = film.save(tmp_path / "lap.mp4")
+    def test_a_video_plays_in_a_browser(self, game, tmp_path, lap):
+        with recorded(game) as video:
+            path = video.save(tmp_path / "lap.mp4")
         call = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", str(path), "-f", "null", "-"]
         words = subprocess.run(call, capture_output=True, check=True).stderr.decode()
         assert "Video: h264" in words
@@ -134,19 +134,19 @@ class TestFiles:
         content = path.read_bytes()
         assert content.index(b"moov") < content.index(b"mdat")  # plays before it is loaded
 
-    def test_a_full_disk_leaves_no_half_film(self, game, tmp_path):
+    def test_a_full_disk_leaves_no_half_video(self, game, tmp_path):
         limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-        target = tmp_path / "films"
-        with filmed(game) as film:
+        target = tmp_path / "videos"
+        with recorded(game) as video:
             resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
             try:
                 with pytest.raises(OutputNotWritable, match="is there room on the disk"):
-                    film.save(target / "lap.mp4")
+                    video.save(target / "lap.mp4")
             finally:
                 resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         assert list(target.iterdir()) == []
 
-    def test_films_go_side_by_side(self):
+    def test_videos_go_side_by_side(self):
         def plain(level, width, count):
             return (np.full((4, width, 3), level + n, np.uint8) for n in range(count))
 
@@ -157,28 +157,28 @@ class TestFiles:
 
 class TestFaults:
     def test_odd_sizes_are_refused(self, game):
-        with pytest.raises(InvalidOption, match="161x120; a film needs even numbers"):
-            filmed(game, size=(161, 120))
+        with pytest.raises(InvalidOption, match="161x120; a video needs even numbers"):
+            recorded(game, size=(161, 120))
 
     def test_without_a_virtual_display_nothing_is_left(self, game, monkeypatch, tmp_path):
         monkeypatch.setenv("PATH", str(tmp_path))
         with pytest.raises(DisplayUnavailable, match="apt install xvfb"):
-            filmed(game)
+            recorded(game)
 
     def test_a_game_that_is_killed_is_an_error(self, game):
-        with filmed(game) as film:
-            frames = film.frames()
+        with recorded(game) as video:
+            frames = video.frames()
             next(frames)
-            os.kill(film.game.pid, signal.SIGKILL)
+            os.kill(video.game.pid, signal.SIGKILL)
             with pytest.raises(GameFailed, match="SIGKILL"):
                 list(frames)
 
     def test_a_display_that_is_killed_is_an_error(self, game):
-        # So many pictures that the pipe does not hold the rest of the film.
-        with filmed(game, fps=100) as film:
-            frames = film.frames()
+        # So many pictures that the pipe does not hold the rest of the video.
+        with recorded(game, fps=100) as video:
+            frames = video.frames()
             next(frames)
-            display = SimpleNamespace(name=film.display.name, pid=film.display.pid)
+            display = SimpleNamespace(name=video.display.name, pid=video.display.pid)
             os.kill(display.pid, signal.SIGKILL)
             with pytest.raises(GameFailed, match="the game ended"):
                 list(frames)
@@ -190,11 +190,11 @@ class TestFaults:
         def start(window):
             return GameProcess(game, LAP, check=check_track, descriptors=[window.frames])
 
-        with Film(start, size=SIZE) as film, pytest.raises(GameFailed, match="exit status 0"):
-            list(film.frames())
+        with GameVideo(start, size=SIZE) as video, pytest.raises(GameFailed, match="exit status 0"):
+            list(video.frames())
 
     def test_a_game_that_hangs_is_an_error(self, monkeypatch):
-        monkeypatch.setattr(film_module, "PATIENCE", 0.1)
+        monkeypatch.setattr(video_module, "PATIENCE", 0.1)
         game = SimpleNamespace(last_words=lambda: "Ready.")
         receiver, sender = os.pipe()
         with pytest.raises(GameTimeout, match=r"no picture for 0\.1 s; it last said: Ready\."):
@@ -220,15 +220,15 @@ class TestFaults:
             read_frame(receiver, game)
         os.close(receiver)
 
-    def test_nothing_outlives_a_process_that_is_killed_in_mid_film(self):
+    def test_nothing_outlives_a_process_that_is_killed_in_mid_video(self):
         code = (
             "import sys; sys.path.insert(0, 'tests')\n"
-            "from test_film import filmed\n"
+            "from test_game_video import recorded\n"
             "from sb3_torcs.torcs.installation import find_game\n"
-            "film = filmed(find_game(), fps=100)\n"
-            "frame = next(film.frames())\n"
-            "display = film.display\n"
-            "print(film.game.pid, film.game.folder, display.pid, display.name, flush=True)\n"
+            "video = recorded(find_game(), fps=100)\n"
+            "frame = next(video.frames())\n"
+            "display = video.display\n"
+            "print(video.game.pid, video.game.folder, display.pid, display.name, flush=True)\n"
             "input()\n"
         )
         call = [sys.executable, "-c", code]
