@@ -228,9 +228,9 @@ def test_steering_a_noise_that_is_not_there_is_an_error(callback):
 @pytest.mark.parametrize(
     ("callback", "older", "newer", "more"),
     [
-        (NoiseDecayCallback, "timesteps", "timesteps", {}),
-        (GradientStepsCallback, "timesteps", "timesteps", {"gradient_steps": 2}),
-        (DrivingMetricsCallback, "line_timesteps", "line_timesteps", {}),
+        (NoiseDecayCallback, "frames", "timesteps", {}),
+        (GradientStepsCallback, "frames", "timesteps", {"gradient_steps": 2}),
+        (DrivingMetricsCallback, "line_decisions", "line_timesteps", {}),
     ],
 )
 def test_an_argument_keeps_its_older_name_for_one_version(callback, older, newer, more):

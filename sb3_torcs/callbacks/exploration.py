@@ -141,7 +141,7 @@ class NoiseDecayCallback(_NoiseUser):
     :param verbose: as in ``BaseCallback``
     """
 
-    @renamed(timesteps="timesteps")
+    @renamed(frames="timesteps")
     def __init__(self, *, timesteps: int = 100_000, floor: float = 0.0, verbose: int = 0) -> None:
         super().__init__(verbose)
         if not is_count(timesteps) or not is_number(floor) or not 0.0 <= floor <= 1.0:

@@ -56,7 +56,7 @@ class GradientStepsCallback(_WhileLearning):
     :param verbose: as in ``BaseCallback``
     """
 
-    @renamed(timesteps="timesteps")
+    @renamed(frames="timesteps")
     def __init__(self, *, gradient_steps: int, timesteps: int, verbose: int = 0) -> None:
         super().__init__(verbose)
         if not is_count(gradient_steps) or not is_count(timesteps):

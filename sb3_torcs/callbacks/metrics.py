@@ -235,7 +235,7 @@ class DrivingMetricsCallback(BaseCallback):
     :param verbose: as in ``BaseCallback``
     """
 
-    @renamed(line_timesteps="line_timesteps")
+    @renamed(line_decisions="line_timesteps")
     def __init__(
         self,
         *,
