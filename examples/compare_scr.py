@@ -16,9 +16,9 @@ from rich.progress import track as progress
 
 import sb3_torcs  # noqa: F401  (registers the environments)
 from sb3_torcs.agents.models import driver_record, load_driver
+from sb3_torcs.agents.rollout import Driver, drive
 from sb3_torcs.car import Start
 from sb3_torcs.cli.common import table
-from sb3_torcs.evaluation.protocol import Driver
 
 ROUNDING = 1e-6  # [-] between observations, which are at most 3
 SAME = 1e-4  # [-] between two actions that count as equal
@@ -58,21 +58,15 @@ class Comparison(NamedTuple):
         )
 
 
-def drive(env: gym.Env, driver: Driver, start: Start | None) -> Drive:
+def driven(env: gym.Env, driver: Driver, start: Start | None) -> Drive:
     """Drive until the episode ends."""
-    observation, info = env.reset(seed=0, options=start._asdict() if start else None)
-    done = Drive([observation], [], [], 0.0)
-    state, episode_start, ended = None, np.ones(1, dtype=bool), False
-    while not ended:
-        action, state = driver.predict(observation, state, episode_start, deterministic=True)
-        episode_start = np.zeros(1, dtype=bool)
-        observation, _, terminated, truncated, info = env.step(action)
-        ended = terminated or truncated
-        done.actions.append(action)
-        done.observations.append(observation)
-        if info["lap_time"]:
-            done.laps.append(info["lap_time"])
-    return done._replace(damage=info["damage"])
+    steps = list(drive(env, driver, seed=0, options=start._asdict() if start else None))
+    return Drive(
+        [steps[0].observation, *(step.next_observation for step in steps)],
+        [step.action for step in steps],
+        [step.info["lap_time"] for step in steps if step.info["lap_time"]],
+        steps[-1].info["damage"],
+    )
 
 
 def held(one: Drive, other: Drive) -> Comparison:
@@ -93,7 +87,7 @@ def compare(
     for backend in ("native", "scr"):
         env = gym.make("Torcs-v0", backend=backend, track=track, laps=laps, **settings)
         try:
-            drives.append(drive(env, driver, start))
+            drives.append(driven(env, driver, start))
         finally:
             env.close()
     return held(*drives)

@@ -34,10 +34,11 @@ FLOORS = (
     {"tracks"},
     {"actions", "rewards", "sensors"},  # with car and tracks: the vocabulary
     {"noise", "policies", "rendering", "scr"},
-    {"backends", "callbacks"},
+    {"backends"},
     {"envs"},
     {"agents"},
-    {"evaluation", "training"},
+    {"callbacks", "evaluation"},
+    {"training"},
     {"bench", "studies"},
     {"cli", "progress", "rl_zoo", "zoo"},
 )
@@ -68,6 +69,12 @@ HAS_THE_GAME_RUN = {  # and nothing else: no world but one needs another process
 }  # fmt: skip
 USES_A_NETWORK = {"rendering/game_camera.py", "scr/client.py", "scr/server.py", "torcs/display.py"}
 LOADS_THE_ENGINE = {"backends/native.py", "torcs/trial_child.py"}
+ASKS_DRIVERS = {
+    "agents/models.py",  # hands on what it is asked
+    "agents/rollout.py",
+    "bench/torcs.py",  # on threads, where nobody looks at what is driven
+    "callbacks/metrics.py",  # hands on, for all cars of a vector
+}
 
 
 class Import(NamedTuple):
@@ -325,6 +332,14 @@ def test_one_file_knows_the_engine(path):
 def test_the_engine_loads_only_when_somebody_drives():
     path = PACKAGE / "backends" / "native.py"
     assert forbidden(path, {"sb3_torcs._engine"}, lazy_too=False) == []
+
+
+@pytest.mark.parametrize("path", FILES, ids=named)
+def test_one_file_lets_drivers_drive(path):
+    """So that a lap is the same lap, whoever asks for it."""
+    called = {node.func.attr for node in ast.walk(ast.parse(source(path)))
+              if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)}  # fmt: skip
+    assert ("predict" in called) == (named(path) in ASKS_DRIVERS)
 
 
 @pytest.mark.parametrize("name", ["agents/robots.py", "torcs/race_results.py"])

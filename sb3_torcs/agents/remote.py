@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
 
 from sb3_torcs.agents.models import driver_record, load_driver
+from sb3_torcs.agents.rollout import drive
 from sb3_torcs.agents.wrapping import wrapped
 
 __all__ = ["Agent"]
@@ -79,14 +80,9 @@ class Agent:
     def _race(self, aftermath: float | None) -> None:
         """Drive until the race ends, or as ``drive`` says."""
         self._forget()
-        observation, _ = self.env.reset()
-        state, episode_start = None, np.ones(1, dtype=bool)
-        while not self.backend.over and not self._has_enough(aftermath):
-            predict = self.driver.predict
-            action, state = predict(observation, state, episode_start, deterministic=True)
-            episode_start = np.zeros(1, dtype=bool)
-            observation, _, terminated, _, info = self.env.step(action)
-            self._note(info, terminated)
+        over = partial(self._is_over, aftermath)
+        for step in drive(self.env, self.driver, over=over):
+            self._note(step.info, step.terminated)
 
     def _note(self, info: dict[str, Any], terminated: bool) -> None:
         """
@@ -102,7 +98,9 @@ class Agent:
         if terminated and self.end is None:
             self.end, self.end_time = info["end"], self.time
 
-    def _has_enough(self, aftermath: float | None) -> bool:
+    def _is_over(self, aftermath: float | None) -> bool:
+        if self.backend.over:
+            return True
         if aftermath is None or self.end_time is None:
             return False
         return bool(self.time > self.end_time + aftermath)

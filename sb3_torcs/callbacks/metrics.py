@@ -11,6 +11,7 @@ import math
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,6 +25,7 @@ from stable_baselines3.common.logger import Image, Logger, TensorBoardOutputForm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_torcs.actions import ACTIONS, PEDALS, layout_of_width
+from sb3_torcs.agents.rollout import drive
 from sb3_torcs.car import CarState
 from sb3_torcs.errors import InvalidOption, renamed
 from sb3_torcs.tracks.track import Track
@@ -90,6 +92,42 @@ class DrivenLine(NamedTuple):
     lap_time: float | None  # [s] of the lap, if it was completed
 
 
+class _FirstOf:
+    """
+    A vector of environments and its model, as one of each: all drive, and the first one is told of.
+
+    :param env: the vector
+    :param model: drives all of them
+    """
+
+    def __init__(self, env: VecEnv, model: BaseAlgorithm) -> None:
+        self._env = env
+        self._model = model
+
+    def reset(self, **_: Any) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode in each, by the generators that they have."""
+        observation = self._env.reset()
+        (self.track,) = self._env.get_attr("track", 0)  # at its end the next may be on another
+        self._begun = np.ones(self._env.num_envs, dtype=bool)
+        return observation, {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Step each of them; those that end begin anew."""
+        observation, rewards, self._begun, infos = self._env.step(action)
+        return observation, rewards[0], self._begun[0], False, infos[0]
+
+    def predict(
+        self,
+        observation: Any,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = False,
+    ) -> tuple[npt.NDArray[np.float32], Any]:
+        """Choose an action for each; the state of those that have just begun is forgotten."""
+        del episode_start  # of one car; each of the vector has its own
+        return self._model.predict(observation, state, self._begun, deterministic)
+
+
 def drive_lap(model: BaseAlgorithm, env: VecEnv, limit: int = 1500) -> DrivenLine:
     """
     Drive one lap, deterministically.
@@ -99,20 +137,16 @@ def drive_lap(model: BaseAlgorithm, env: VecEnv, limit: int = 1500) -> DrivenLin
     :param limit: timesteps after which to give up
     :return: the line of the lap, or of what there was of it
     """
+    first = _FirstOf(env, model)
     cars: list[CarState] = []
     lap_time = 0.0
-    observation: Any = env.reset()
-    (track,) = env.get_attr("track", 0)  # when the lap ends the next one may be on another
-    state, dones = None, np.ones(env.num_envs, dtype=bool)
-    for _ in range(limit):
-        action, state = model.predict(observation, state, dones, deterministic=True)
-        observation, _, dones, infos = env.step(action)
-        cars.append(infos[0]["car"])
-        lap_time = infos[0]["lap_time"]
-        if lap_time or dones[0]:
+    for step in islice(drive(first, first), limit):
+        cars.append(step.car)
+        lap_time = step.info["lap_time"]
+        if lap_time:
             break
     x, y, speed = np.array([(car.x, car.y, car.speed_x) for car in cars]).T
-    return DrivenLine(track, x, y, speed, cars[-1].distance_raced, lap_time or None)
+    return DrivenLine(first.track, x, y, speed, cars[-1].distance_raced, lap_time or None)
 
 
 def line_image(line: DrivenLine) -> npt.NDArray[np.uint8]:

@@ -6,16 +6,15 @@ It is written for people in ``docs/evaluation.md``; everything that compares dri
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from types import MappingProxyType
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import gymnasium as gym
-import numpy as np
-import numpy.typing as npt
 
-from sb3_torcs.car import CONTROL_TICK, CarState
+from sb3_torcs.agents.rollout import Driver, Timestep, drive
+from sb3_torcs.car import CONTROL_TICK
 
 __all__ = [
     "KEPT",
@@ -39,30 +38,6 @@ RANDOM_TRACK = "random"
 LONGEST_TRACK = 10000.0  # [m] for such a one, whose length is not known beforehand
 KEPT = ("track", "car", "reward", "action_repeat", "range_finders", "action", "gearbox")
 """What an evaluation takes from the training's environment, unless it is told otherwise."""
-
-
-class Driver(Protocol):
-    """What drives: a Stable-Baselines3 model, or anything that predicts like one."""
-
-    def predict(
-        self,
-        observation: npt.NDArray[np.float32],
-        state: Any = None,
-        episode_start: npt.NDArray[np.bool_] | None = None,
-        deterministic: bool = False,
-    ) -> tuple[npt.NDArray[np.float32], Any]:
-        """Choose an action; the state that comes with it is given back at the next timestep."""
-
-
-@dataclass(frozen=True)
-class Timestep:
-    """One timestep of a drive."""
-
-    car: CarState  # after it
-    action: npt.NDArray[np.float32]
-    reward: float
-    info: dict[str, Any]
-    done: bool
 
 
 @dataclass(frozen=True)
@@ -196,25 +171,6 @@ def race_environment(
     kwargs.update({"laps": RACE_LAPS}, **({} if track is None else {"track": track}))
     env = gym.make(env_id, max_episode_steps=time_limit(kwargs), **kwargs)
     return wrapped(env, hyperparameters, trust=trust)
-
-
-def drive(env: gym.Env[Any, Any], driver: Driver, *, seed: int | None = None) -> Iterator[Timestep]:
-    """
-    Drive one episode, deterministically.
-
-    :param env: a racing environment
-    :param driver: chooses the actions
-    :param seed: of the reset
-    :return: the timesteps, one by one
-    """
-    observation, _ = env.reset(seed=seed)
-    state, episode_start, done = None, np.ones(1, dtype=bool), False
-    while not done:
-        action, state = driver.predict(observation, state, episode_start, deterministic=True)
-        episode_start = np.zeros(1, dtype=bool)
-        observation, reward, terminated, truncated, info = env.step(action)
-        done = terminated or truncated
-        yield Timestep(info["car"], action, float(reward), info, done)
 
 
 def evaluate(
