@@ -263,6 +263,12 @@ def test_one_file_knows_the_cluster(path):
     assert forbidden(path, {"ray"}, lazy_too=named(path) != "studies/runner.py") == []
 
 
+@pytest.mark.parametrize("path", FILES, ids=named)
+def test_one_file_starts_the_zoo(path):
+    zoo = {"rl_zoo3.train", "rl_zoo3.exp_manager"}
+    assert named(path) == "training/manager.py" or forbidden(path, zoo) == []
+
+
 @pytest.mark.parametrize("path", files_of({"backends"}), ids=named)
 def test_worlds_know_nothing_of_agents(path):
     assert forbidden(path, {"gymnasium", "torch", "stable_baselines3", "rl_zoo3"}) == []

@@ -251,6 +251,13 @@ def test_a_search_that_was_ended_before_its_first_trial_is_told(monkeypatch, tmp
         manager.hyperparameters_optimization()
 
 
+def test_the_zoo_reads_the_words_of_the_training_not_those_of_the_process(capsys, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["own.py", "--own"])
+    with pytest.raises(SystemExit):
+        zoo_training.train("ddpg", "TorcsLite-v0", {}, ["--n-timestep", "many"], [])
+    assert "rl_zoo3.train: error: argument -n/--n-timesteps: invalid" in capsys.readouterr().err
+
+
 def whole(folder):
     """Read all that a training leaves; a truncated file raises."""
     steps = 0

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import io
-import tempfile
 import time
-from pathlib import Path
 from typing import Any
 
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
@@ -73,41 +70,24 @@ def training_share(steps: int) -> Figures:
     :return: ``training_env_share``, in [0, 1]
     """
     import torch as th
-    import yaml
-    from rl_zoo3.exp_manager import ExperimentManager
 
-    import sb3_torcs  # noqa: F401  registers the environment
+    from sb3_torcs.training.manager import build
     from sb3_torcs.training.zoo import config_file, read_entry
 
     entry = read_entry(config_file("ddpg"), "TorcsLite-v0")
     start = int(entry["batch_size"]) + WARM_UP
     entry.update(learning_starts=int(entry["batch_size"]), buffer_size=start + steps)
+    entry.update(n_timesteps=start + steps)
     threads = th.get_num_threads()
     th.set_num_threads(1)
     try:
-        with (
-            tempfile.TemporaryDirectory() as scratch,
-            contextlib.redirect_stdout(io.StringIO()),
-        ):
-            config = Path(scratch) / "ddpg.yml"
-            config.write_text(yaml.safe_dump({"TorcsLite-v0": entry}), encoding="utf-8")
-            manager = ExperimentManager(
-                argparse.Namespace(),
-                "ddpg",
-                "TorcsLite-v0",
-                scratch,
-                eval_freq=-1,
-                n_timesteps=start + steps,
-                verbose=0,
-                device="cpu",
-                config=str(config),
-            )
-            model, _ = manager.setup_experiment()
-            env = _TimedVecEnv(model.env)
-            model.env = env
-            callbacks = _TimedCallbacks(manager.callbacks, env, start)
+        model, chosen, _ = build("ddpg", "TorcsLite-v0", entry)
+        env = _TimedVecEnv(model.env)
+        model.env = env
+        callbacks = _TimedCallbacks(chosen, env, start)
+        with contextlib.redirect_stdout(io.StringIO()):
             model.learn(start + steps, callback=callbacks)
-            env.close()
+        env.close()
     finally:
         th.set_num_threads(threads)
     return {"training_env_share": callbacks.share}

@@ -7,8 +7,6 @@ too: so what a slice learns depends on nothing but what is in the checkpoint bef
 
 from __future__ import annotations
 
-import argparse
-import contextlib
 import io
 import json
 import tempfile
@@ -19,12 +17,10 @@ from typing import Any
 
 import numpy as np
 import torch as th
-import yaml
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecNormalize
 
-import sb3_torcs  # noqa: F401  registers the environments, in a worker too
 from sb3_torcs.agents.model_writing import recipe, write_record
 from sb3_torcs.agents.models import BEST_MODEL, Driver, load_driver
 from sb3_torcs.agents.wrapping import frames_of
@@ -33,7 +29,7 @@ from sb3_torcs.errors import StudyError
 from sb3_torcs.evaluation.ladder import rung
 from sb3_torcs.evaluation.protocol import Episode, Merit, evaluate, merit, race_environment
 from sb3_torcs.studies.config import FIELDS, Trial, track_name
-from sb3_torcs.training.manager import command_as_text
+from sb3_torcs.training.manager import build
 
 __all__ = ["Row", "Training", "final_row"]
 
@@ -41,7 +37,6 @@ Row = dict[str, Any]
 
 LAST_MODEL, REPLAY, STATE = "last_model.zip", "replay.npz", "state.json"
 STATISTICS, BEST_STATISTICS = "statistics.pkl", "vecnormalize.pkl"
-RECORDS = ("config.yml", "args.yml")  # as the zoo writes them: evaluate and watch read them
 
 
 class Training:
@@ -62,7 +57,9 @@ class Training:
         self._best_files: dict[str, bytes] = {}
         self._spent = np.zeros(2)  # [s] of the clock and of the processor, before this process
         self._races: dict[str, Any] = {}
-        self.model, self.callbacks, self._records = _build(trial)
+        self.model, self.callbacks, self._records = build(
+            trial.algo, trial.env_id, trial.entry, seed=trial.seed
+        )
         if checkpoint is None:
             return
         try:
@@ -307,30 +304,6 @@ def _row(trial: Trial, phase: str, track: str, race: Episode, more: Row) -> Row:
 
 def _clocks() -> np.ndarray:
     return np.array([time.perf_counter(), time.process_time()])
-
-
-def _build(trial: Trial) -> tuple[Any, list[BaseCallback], dict[str, bytes]]:
-    """
-    Let the RL Zoo build algorithm, environments and callbacks.
-
-    :param trial: what to build
-    :return: them, and the zoo's records by file name
-    """
-    from rl_zoo3.exp_manager import ExperimentManager
-
-    with tempfile.TemporaryDirectory() as scratch, contextlib.redirect_stdout(io.StringIO()):
-        conf_file = Path(scratch) / "entry.yml"
-        conf_file.write_text(yaml.safe_dump({trial.env_id: trial.entry}), encoding="utf-8")
-        words = argparse.Namespace(algo=trial.algo, env=trial.env_id, seed=trial.seed)
-        manager = ExperimentManager(
-            words, trial.algo, trial.env_id, scratch, eval_freq=-1, seed=trial.seed, verbose=0,
-            device="cpu", config=str(conf_file),
-        )  # fmt: skip
-        with command_as_text():
-            model, _ = manager.setup_experiment()
-        folder = Path(manager.params_path)
-        records = {name: (folder / name).read_bytes() for name in RECORDS}
-    return model, manager.callbacks, records
 
 
 def _cut_episodes(model: Any, running: np.ndarray) -> None:

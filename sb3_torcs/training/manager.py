@@ -1,31 +1,121 @@
-"""The RL Zoo's own training, with files that are there whole or not at all."""
+"""The one place that starts the RL Zoo.
+
+:func:`train` runs its own training, with files that are there whole or not at all. :func:`build`
+has it make an algorithm and its environments, for those who learn in another way.
+"""
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import copy
 import fcntl
+import io
 import locale
 import os
 import sys
+import tempfile
 import types
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import rl_zoo3.train
+import yaml
 from rl_zoo3.callbacks import SaveVecNormalizeCallback
 from rl_zoo3.exp_manager import ExperimentManager
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import CheckpointCallback, EvalCallback
+from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback
 
+import sb3_torcs  # noqa: F401  registers the environments
 from sb3_torcs.agents.model_writing import RecordCallback, recipe
 from sb3_torcs.errors import InvalidOption, WorkerLost
 from sb3_torcs.training.keeping import KeepCallback, WholeFiles
 
-__all__ = ["Manager", "command_as_text", "train"]
+__all__ = ["Built", "Manager", "build", "train"]
 
 SAVINGS = 40  # of a training without evaluations
+RECORDS = ("config.yml", "args.yml")  # of a run: evaluate and watch read them
+
+
+class Built(NamedTuple):
+    """What the zoo makes of an entry."""
+
+    model: Any  # of any algorithm; its environments are ``model.get_env()``
+    callbacks: list[BaseCallback]
+    records: dict[str, bytes]  # the zoo's own of the run, by file name
+
+
+def build(algo: str, env_id: str, entry: Mapping[str, Any], *, seed: int = 0) -> Built:
+    """
+    Let the zoo build an algorithm, its environments and its callbacks; it leaves no files behind.
+
+    :param algo: as the zoo calls it
+    :param env_id: of a registered environment
+    :param entry: of a hyperparameter file
+    :param seed: of the training
+    """
+    said = argparse.Namespace(algo=algo, env=env_id, seed=seed)
+    with tempfile.TemporaryDirectory() as scratch, contextlib.redirect_stdout(io.StringIO()):
+        conf_file = _write_entry(Path(scratch), env_id, entry)
+        manager = ExperimentManager(
+            said, algo, env_id, scratch, eval_freq=-1, seed=seed, verbose=0, device="cpu",
+            config=str(conf_file),
+        )  # fmt: skip
+        with _command_as_text():
+            model, _ = manager.setup_experiment()
+        folder = Path(manager.params_path)
+        records = {name: (folder / name).read_bytes() for name in RECORDS}
+    return Built(model, manager.callbacks, records)
+
+
+def train(
+    algo: str, env_id: str, entry: Mapping[str, Any], words: list[str], managers: list[Manager]
+) -> None:
+    """
+    Run the zoo's own training in this process.
+
+    :param algo: as the zoo calls it
+    :param env_id: of a registered environment
+    :param entry: of a hyperparameter file
+    :param words: further ones of the zoo's command line
+    :param managers: gets the manager of the training, once there is one
+    """
+
+    def manager(*arguments: Any, **keywords: Any) -> Manager:
+        managers.append(Manager(*arguments, **keywords))
+        return managers[-1]
+
+    with tempfile.TemporaryDirectory() as scratch:
+        conf_file = _write_entry(Path(scratch), env_id, entry)
+        first = ["--gym-packages", "sb3_torcs", "--algo", algo, "--env", env_id]
+        first += ["--conf-file", str(conf_file)]
+        # The zoo's function, with our manager and our words in the places of its own.
+        names = {**vars(rl_zoo3.train), "ExperimentManager": manager}
+        names["argparse"] = types.SimpleNamespace(ArgumentParser=_parser_of([*first, *words]))
+        zoo_train = types.FunctionType(rl_zoo3.train.train.__code__, names)
+        with _command_as_text():
+            zoo_train()
+
+
+def _parser_of(words: list[str]) -> type[argparse.ArgumentParser]:
+    """Make the class of a parser that reads these words, not those of the process."""
+
+    class Parser(argparse.ArgumentParser):
+        def __init__(self) -> None:
+            super().__init__(prog="rl_zoo3.train")
+
+        def parse_args(self) -> argparse.Namespace:  # type: ignore[override]
+            return super().parse_args(words)
+
+    return Parser
+
+
+def _write_entry(folder: Path, env_id: str, entry: Mapping[str, Any]) -> Path:
+    """Write the one entry that the zoo shall read, under the environment's id."""
+    path = folder / "zoo.yml"
+    path.write_text(yaml.safe_dump({env_id: dict(entry)}), encoding="utf-8")
+    return path
 
 
 class Manager(ExperimentManager):
@@ -166,32 +256,8 @@ def _alone(folder: Path) -> Iterator[None]:
         os.close(directory)
 
 
-def train(words: list[str], managers: list[Manager]) -> None:
-    """
-    Run the zoo's own training in this process.
-
-    :param words: of its command line
-    :param managers: gets the manager of the training, once there is one
-    """
-
-    def manager(*arguments: Any, **keywords: Any) -> Manager:
-        managers.append(Manager(*arguments, **keywords))
-        return managers[-1]
-
-    # The zoo's function with our manager in the place of its own; the zoo itself stays as it is.
-    names = {**vars(rl_zoo3.train), "ExperimentManager": manager}
-    zoo_train = types.FunctionType(rl_zoo3.train.train.__code__, names)
-    before = sys.argv
-    sys.argv = ["rl_zoo3.train", *words]
-    try:
-        with command_as_text():
-            zoo_train()
-    finally:
-        sys.argv = before
-
-
 @contextlib.contextmanager
-def command_as_text() -> Iterator[None]:
+def _command_as_text() -> Iterator[None]:
     """Let the zoo write the process's command line into a file, also if a path in it is no text."""
     before = sys.orig_argv
     encoding = locale.getpreferredencoding(False)

@@ -8,7 +8,6 @@ import dataclasses
 import shlex
 import signal
 import sys
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import FrameType
@@ -133,14 +132,11 @@ def train_run(options: TrainOptions) -> Run:
         entry["env_wrapper"] = [*(wrappers if isinstance(wrappers, list) else [wrappers]), WORKER]
     if options.progress:
         entry["callback"] = _with_progress(entry.get("callback"))
-    with tempfile.TemporaryDirectory() as scratch:
-        conf_file = _write_entry(Path(scratch) / "zoo.yml", options.env, entry)
-        words = _zoo_words(options, wanted, changed["env_kwargs"])
-        words += ["--conf-file", str(conf_file), "--log-folder", str(folder)]
-        words += ["--tensorboard-log", str(tensorboard)]
-        words += ["--trained-agent", str(resume)] if resume else []
-        track = changed["env_kwargs"].get("track")
-        return _run_zoo(options, [*words, *options.zoo_args], wanted, track)
+    words = _zoo_words(options, wanted, changed["env_kwargs"])
+    words += ["--log-folder", str(folder), "--tensorboard-log", str(tensorboard)]
+    words += ["--trained-agent", str(resume)] if resume else []
+    track = changed["env_kwargs"].get("track")
+    return _run_zoo(options, [*words, *options.zoo_args], entry, wanted, track)
 
 
 def _for_tensorboard(folder: str | Path) -> Path:
@@ -223,14 +219,6 @@ def _resumed(
     return path
 
 
-def _write_entry(path: Path, env_id: str, entry: dict[str, Any]) -> Path:
-    """Write the one entry that the zoo shall read, under the environment's id."""
-    import yaml
-
-    path.write_text(yaml.safe_dump({env_id: entry}), encoding="utf-8")
-    return path
-
-
 def _zoo_words(options: TrainOptions, wanted: int, env_kwargs: dict[str, Any]) -> list[str]:
     """Compose the zoo's command line, files and folders aside."""
     from sb3_torcs.training import zoo
@@ -238,8 +226,7 @@ def _zoo_words(options: TrainOptions, wanted: int, env_kwargs: dict[str, Any]) -
     eval_freq = options.eval_freq
     if eval_freq is None:
         eval_freq = max(wanted // EVALUATIONS, min(wanted, SHORTEST_EVAL_FREQ))
-    words = ["--gym-packages", "sb3_torcs", "--algo", options.algo, "--env", options.env]
-    words += ["--n-timesteps", str(wanted), "--seed", str(options.seed)]
+    words = ["--n-timesteps", str(wanted), "--seed", str(options.seed)]
     words += ["--eval-freq", str(eval_freq), "--eval-episodes", str(options.eval_episodes)]
     words += ["--num-threads", "1", "--device", "cpu", "--verbose", "0", "--save-replay-buffer"]
     # An evaluation is from the grid and long enough, wherever and how long the training drives.
@@ -262,12 +249,15 @@ def _with_progress(callbacks: Any) -> list[Any]:
     return [PROGRESS, *(item for item in items if item != PROGRESS)]
 
 
-def _run_zoo(options: TrainOptions, words: list[str], wanted: int, track: Any) -> Run:
+def _run_zoo(
+    options: TrainOptions, words: list[str], entry: dict[str, Any], wanted: int, track: Any
+) -> Run:
     """
     Run the zoo's own training in this process.
 
     :param options: what to train
     :param words: of the zoo's command line
+    :param entry: of the hyperparameter file
     :param wanted: timesteps to learn from
     :param track: a name, or a list of them
     """
@@ -280,7 +270,7 @@ def _run_zoo(options: TrainOptions, words: list[str], wanted: int, track: Any) -
     redirected = contextlib.redirect_stdout(out), contextlib.redirect_stderr(err)
     try:
         with redirected[0], redirected[1], _noted_interrupts() as seen:
-            zoo_training.train(words, managers)
+            zoo_training.train(options.algo, options.env, entry, words, managers)
     except (OSError, WorkerLost) as error:
         if not managers:
             raise
