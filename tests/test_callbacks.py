@@ -302,13 +302,6 @@ def test_reward_and_start_are_switched_and_given_back(n_envs, vec_env_cls):
     env.close()
 
 
-def test_the_mean_of_each_reward_term_is_logged():
-    """Under reward/, for TensorBoard."""
-    spy = learn(make_model(), 10, RewardCallback(reward="blog"))
-    assert spy.logged["reward/speed"] == 3.0
-    assert spy.logged["reward/crash"] == 1.0
-
-
 @pytest.mark.parametrize(("also_eval", "expected"), [(False, "progress"), (True, "blog")])
 def test_evaluation_keeps_its_reward_unless_asked(also_eval, expected):
     """Also when the EvalCallback sits deep in a list; afterwards all is as before."""

@@ -15,6 +15,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 import sb3_torcs  # noqa: F401
+from sb3_torcs.callbacks import RewardCallback
 from sb3_torcs.callbacks.metrics import (
     MONITOR_KWARGS,
     DrivenLine,
@@ -126,6 +127,32 @@ def test_an_episode_cut_by_the_time_limit_is_called_so():
     env = make_vec_env(lambda: gym.make("TorcsLite-v0", max_episode_steps=3))
     values = logged(PPO("MlpPolicy", env, n_steps=8, batch_size=8, **small()), [STILL] * 3)
     assert values["driving/end_time_limit"] == 1.0
+
+
+def test_each_term_of_the_reward_is_summed_over_an_episode(oval):
+    """An episode that still runs counts when it ends, from its beginning."""
+    off, metrics = {"distance_from_axis": 6.0}, DrivingMetricsCallback()
+    model = scripted_model(oval, {}, off, off, {}, reward={"time": 10.0, "crash": -8.0})
+    values = logged(model, [STILL] * 4, metrics)
+    # Episodes of two timesteps and of one, of 0.1 s each; the third one has not ended yet.
+    assert values["reward/crash"] == -8.0
+    assert values["reward/time"] == pytest.approx(1.5, rel=1e-12)  # 0.1 s is a rounded number
+    assert sum(key.startswith("reward/") for key in values) == 2
+
+
+@pytest.mark.parametrize("vec_env_cls", [DummyVecEnv, SubprocVecEnv])
+def test_the_logged_terms_add_up_to_the_return_also_of_a_reward_that_a_callback_gives(vec_env_cls):
+    env = VecNormalize(lite(2, vec_env_cls, max_episode_steps=5))
+    model = PPO("MlpPolicy", env, n_steps=5, batch_size=5, **small())
+    rows = Rows()
+    model.set_logger(Logger(None, [rows]))
+    model.learn(10, [RewardCallback(reward="blog"), DrivingMetricsCallback()], log_interval=1)
+    env.close()
+    terms = {key: value for key, value in rows.rows[0].items() if key.startswith("reward/")}
+    names = ("speed_along", "speed_across", "speed_off_axis", "crash")
+    assert set(terms) == {f"reward/{name}" for name in names}
+    # Monitor rounds returns to six digits.
+    assert sum(terms.values()) == pytest.approx(rows.rows[0]["rollout/ep_rew_mean"], abs=1e-6)
 
 
 def test_lap_times_are_averaged_and_the_best_is_kept(oval):
@@ -305,7 +332,6 @@ def test_a_driven_lap_that_never_ends_is_given_up(oval):
 
 
 def test_the_picture_shows_the_line_in_colours(oval):
-    pytest.importorskip("sb3_torcs.tracks.plot")
     turn = np.linspace(0.0, 1.0, 50)
     fast = DrivenLine(oval, 300.0 * turn, 0.0 * turn, 20.0 + 30.0 * turn, 300.0, None)
     picture = line_image(fast)

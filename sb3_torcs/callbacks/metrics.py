@@ -258,6 +258,9 @@ class DrivingMetricsCallback(BaseCallback):
     ``line``                                  the driven line (TensorBoard image)
     ========================================  ==========================================  ======
 
+    Beside ``driving/…`` there is ``reward/TERM``, for each term of the reward: its sum over an
+    episode, and of that the mean of the episodes that ended.
+
     Means are over what happened since the logger's previous row. After each evaluation of an
     ``EvalCallback`` anywhere in the training's callbacks, one more lap is driven in its environment
     and drawn, if TensorBoard listens.
@@ -310,6 +313,7 @@ class DrivingMetricsCallback(BaseCallback):
         assert isinstance(space, spaces.Box)
         low, high = (np.asarray(bound, np.float64) for bound in (space.low, space.high))
         margin = SATURATED * (high - low)
+        self._terms: list[dict[str, float]] = [{} for _ in range(self.training_env.num_envs)]
         self._limits = list(zip((low + margin).tolist(), (high - margin).tolist(), strict=True))
         self._evaluations = [
             _Watched(callback, callback.n_calls)
@@ -321,8 +325,8 @@ class DrivingMetricsCallback(BaseCallback):
         # PPO keeps what it drew in "actions", and what the environment got beside it.
         actions = self.locals.get("clipped_actions", self.locals["actions"])
         pending, read = self._pending, self._layout.read
-        for action, info, done in zip(
-            actions.tolist(), self.locals["infos"], self.locals["dones"], strict=True
+        for action, info, done, terms in zip(
+            actions.tolist(), self.locals["infos"], self.locals["dones"], self._terms, strict=True
         ):
             pending.count += 1
             pending.speed += info["car"].speed_x
@@ -330,10 +334,12 @@ class DrivingMetricsCallback(BaseCallback):
             for index, (low, high) in enumerate(self._limits):
                 if not low < action[index] < high:
                     pending.saturated[index] += 1
+            for term, value in info.get("reward_terms", {}).items():
+                terms[term] = terms.get(term, 0.0) + value
             if info.get("lap_time"):
                 self._record_lap(info["lap_time"])
             if done:
-                self._record_episode(info)
+                self._record_episode(info, terms)
         if self.n_calls % RECORD_EVERY == 0:
             self._record_steps()
         if self.n_calls % self.q_every == 0:
@@ -349,8 +355,11 @@ class DrivingMetricsCallback(BaseCallback):
         self.logger.record_mean("driving/lap_time", seconds)
         self.best_lap_time = min(seconds, self.best_lap_time or math.inf)
 
-    def _record_episode(self, info: dict[str, Any]) -> None:
+    def _record_episode(self, info: dict[str, Any], terms: dict[str, float]) -> None:
         mean = self.logger.record_mean
+        for term, total in terms.items():
+            mean(f"reward/{term}", total)
+        terms.clear()
         mean("driving/distance", info["distance"])
         mean("driving/laps", info["laps"])
         end = info.get("end") or "time_limit"

@@ -21,6 +21,9 @@ class _SwitchUser(BaseCallback):
 
     _switches: Sequence[_Switch] = ()
 
+    def _on_step(self) -> bool:
+        return True
+
     def _on_training_end(self) -> None:
         for switch in self._switches:
             switch.undo()
@@ -28,7 +31,7 @@ class _SwitchUser(BaseCallback):
 
 class RewardCallback(_SwitchUser):
     """
-    Let the training environments give another reward, and log the mean of each of its terms.
+    Let the training environments give another reward.
 
     :param reward: name of a reward, or a mapping of terms to weights
     :param also_eval: also in the environments of an ``EvalCallback``, whose score it changes
@@ -49,12 +52,6 @@ class RewardCallback(_SwitchUser):
             others = callbacks_in(self.locals["callback"])
             envs += [other.eval_env for other in others if isinstance(other, EvalCallback)]
         self._switches = [_Switch(env, "set_reward", self.reward) for env in envs]
-
-    def _on_step(self) -> bool:
-        for info in self.locals["infos"]:
-            for term, value in info.get("reward_terms", {}).items():
-                self.logger.record_mean(f"reward/{term}", value)
-        return True
 
 
 class RandomStartCallback(_SwitchUser):
@@ -80,9 +77,6 @@ class RandomStartCallback(_SwitchUser):
         if self.speed is not None:
             settings.append(("set_random_speed", self.speed))
         self._switches = [_Switch(self.training_env, *setting) for setting in settings]
-
-    def _on_step(self) -> bool:
-        return True
 
 
 def require_method(env: VecEnv, name: str) -> None:
