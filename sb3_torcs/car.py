@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from numbers import Integral, Real
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +23,7 @@ __all__ = [
     "Controls",
     "FloatArray",
     "Start",
+    "StartName",
     "checked_laps",
     "checked_start",
     "checked_start_speed",
@@ -78,7 +79,10 @@ class Start(NamedTuple):
     speed: float = 0.0  # [m/s] along the car's own axis
 
 
-STARTS = ("grid", "random")
+StartName = Literal["grid", "random"]
+STARTS: tuple[str, ...] = get_args(StartName)
+"""Where episodes begin."""
+
 MAX_START_SPEED = 150.0  # [m/s] what the observation of the speed can say
 
 
@@ -99,7 +103,7 @@ def checked_laps(laps: int | None) -> int | None:
     return int(laps)
 
 
-def checked_start(start: str) -> str:
+def checked_start(start: StartName) -> StartName:
     """
     Check where episodes shall begin.
 
@@ -108,7 +112,7 @@ def checked_start(start: str) -> str:
     :raises InvalidOption: for anything else
     """
     if start not in STARTS:
-        raise InvalidOption(f"start is {start!r}; expected 'grid' or 'random'")
+        raise InvalidOption(f"start is {start!r}; expected {' or '.join(map(repr, STARTS))}")
     return start
 
 

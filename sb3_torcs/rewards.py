@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from typing import Literal
 
 from sb3_torcs.car import CarState, Controls, is_number
 from sb3_torcs.errors import InvalidOption, UnknownRewardTerm, near_miss
 
-__all__ = ["PRESETS", "TERMS", "Reward"]
+__all__ = ["PRESETS", "TERMS", "Reward", "RewardChoice", "RewardName"]
 
 BRAKING = 10.0  # [m/s²] a car on asphalt can do twice that, but not while it turns in
 BEND_SPEED = 12.0  # [m/s] in a bend behind which nothing is seen; the tightest hairpins need it
@@ -74,7 +75,11 @@ TERMS: dict[str, Term] = {
 SCALE = 0.1  # [1/m] a reward of 1 for ten metres along the road
 CRASH = -1.0  # what an episode that ends off the road, backwards, stuck and so on costs
 
-PRESETS: dict[str, dict[str, float]] = {
+RewardName = Literal["progress", "blog", "apex"]
+RewardChoice = RewardName | Mapping[str, float]
+"""A preset, or a mapping from terms to weights."""
+
+PRESETS: dict[RewardName, dict[str, float]] = {
     "progress": {"speed_along": 1.0, "scale": SCALE, "crash": CRASH},
     "blog": {
         "speed_along": 1.0,
@@ -102,7 +107,7 @@ class Reward:
     :raises InvalidOption: if a weight is not a finite number
     """
 
-    def __init__(self, reward: str | Mapping[str, float]) -> None:
+    def __init__(self, reward: RewardChoice) -> None:
         if isinstance(reward, str):
             if reward not in PRESETS:
                 advice = (

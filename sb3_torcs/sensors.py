@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from operator import attrgetter
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -167,7 +167,8 @@ def sensor_table() -> str:
     return "\n".join(lines)
 
 
-RANGE_FINDERS: dict[str, tuple[float, ...]] = {
+RangeFinderName = Literal["scr", "narrow"]
+RANGE_FINDERS: dict[RangeFinderName, tuple[float, ...]] = {
     "scr": tuple(float(angle) for angle in range(-90, 91, 10)),
     "narrow": (
         -45, -19, -12, -7, -4, -2.5, -1.7, -1, -0.5, 0, 0.5, 1, 1.7, 2.5, 4, 7, 12, 19, 45,
@@ -176,7 +177,7 @@ RANGE_FINDERS: dict[str, tuple[float, ...]] = {
 """[deg] left to right: the SCR server's default, and what the original DDPG code asks for."""
 
 
-def range_finder_angles(choice: str | Sequence[float]) -> FloatArray:
+def range_finder_angles(choice: RangeFinderName | Sequence[float]) -> FloatArray:
     """
     Resolve the ``range_finders`` option.
 

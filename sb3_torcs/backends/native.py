@@ -22,7 +22,7 @@ from sb3_torcs.car import (
     is_count,
 )
 from sb3_torcs.errors import BackendUnavailable, InvalidOption, TrackFileError
-from sb3_torcs.sensors import range_finder_angles
+from sb3_torcs.sensors import RangeFinderName, range_finder_angles
 from sb3_torcs.torcs.building import build_command
 from sb3_torcs.torcs.installation import Game, find_game
 from sb3_torcs.torcs.race_setup import SCR_SERVER, SESSIONS, RaceSetup, Session
@@ -172,7 +172,7 @@ class NativeBackend:
         track: str | Path = "aalborg",
         *,
         car: str = DEFAULT_CAR,
-        range_finders: str | Sequence[float] = "scr",
+        range_finders: RangeFinderName | Sequence[float] = "scr",
         opponents: Sequence[str] = (),
         laps: int | None = None,
         grid_place: int | None = None,

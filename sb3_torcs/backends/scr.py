@@ -21,7 +21,7 @@ from sb3_torcs.scr.gearbox import read_gearbox
 from sb3_torcs.scr.protocol import ScrAction, format_action, parse_engine, parse_state
 from sb3_torcs.scr.rehearsal import Rehearsal
 from sb3_torcs.scr.server import SCR_PORT, open_ports, start_server
-from sb3_torcs.sensors import encode, range_finder_angles
+from sb3_torcs.sensors import RangeFinderName, encode, range_finder_angles
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.process import GameProcess, compiled_library
 from sb3_torcs.torcs.race_setup import SCR_SERVER, RaceSetup
@@ -66,7 +66,7 @@ class ScrBackend:
         track: str | Path = "aalborg",
         *,
         car: str = DEFAULT_CAR,
-        range_finders: str | Sequence[float] = "scr",
+        range_finders: RangeFinderName | Sequence[float] = "scr",
         opponents: Sequence[str] = (),
         laps: int | None = None,
         grid_place: int | None = None,

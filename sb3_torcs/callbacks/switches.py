@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_torcs.callbacks.metrics import callbacks_in
-from sb3_torcs.car import checked_start, checked_start_speed
+from sb3_torcs.car import StartName, checked_start, checked_start_speed
 from sb3_torcs.errors import InvalidOption
-from sb3_torcs.rewards import Reward
+from sb3_torcs.rewards import Reward, RewardChoice
 
 __all__ = ["RandomStartCallback", "RewardCallback", "require_method"]
 
@@ -38,9 +38,7 @@ class RewardCallback(_SwitchUser):
     :param verbose: as in ``BaseCallback``
     """
 
-    def __init__(
-        self, *, reward: str | Mapping[str, float], also_eval: bool = False, verbose: int = 0
-    ) -> None:
+    def __init__(self, *, reward: RewardChoice, also_eval: bool = False, verbose: int = 0) -> None:
         super().__init__(verbose)
         Reward(reward)  # or a worker process would have to say what is wrong
         self.reward = reward
@@ -66,7 +64,7 @@ class RandomStartCallback(_SwitchUser):
     """
 
     def __init__(
-        self, *, start: str = "random", speed: float | None = None, verbose: int = 0
+        self, *, start: StartName = "random", speed: float | None = None, verbose: int = 0
     ) -> None:
         super().__init__(verbose)
         self.start = checked_start(start)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any, TypedDict
+from typing import Any, Literal, TypedDict, get_args
 
 import gymnasium as gym
 import numpy as np
@@ -22,6 +22,7 @@ from sb3_torcs.car import (
     Controls,
     FloatArray,
     Start,
+    StartName,
     checked_laps,
     checked_start,
     checked_start_speed,
@@ -29,13 +30,14 @@ from sb3_torcs.car import (
     is_number,
 )
 from sb3_torcs.errors import CarLost, EnvClosed, InvalidOption
-from sb3_torcs.rewards import Reward
+from sb3_torcs.rewards import Reward, RewardChoice
 from sb3_torcs.sensors import OBSERVATION_HIGH, OBSERVATION_LOW, encode
 from sb3_torcs.tracks.track import Track
 
-__all__ = ["RacingEnv", "RacingInfo"]
+__all__ = ["RacingEnv", "RacingInfo", "RenderMode"]
 
 Observation = npt.NDArray[np.float32]
+RenderMode = Literal["rgb_array", "human"]
 
 MAX_ACTION_REPEAT = 50_000  # [-] a timestep every quarter of an hour
 
@@ -81,16 +83,16 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
     :raises InvalidOption: if an option has a value that is not allowed
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": 10.0}  # noqa: RUF012
+    metadata: dict[str, Any] = {"render_modes": [*get_args(RenderMode)], "render_fps": 10.0}  # noqa: RUF012
 
     def __init__(
         self,
         backend: Backend,
         *,
         action: ActionName = "pedals",
-        reward: str | Mapping[str, float] = "progress",
+        reward: RewardChoice = "progress",
         action_repeat: int = 5,
-        start: str = "grid",
+        start: StartName = "grid",
         laps: int | None = None,
         render_mode: str | None = None,
     ) -> None:
@@ -139,7 +141,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         """Where the range finders look [rad], (19,), left negative."""
         return self.backend.range_finder_angles
 
-    def set_reward(self, reward: str | Mapping[str, float]) -> str | Mapping[str, float] | None:
+    def set_reward(self, reward: RewardChoice) -> RewardChoice | None:
         """
         Value timesteps by another reward from now on.
 
@@ -151,7 +153,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         self._reward_choice = reward
         return previous
 
-    def set_start(self, start: str) -> str | None:
+    def set_start(self, start: StartName) -> StartName | None:
         """
         Begin episodes elsewhere from the next reset on.
 

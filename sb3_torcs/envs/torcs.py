@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -15,17 +15,21 @@ from sb3_torcs.backends.base import Backend
 from sb3_torcs.backends.native import NativeBackend, track_path
 from sb3_torcs.backends.scr import ScrBackend
 from sb3_torcs.backends.several import SeveralTracks, is_several
-from sb3_torcs.car import DEFAULT_CAR, is_count
-from sb3_torcs.envs.racing import RacingEnv
+from sb3_torcs.car import DEFAULT_CAR, StartName, is_count
+from sb3_torcs.envs.racing import RacingEnv, RenderMode
 from sb3_torcs.errors import EnvClosed, InvalidOption, near_miss
+from sb3_torcs.rewards import RewardChoice
+from sb3_torcs.sensors import RangeFinderName
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.scenery import find_scenery
-from sb3_torcs.torcs.window import Window
+from sb3_torcs.torcs.window import ViewName, Window
 
 __all__ = ["TorcsEnv"]
 
-BACKENDS = ("native", "scr")
-PICTURES = ("above", "game")
+BackendName = Literal["native", "scr"]
+PictureName = Literal["above", "game"]
+GameRenderMode = Literal[RenderMode, "game"]
+BACKENDS, PICTURES = get_args(BackendName), get_args(PictureName)
 
 
 class TorcsEnv(RacingEnv):
@@ -81,7 +85,7 @@ class TorcsEnv(RacingEnv):
 
     metadata: dict[str, Any] = {  # noqa: RUF012
         **RacingEnv.metadata,
-        "render_modes": [*RacingEnv.metadata["render_modes"], "game"],
+        "render_modes": [*get_args(GameRenderMode)],
     }
 
     def __init__(
@@ -89,20 +93,20 @@ class TorcsEnv(RacingEnv):
         *,
         track: str | Path | Sequence[str | Path] = "aalborg",
         car: str = DEFAULT_CAR,
-        reward: str | Mapping[str, float] = "progress",
+        reward: RewardChoice = "progress",
         action_repeat: int = 5,
-        range_finders: str | Sequence[float] = "scr",
+        range_finders: RangeFinderName | Sequence[float] = "scr",
         action: ActionName = "pedals",
         gearbox: GearboxName = "automatic",
-        start: str = "grid",
+        start: StartName = "grid",
         laps: int | None = None,
-        render_mode: str | None = None,
-        backend: str = "native",
+        render_mode: GameRenderMode | None = None,
+        backend: BackendName = "native",
         opponents: Sequence[str] = (),
         grid_place: int | None = None,
         sensor_noise: bool = False,
-        picture: str = "above",
-        view: str = "behind",
+        picture: PictureName = "above",
+        view: ViewName = "behind",
         boards: bool = True,
         render_size: tuple[int, int] = (640, 480),
         host: str | None = None,
@@ -178,7 +182,12 @@ class TorcsEnv(RacingEnv):
 
 
 def _world(
-    backend: str, track: Any, *, sensor_noise: bool, address: Mapping[str, Any], **options: Any
+    backend: BackendName,
+    track: Any,
+    *,
+    sensor_noise: bool,
+    address: Mapping[str, Any],
+    **options: Any,
 ) -> Backend:
     """
     Make the world that was chosen.
@@ -209,7 +218,7 @@ def _world(
     return SeveralTracks(map(make, track)) if is_several(track) else make(track)
 
 
-def _picture(picture: str, render_mode: str | None) -> str:
+def _picture(picture: PictureName, render_mode: GameRenderMode | None) -> PictureName:
     """
     Check what shall be drawn.
 

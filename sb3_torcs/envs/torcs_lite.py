@@ -5,15 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from sb3_torcs.actions import ActionName, GearboxName, used_gearbox
 from sb3_torcs.backends.base import Backend
 from sb3_torcs.backends.lite.backend import LiteBackend
 from sb3_torcs.backends.several import SeveralTracks, is_several
-from sb3_torcs.car import DEFAULT_CAR
-from sb3_torcs.envs.racing import RacingEnv
+from sb3_torcs.car import DEFAULT_CAR, StartName
+from sb3_torcs.envs.racing import RacingEnv, RenderMode
 from sb3_torcs.errors import InvalidOption
+from sb3_torcs.rewards import RewardChoice
+from sb3_torcs.sensors import RangeFinderName
 from sb3_torcs.tracks.track import Track
 
 __all__ = ["OF_THE_GAME", "TorcsLiteEnv"]
@@ -84,23 +86,24 @@ class TorcsLiteEnv(RacingEnv):
         *,
         track: str | Path | Track | Sequence[str | Path | Track] = "aalborg",
         car: str = DEFAULT_CAR,
-        reward: str | Mapping[str, float] = "progress",
+        reward: RewardChoice = "progress",
         action_repeat: int = 5,
-        range_finders: str | Sequence[float] = "scr",
+        range_finders: RangeFinderName | Sequence[float] = "scr",
         action: ActionName = "pedals",
         gearbox: GearboxName = "automatic",
-        start: str = "grid",
+        start: StartName = "grid",
         laps: int | None = None,
-        render_mode: str | None = None,
-        picture: str = "above",
+        render_mode: RenderMode | None = None,
+        picture: Literal["above"] = "above",
         **of_the_game: Any,
     ) -> None:
-        if "game" in (picture, render_mode):
-            name = "picture" if picture == "game" else "render_mode"
-            raise InvalidOption(
-                f"{name} is 'game', which the installed game draws: that is for Torcs-v0; "
-                "TorcsLite-v0 has render_mode 'rgb_array' or 'human' with picture 'above'"
-            )
+        drawn: dict[str, str | None] = {"picture": picture, "render_mode": render_mode}
+        for name, choice in drawn.items():
+            if choice == "game":
+                raise InvalidOption(
+                    f"{name} is 'game', which the installed game draws: that is for Torcs-v0; "
+                    "TorcsLite-v0 has render_mode 'rgb_array' or 'human' with picture 'above'"
+                )
         if picture != "above":
             raise InvalidOption(f"picture is {picture!r}; expected 'above'")
         _refuse(of_the_game)

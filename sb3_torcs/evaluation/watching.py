@@ -26,7 +26,7 @@ from sb3_torcs.torcs.process import GameProcess
 from sb3_torcs.torcs.race_results import RobotResult
 from sb3_torcs.torcs.race_setup import SCR_SERVER, RaceSetup, session_for
 from sb3_torcs.torcs.results import read_results
-from sb3_torcs.torcs.window import Window, window_arguments
+from sb3_torcs.torcs.window import ViewName, Window, window_arguments
 from sb3_torcs.tracks.trial import check_track
 
 __all__ = ["Show", "record_shows", "show_in_window"]
@@ -137,7 +137,7 @@ def record_shows(
     path: Path,
     *,
     size: tuple[int, int] = (1280, 720),
-    view: str = "behind",
+    view: ViewName = "behind",
     fps: float = FPS,
 ) -> None:
     """

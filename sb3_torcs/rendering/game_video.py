@@ -23,7 +23,7 @@ from sb3_torcs.errors import GameFailed, GameTimeout, InvalidOption
 from sb3_torcs.rendering.encoder import PHOTOGRAPHIC, write_video
 from sb3_torcs.torcs.display import VirtualDisplay
 from sb3_torcs.torcs.process import GameProcess
-from sb3_torcs.torcs.window import Window
+from sb3_torcs.torcs.window import ViewName, Window
 
 __all__ = ["FPS", "Frame", "GameVideo", "read_frame", "side_by_side"]
 
@@ -74,7 +74,7 @@ class GameVideo:
         start: Callable[[Window], GameProcess],
         *,
         size: tuple[int, int] = (1280, 720),
-        view: str = "behind",
+        view: ViewName = "behind",
         fps: float = FPS,
         driver: str | None = None,
     ) -> None:

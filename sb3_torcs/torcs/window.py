@@ -6,16 +6,20 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypedDict
+from typing import Literal, TypedDict
 from xml.etree import ElementTree
 
 from sb3_torcs.errors import GameIncomplete, InvalidOption, near_miss
 from sb3_torcs.torcs.installation import Game
 from sb3_torcs.torcs.process import compiled_library
 
-__all__ = ["VIEWS", "Window", "WindowArguments", "window_arguments", "window_files"]
+__all__ = ["VIEWS", "ViewName", "Window", "WindowArguments", "window_arguments", "window_files"]
 
-VIEWS: Mapping[str, tuple[int, int]] = {
+ViewName = Literal[
+    "behind", "close", "far", "front", "cockpit", "hood", "road", "side", "above", "track",
+    "helicopter", "tv",
+]  # fmt: skip
+VIEWS: Mapping[ViewName, tuple[int, int]] = {
     "behind": (0, 1),
     "close": (0, 0),
     "far": (1, 0),
@@ -69,7 +73,7 @@ class Window:
     """
 
     size: tuple[int, int] = (1280, 720)
-    view: str = "behind"
+    view: ViewName = "behind"
     display: str = ":0"
     driver: str | None = None
     frames: int | None = None

@@ -15,7 +15,7 @@ from sb3_torcs.backends.lite.rays import RANGE, Edges, road_edges
 from sb3_torcs.backends.lite.road import road_width
 from sb3_torcs.car import DEFAULT_CAR, CarState, Controls, FloatArray, Start
 from sb3_torcs.errors import CarLost, InvalidOption
-from sb3_torcs.sensors import range_finder_angles
+from sb3_torcs.sensors import RangeFinderName, range_finder_angles
 from sb3_torcs.tracks.catalogue import load_track
 from sb3_torcs.tracks.track import Track
 
@@ -41,7 +41,7 @@ class LiteBackend:
         track: str | Path | Track = "aalborg",
         *,
         car: str = DEFAULT_CAR,
-        range_finders: str | Sequence[float] = "scr",
+        range_finders: RangeFinderName | Sequence[float] = "scr",
         gearbox: str = "automatic",
     ) -> None:
         if car not in CARS:
