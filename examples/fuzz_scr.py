@@ -21,7 +21,7 @@ from sb3_torcs.scr.protocol import (
     format_action,
     format_state,
     parse_action,
-    parse_engine,
+    parse_motor,
     parse_state,
 )
 
@@ -98,7 +98,7 @@ def check_state(text: bytes) -> bool:
         return False
     assert expected == state, text
     read = (state.lap_time, state.gear, state.engine_speed, state.speed_x)
-    assert parse_engine(text) == read, text
+    assert parse_motor(text) == read, text
     return True
 
 

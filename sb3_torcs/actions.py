@@ -42,13 +42,13 @@ ACTIONS: tuple[str, ...] = get_args(ActionName)
 GearboxName = Literal["automatic", "road_speed"]
 GEARBOXES: tuple[str, ...] = get_args(GearboxName)
 """
-What chooses the gears of an agent that does not. Both shift up when the engine would turn faster
+What chooses the gears of an agent that does not. Both shift up when the motor would turn faster
 than 93 % of its limit, and down when it would turn slower than 82 % in the lower gear.
 
-``"automatic"`` goes by the engine's own speed, which jumps while the wheels spin: then it hunts
-between two gears. ``"road_speed"`` goes by the speed that the engine would have if no wheel
+``"automatic"`` goes by the motor's own speed, which jumps while the wheels spin: then it hunts
+between two gears. ``"road_speed"`` goes by the speed that the motor would have if no wheel
 slipped; and in first gear it slips the clutch, four fifths pressed at rest and less the faster the
-car is, so that the engine has its power from the start.
+car is, so that the motor has its power from the start.
 """
 
 GEARS = 6
@@ -60,7 +60,7 @@ _COUNTS = {2: "two", 3: "three", 5: "five"}
 SHIFT_UP = 8500.0 * 2.0 * math.pi / 60.0
 """[rad/s] ``car1-trb1`` gives its best power at 8,000 rpm and is limited at 9,152."""
 SHIFT_DOWN = 7500.0 * 2.0 * math.pi / 60.0
-"""[rad/s] Shift down when the lower gear would turn the engine no faster than this."""
+"""[rad/s] Shift down when the lower gear would turn the motor no faster than this."""
 LAUNCH_CLUTCH = 0.8
 """[-] Clutch of a standing car, by road speed. TORCS passes all torque up to two thirds of it."""
 CLUTCH_STEPS = 128.0
@@ -233,10 +233,10 @@ def _numbers(action: Any, names: tuple[str, ...]) -> list[float]:
 @njit(cache=True)
 def automatic_gear(gear: int, engine_speed: float, ratios: FloatArray) -> int:
     """
-    Choose the gear by engine speed. Compiled, and callable from compiled code.
+    Choose the gear by motor speed. Compiled, and callable from compiled code.
 
     :param gear: the present gear, -1 reverse, 0 neutral, 1 and up
-    :param engine_speed: the engine's own, or what it would be if no wheel slipped [rad/s]
+    :param engine_speed: the motor's own, or what it would be if no wheel slipped [rad/s]
     :param ratios: (gears + 2,) gear ratios of reverse, neutral, 1 and up
     :return: the gear to ask for; forward gears only
     """

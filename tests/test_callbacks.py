@@ -128,7 +128,7 @@ def test_nothing_is_added_during_the_warm_up():
 @pytest.mark.parametrize(("before", "after"), [(1, 1), (4, 4), (1, 4), (4, 1), (4, 2)])
 @pytest.mark.parametrize("kind", ["set_point", "ou"])
 def test_a_resumed_model_goes_on_with_its_noise(tmp_path, kind, before, after):
-    """Frames and scale survive save and load, also with another number of environments."""
+    """Count and scale survive save and load, also with another number of environments."""
     callbacks = [NoiseCallback(kind=kind), NoiseDecayCallback(timesteps=100)]
     model = make_model(before)
     learn(model, 40, *callbacks)
@@ -153,7 +153,7 @@ def test_a_resumed_noise_takes_the_new_parameters():
     assert (noise.parameters[0].sigma, noise.dt, noise.timesteps) == (0.9, 0.2, 10)
 
 
-def test_another_kind_continues_the_count_of_frames():
+def test_another_kind_continues_the_count_of_timesteps():
     """The decay goes on; no hook of the old noise stays on the actor."""
     model = make_model()
     learn(model, 5, NoiseCallback(kind="set_point"))
@@ -254,7 +254,7 @@ def test_a_decay_that_is_none_is_refused(bad):
 @pytest.mark.parametrize("kind", ["set_point", "ou"])
 @pytest.mark.parametrize("n_envs", [1, 2])
 def test_stochastic_brake_overrides_its_share_of_the_timesteps(kind, n_envs):
-    """With probability 1 each step pulls to its mu; afterwards the noise is as before."""
+    """With probability 1 each timestep pulls to its mu; afterwards the noise is as before."""
     brake = [0, 1, 0]
     noise = NoiseCallback(kind=kind, brake=brake)
     always = StochasticBrakeCallback(probability=1.0, mu=0.9, theta=1.0, sigma=0.0)

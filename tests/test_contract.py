@@ -235,7 +235,7 @@ def test_an_observation_is_what_the_sensor_table_makes_of_the_car(world):
 
 
 def test_no_checker_stands_between_the_agent_and_the_world(world):
-    """It would be asked at every step; both libraries' checks above look at more."""
+    """It would be asked at every timestep; both libraries' checks above look at more."""
     env = world.make()
     while env is not env.unwrapped:
         assert not isinstance(env, PassiveEnvChecker)

@@ -72,12 +72,12 @@ def test_the_steering_turns_no_faster_than_its_rate(world):
     ("engine_speed_rpm", "torque"), [(1000, 160.0), (5000, 405.0), (7500, 474.0), (9000, 415.0)]
 )
 def test_the_engine_gives_the_torque_of_its_curve(engine_speed_rpm, torque):
-    assert figures.engine_torque(engine_speed_rpm * figures.RPM, 1.0) == pytest.approx(torque)
+    assert figures.motor_torque(engine_speed_rpm * figures.RPM, 1.0) == pytest.approx(torque)
 
 
 def test_the_engine_gives_nothing_above_the_limiter_and_brakes_below():
-    assert figures.engine_torque(9200.0 * figures.RPM, 1.0) == 0.0
-    assert figures.engine_torque(6000.0 * figures.RPM, 0.0) < 0.0
+    assert figures.motor_torque(9200.0 * figures.RPM, 1.0) == 0.0
+    assert figures.motor_torque(6000.0 * figures.RPM, 0.0) < 0.0
 
 
 def test_a_tyre_saturates():

@@ -138,7 +138,7 @@ def test_ou_has_the_stationary_moments_and_the_correlation_of_the_process(dt):
 
 
 def test_ou_without_chance_decays_exactly():
-    """From the brake's override back to mu, by exp(-theta dt) per step."""
+    """From the brake's override back to mu, by exp(-theta dt) per timestep."""
     noise = OUNoise(steering=[1, 0.5, 0], throttle=[0, 0.5, 0], brake=[0, 0.5, 0], dt=0.1)
     draws(noise, 1)
     noise.parameters = (OUParameters(0, 0.5, 0), *noise.parameters[1:])
@@ -147,7 +147,7 @@ def test_ou_without_chance_decays_exactly():
 
 
 def test_ou_with_theta_zero_is_a_random_walk():
-    """The limit: variance sigma^2 dt per step."""
+    """The limit: variance sigma^2 dt per timestep."""
     steps = np.diff(draws(OUNoise(steering=[0, 0, 0.3], dt=0.25, seed=0), 4000)[:, 0])
     assert steps.std() == pytest.approx(0.3 * 0.5, rel=4 / np.sqrt(2 * 4000))
 

@@ -23,8 +23,8 @@ from sb3_torcs.scr.protocol import (
     format_init,
     format_state,
     parse_action,
-    parse_engine,
     parse_init,
+    parse_motor,
     parse_state,
     plain_name,
 )
@@ -88,7 +88,7 @@ def test_a_literal_packet_gives_literal_numbers():
     assert state.wheel_speeds == (67.9393, 68.8267, 71.4009, 71.7363)
     assert state.height == 0.336726
     assert state.focus == (-1.0,) * 5
-    assert parse_engine(LITERAL) == (-0.982, 1, 94.2478, 10.0)
+    assert parse_motor(LITERAL) == (-0.982, 1, 94.2478, 10.0)
 
 
 def test_a_literal_action_is_written_and_read():
@@ -139,7 +139,7 @@ def test_tags_come_in_any_order_and_unknown_ones_are_passed_over():
     groups = LITERAL.partition(b"\0")[0][1:-1].split(b")(")
     backwards = b"(" + b") (".join([*groups[::-1], b"totalDistFromStart 12.5", b"img 1 2"]) + b")\n"
     assert parse_state(backwards) == parse_state(LITERAL)
-    assert parse_engine(backwards) == parse_engine(LITERAL)
+    assert parse_motor(backwards) == parse_motor(LITERAL)
 
 
 def test_what_is_missing_has_its_default():
@@ -181,7 +181,7 @@ def test_a_broken_state_is_told(old, new, message):
 
 def test_a_broken_engine_reading_is_told():
     with pytest.raises(MessageBroken, match="rpm is no number"):
-        parse_engine(LITERAL.replace(b"(rpm 942.478)", b"(rpm x)"))
+        parse_motor(LITERAL.replace(b"(rpm 942.478)", b"(rpm x)"))
 
 
 # ---- Any messages --------------------------------------------------------------------------------
@@ -194,7 +194,7 @@ def test_a_state_comes_back_with_six_digits(state):
     once = parse_state(text)
     for value, expected in zip(once, state, strict=True):
         np.testing.assert_allclose(value, expected, rtol=1e-5)
-    assert parse_engine(text) == (
+    assert parse_motor(text) == (
         once.lap_time,
         once.gear,
         once.engine_speed,

@@ -54,10 +54,10 @@ def undisturbed(tmp_path_factory):
     """The same study without Ray: one trial after the other, in this process."""
     folder = tmp_path_factory.mktemp("undisturbed")
     study = read_study(study_file(folder))
-    place = StudyFolder(folder / "out", study)
-    place.begin()
+    store = StudyFolder(folder / "out", study)
+    store.begin()
     for trial in study.trials:
-        run_trial(trial, place, lambda row: None)
+        run_trial(trial, store, lambda row: None)
     return results(folder / "out")
 
 
@@ -83,10 +83,10 @@ def evaluated(trial):
 def begun(tmp_path):
     """A study of two trials, of which the first has one evaluation."""
     study = read_study(study_file(tmp_path))
-    place = StudyFolder(tmp_path / "out", study)
-    place.begin()
-    place.put(study.trials[0], {"state.json": b"1"}, [evaluated(study.trials[0])])
-    return study, place
+    store = StudyFolder(tmp_path / "out", study)
+    store.begin()
+    store.put(study.trials[0], {"state.json": b"1"}, [evaluated(study.trials[0])])
+    return study, store
 
 
 def test_the_table_shows_how_far_everybody_is_and_the_best_so_far(begun, monkeypatch, capsys):
@@ -106,18 +106,18 @@ def test_the_table_shows_how_far_everybody_is_and_the_best_so_far(begun, monkeyp
 
 
 def test_a_full_disk_is_told_and_leaves_everything_as_it_was(begun, tmp_path, monkeypatch, capsys):
-    study, place = begun
-    before = place.rows(study.trials[0])
+    study, store = begun
+    before = store.rows(study.trials[0])
 
     def full(descriptor):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(OSError, match="No space left on device; make room"):
-        place.put(study.trials[0], {"state.json": b"2"}, [*before, {"decisions": 480}])
-    assert place.rows(study.trials[0]) == before
-    assert (place.checkpoint(study.trials[0]) / "state.json").read_bytes() == b"1"
-    assert main(["study", str(study.path), "--folder", str(place.path.parent / "new")]) == 2
+        store.put(study.trials[0], {"state.json": b"2"}, [*before, {"decisions": 480}])
+    assert store.rows(study.trials[0]) == before
+    assert (store.checkpoint(study.trials[0]) / "state.json").read_bytes() == b"1"
+    assert main(["study", str(study.path), "--folder", str(store.path.parent / "new")]) == 2
     assert (
         "make room, or give another folder, and type the command again" in capsys.readouterr().err
     )
@@ -138,9 +138,9 @@ def test_a_full_disk_is_told_and_leaves_everything_as_it_was(begun, tmp_path, mo
     ],
 )
 def test_a_damaged_folder_is_told(begun, capsys, name, content):
-    study, place = begun
-    (place.of(study.trials[0]) / name).write_bytes(content)
-    assert main(["study", str(study.path), "--folder", str(place.path)]) == 2
+    study, store = begun
+    (store.of(study.trials[0]) / name).write_bytes(content)
+    assert main(["study", str(study.path), "--folder", str(store.path)]) == 2
     err = capsys.readouterr().err
     assert f"small-nets-seed0/{name}' cannot be read (" in err
     assert err.count("\n") == 1
@@ -160,12 +160,12 @@ def test_a_damaged_folder_is_told(begun, capsys, name, content):
     ],
 )
 def test_a_row_with_a_wrong_value_is_told(begun, capsys, field, value):
-    study, place = begun
-    rows = place.of(study.trials[0]) / "rows.json"
+    study, store = begun
+    rows = store.of(study.trials[0]) / "rows.json"
     damaged = json.loads(rows.read_text())
     damaged[0][field] = value
     rows.write_text(json.dumps(damaged))
-    assert main(["study", str(study.path), "--folder", str(place.path)]) == 2
+    assert main(["study", str(study.path), "--folder", str(store.path)]) == 2
     err = capsys.readouterr().err
     assert f"rows.json' cannot be read (row 0: {field} is {value!r}); repair it, or remove" in err
     assert err.count("\n") == 1
@@ -181,17 +181,17 @@ def test_a_damaged_record_of_temporary_files_removes_nothing(tmp_path, content):
 
 
 def test_what_was_lost_of_a_folder_is_told(begun, capsys):
-    study, place = begun
-    shutil.rmtree(place.checkpoint(study.trials[0]))
-    assert main(["study", str(study.path), "--folder", str(place.path)]) == 2
+    study, store = begun
+    shutil.rmtree(store.checkpoint(study.trials[0]))
+    assert main(["study", str(study.path), "--folder", str(store.path)]) == 2
     assert "small-nets-seed0' has lost its checkpoint-*; remove" in capsys.readouterr().err
 
 
 @pytest.mark.slow
 def test_a_damaged_checkpoint_is_told_once(begun, capsys):
-    study, place = begun
+    study, store = begun
     handlers = [signal.getsignal(number) for number in HANDLED]
-    assert main(["study", str(study.path), "--folder", str(place.path)]) == 1
+    assert main(["study", str(study.path), "--folder", str(store.path)]) == 1
     # Tune leaves its own behind, which would swallow the next Ctrl-C of this process.
     assert [signal.getsignal(number) for number in HANDLED] == handlers
     out = capsys.readouterr().out
@@ -236,31 +236,31 @@ def test_a_wrong_value_is_told_before_anything_is_trained(tmp_path, capsys, chan
     ],
 )
 def test_another_recipe_is_told_by_what_is_different(begun, tmp_path, changes, told):
-    _, place = begun
+    _, store = begun
     with pytest.raises(StudyError, match=told):
-        StudyFolder(place.path, read_study(study_file(tmp_path, **changes))).begin()
+        StudyFolder(store.path, read_study(study_file(tmp_path, **changes))).begin()
 
 
 def test_what_the_file_names_no_more_stays_in_the_table(begun, tmp_path):
     """Fewer seeds, or another variant: nothing that was measured gets lost."""
-    study, place = begun
-    place.put(study.trials[1], {"state.json": b"1"}, [evaluated(study.trials[1])])
-    fewer = StudyFolder(place.path, read_study(study_file(tmp_path, seeds=[1, 2])))
+    study, store = begun
+    store.put(study.trials[1], {"state.json": b"1"}, [evaluated(study.trials[1])])
+    fewer = StudyFolder(store.path, read_study(study_file(tmp_path, seeds=[1, 2])))
     fewer.begin()
     fewer.write_results()
-    assert [row["seed"] for row in results(place.path)] == ["1", "0"]
+    assert [row["seed"] for row in results(store.path)] == ["1", "0"]
 
 
 def test_a_worker_that_is_behind_is_not_needed(begun):
-    study, place = begun
+    study, store = begun
     with pytest.raises(StudyError, match="small-nets-seed0 has come farther elsewhere"):
-        place.put(study.trials[0], {}, [evaluated(study.trials[0])])
+        store.put(study.trials[0], {}, [evaluated(study.trials[0])])
 
 
 def test_two_runs_do_not_share_a_folder(begun, capsys):
-    study, place = begun
-    with place.locked():
-        assert main(["study", str(study.path), "--folder", str(place.path)]) == 2
+    study, store = begun
+    with store.locked():
+        assert main(["study", str(study.path), "--folder", str(store.path)]) == 2
     assert "another process runs the study" in capsys.readouterr().err
 
 
@@ -268,22 +268,22 @@ def test_where_ray_does_not_start_it_is_said_and_nothing_else_is_removed(
     begun, tmp_path, monkeypatch
 ):
     """Its sockets lie in the folder for temporary files, and their paths must not be long."""
-    study, place = begun
+    study, store = begun
     far = tmp_path / ("far" * 20)
     far.mkdir()
-    (place.path / SESSION).write_text(str(tmp_path))
+    (store.path / SESSION).write_text(str(tmp_path))
     monkeypatch.setattr(tempfile, "tempdir", str(far))
     with pytest.raises(RayUnavailable, match=r"Ray does not start in .* TMPDIR=/tmp"):
-        run_study(study, place.path, jobs=1)
+        run_study(study, store.path, jobs=1)
     assert study.path.is_file()
     assert not list(far.iterdir())
-    assert not (place.path / SESSION).exists()
+    assert not (store.path / SESSION).exists()
 
 
 def test_an_address_for_clients_outside_of_a_cluster_is_refused(begun):
-    study, place = begun
+    study, store = begun
     with pytest.raises(RayUnavailable, match=r"type the command on one of its machines"):
-        run_study(study, place.path, address="ray://somewhere:10001")
+        run_study(study, store.path, address="ray://somewhere:10001")
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ from sb3_torcs.errors import EngineForked, GameFailed, GameTimeout, InvalidOptio
 from sb3_torcs.scr.car_reader import CarReader
 from sb3_torcs.scr.client import ScrClient
 from sb3_torcs.scr.gearbox import read_gearbox
-from sb3_torcs.scr.protocol import ScrAction, format_action, parse_engine, parse_state
+from sb3_torcs.scr.protocol import ScrAction, format_action, parse_motor, parse_state
 from sb3_torcs.scr.rehearsal import Rehearsal
 from sb3_torcs.scr.server import SCR_PORT, open_ports, start_server
 from sb3_torcs.sensors import RangeFinderName, encode, range_finder_angles
@@ -296,7 +296,7 @@ class ScrBackend:
             if message is None:  # another client has the race begin anew
                 client.identify(start)
                 continue
-            lap_time = parse_engine(message).lap_time
+            lap_time = parse_motor(message).lap_time
             if lap_time >= 0.0:
                 return message
             if start is not None:
@@ -320,7 +320,7 @@ class ScrBackend:
         for tick in range(ticks):
             if client.over:
                 return tick
-            reading = parse_engine(self._message)
+            reading = parse_motor(self._message)
             asked = self._gearbox.shift(controls, reading) if controls.gear is None else controls
             client.send(_action(asked, reading.lap_time))
             message = client.receive()

@@ -1,4 +1,4 @@
-"""What several verbs share: numbers from the command line, places to write, JSON."""
+"""What several verbs share: numbers from the command line, files to write, JSON."""
 
 from __future__ import annotations
 

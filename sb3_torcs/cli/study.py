@@ -66,18 +66,18 @@ def run(args: argparse.Namespace) -> int:
     interrupted = contextlib.suppress(KeyboardInterrupt)  # Tune swallows it, others do not
     with interrupted, quiet_output(args.json), board.shown():
         run_study(study, folder, jobs=args.jobs, address=args.address, progress=board.update)
-    place = StudyFolder(folder, study)
-    left = [trial for trial in study.trials if not place.ended(trial)]
+    store = StudyFolder(folder, study)
+    left = [trial for trial in study.trials if not store.ended(trial)]
     failed = board.errors()
     if args.json:
-        print_json({"study": study.name, "results": str(place.results), "trials": board.as_json()})
+        print_json({"study": study.name, "results": str(store.results), "trials": board.as_json()})
     else:
         for name, error in failed.items():
             print(f"{name} failed: {error}")
         ended = len(study.trials) - len(left)
         print(f"{ended} of {len(study.trials)} agents trained and measured")
-        if place.results.is_file():
-            print(f"results: {place.results}")
+        if store.results.is_file():
+            print(f"results: {store.results}")
         print("go on with:" if left else "see them:")
         print(f"  {_command(args) if left else shlex.join(['sb3-torcs', 'report', str(folder)])}")
     return INTERRUPTED if len(left) > len(failed) else int(bool(failed))

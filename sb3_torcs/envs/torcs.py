@@ -58,7 +58,7 @@ class TorcsEnv(RacingEnv):
     :param range_finders: ``"scr"``, ``"narrow"``, or 19 angles in degrees, left to right
     :param action: ``"pedals"``: steering, throttle, brake; ``"pedal"``: steering and one signed
         pedal; or ``"manual"``: steering, throttle, brake, gear, clutch
-    :param gearbox: ``"automatic"``, by engine speed; or ``"road_speed"``, which does not hunt while
+    :param gearbox: ``"automatic"``, by motor speed; or ``"road_speed"``, which does not hunt while
         the wheels spin, and slips the clutch to set off
     :param start: ``"grid"`` or ``"random"``
     :param laps: whole laps after which the episode is truncated; ``None`` drives on

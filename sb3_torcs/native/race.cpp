@@ -184,10 +184,10 @@ Params Race::load_car(const std::string& name) {
     const auto require = [&](bool has, const char* what) {
         if (!has) throw Error("CarFileError", game_.data + path + " has no " + what);
     };
-    require(whole.elements("Engine/data points") >= 2, "engine torque of two speeds or more");
+    require(whole.elements("Engine/data points") >= 2, "motor torque of two speeds or more");
     require(whole.elements("Gearbox/gears") >= 2, "gears");
     require(whole.number("Car", "mass", 0.0f) > 0.0f, "mass");
-    require(whole.number("Engine", "inertia", 0.2f) > 0.0f, "engine inertia");
+    require(whole.number("Engine", "inertia", 0.2f) > 0.0f, "motor inertia");
     require(whole.number("Car", "fuel tank", 80.0f) > 0.0f, "fuel tank");
     require(whole.number("Engine", "revs limiter", 0.0f) > 0.0f, "rev limiter");
     return whole;
@@ -567,8 +567,8 @@ void Race::drive_agent(CarElement& car) {
     if (controls.gear == AUTOMATIC_GEAR) shift(car);
 }
 
-// Gears by engine speed hunt while wheels spin. By road speed, they go by how fast the engine would
-// turn if no wheel slipped; and in first gear the clutch lets the engine turn faster than the car.
+// Gears by motor speed hunt while wheels spin. By road speed, they go by how fast the motor would
+// turn if no wheel slipped; and in first gear the clutch lets the motor turn faster than the car.
 void Race::shift(CarElement& car) const {
     const CarPrivate& priv = car.priv;
     const float* ratio = priv.gear_ratio + priv.gear_offset;

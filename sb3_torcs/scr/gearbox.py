@@ -11,7 +11,7 @@ import numpy as np
 from sb3_torcs.actions import SHIFT_DOWN, SHIFT_UP, launch_clutch
 from sb3_torcs.car import Controls
 from sb3_torcs.errors import CarFileError
-from sb3_torcs.scr.protocol import EngineReading
+from sb3_torcs.scr.protocol import MotorReading
 
 __all__ = ["Gearbox", "read_gearbox"]
 
@@ -30,11 +30,11 @@ class Gearbox(NamedTuple):
 
     ratios: tuple[float, ...]  # [-] of the first gear and up
     shift_up: float  # [rad/s] above which
-    shift_down: float  # [rad/s] below which the lower gear would turn the engine
-    rolling: float | None = None  # [rad/m] that the engine turns on the way, by a ratio of 1;
-    # None goes by the engine's own speed
+    shift_down: float  # [rad/s] below which the lower gear would turn the motor
+    rolling: float | None = None  # [rad/m] that the motor turns on the way, by a ratio of 1;
+    # None goes by the motor's own speed
 
-    def shift(self, controls: Controls, reading: EngineReading) -> Controls:
+    def shift(self, controls: Controls, reading: MotorReading) -> Controls:
         """
         Choose gear and clutch; forward gears only.
 
@@ -99,7 +99,7 @@ def read_gearbox(path: Path, gearbox: str = "automatic") -> Gearbox:
 
 def _limiter(car: ElementTree.Element) -> np.float32:
     """
-    Read at which engine speed the limiter cuts in.
+    Read at which motor speed the limiter cuts in.
 
     :param car: the file
     :return: [rad/s]; 0 if it does not say
@@ -112,7 +112,7 @@ def _limiter(car: ElementTree.Element) -> np.float32:
 
 def _rolling(car: ElementTree.Element, path: Path) -> float:
     """
-    Work out how far an engine turns on the way, by a gear of ratio 1: as the game does.
+    Work out how far a motor turns on the way, by a gear of ratio 1: as the game does.
 
     :param car: the file
     :param path: where it is; its category is beside the cars

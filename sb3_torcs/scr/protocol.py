@@ -25,7 +25,7 @@ __all__ = [
     "NO_FOCUS",
     "RESTART",
     "SHUTDOWN",
-    "EngineReading",
+    "MotorReading",
     "ScrAction",
     "ScrInit",
     "ScrState",
@@ -33,8 +33,8 @@ __all__ = [
     "format_init",
     "format_state",
     "parse_action",
-    "parse_engine",
     "parse_init",
+    "parse_motor",
     "parse_state",
     "plain_name",
 ]
@@ -102,7 +102,7 @@ class ScrInit(NamedTuple):
     name: str = ""  # of the driver; servers but ours ignore it
 
 
-class EngineReading(NamedTuple):
+class MotorReading(NamedTuple):
     """What a gearbox needs of a state."""
 
     lap_time: float  # [s]
@@ -180,7 +180,7 @@ def parse_state(message: bytes) -> ScrState:
     return ScrState(**found)
 
 
-def parse_engine(message: bytes) -> EngineReading:
+def parse_motor(message: bytes) -> MotorReading:
     """
     Read only what a gearbox needs: for the states between two timesteps.
 
@@ -196,9 +196,9 @@ def parse_engine(message: bytes) -> EngineReading:
             words.append(message[begin : message.index(b")", begin)])
         lap_time, gear, revs, speed = map(float, words)
         if math.isfinite(lap_time + revs + speed) and gear.is_integer() and b"_" not in message:
-            return EngineReading(lap_time, int(gear), revs / RPM, speed / KMH)
+            return MotorReading(lap_time, int(gear), revs / RPM, speed / KMH)
     state = parse_state(message)
-    return EngineReading(state.lap_time, state.gear, state.engine_speed, state.speed_x)
+    return MotorReading(state.lap_time, state.gear, state.engine_speed, state.speed_x)
 
 
 def format_state(state: ScrState) -> bytes:

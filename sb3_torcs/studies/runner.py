@@ -48,18 +48,18 @@ IMPATIENT = {"RAY_NUM_REDIS_GET_RETRIES": "1"}
 """A cluster that does not answer is told within a minute; Ray would try for eight."""
 
 
-def run_trial(trial: Trial, place: Any, report: Callable[[dict[str, Any]], None]) -> None:
+def run_trial(trial: Trial, store: Any, report: Callable[[dict[str, Any]], None]) -> None:
     """
     Train and measure one agent, or go on with it.
 
     :param trial: which one
-    :param place: a :class:`~sb3_torcs.studies.storage.StudyFolder`, or what stands for one on
+    :param store: a :class:`~sb3_torcs.studies.storage.StudyFolder`, or what stands for one on
         another machine
     :param report: called with the newest row
     """
     from sb3_torcs.studies.trial import Training, final_row
 
-    files, over, missing = place.state(trial)
+    files, over, missing = store.state(trial)
     if not over:
         with _unpacked(files) as checkpoint:
             training = Training(trial, checkpoint)
@@ -68,19 +68,19 @@ def run_trial(trial: Trial, place: Any, report: Callable[[dict[str, Any]], None]
             with tempfile.TemporaryDirectory() as scratch:
                 training.save(Path(scratch))
                 packed = {file.name: file.read_bytes() for file in Path(scratch).iterdir()}
-            place.put(trial, packed, training.rows)
+            store.put(trial, packed, training.rows)
             report(training.rows[-1])
 
         with contextlib.closing(training):
             training.run(after_slice)
-        files, _, missing = place.state(trial)
-    chosen = [row for row in place.rows(trial) if row["phase"] == "train" and row["kept"]][-1]
+        files, _, missing = store.state(trial)
+    chosen = [row for row in store.rows(trial) if row["phase"] == "train" and row["kept"]][-1]
     with _unpacked(files) as folder:
         assert folder is not None
         model = folder / "best_model.zip"
         for track in missing:
             row = final_row(trial, model, track, chosen)
-            place.put_finals(trial, [row])
+            store.put_finals(trial, [row])
     if missing:
         report(row)
 
@@ -120,25 +120,25 @@ def run_study(
     """
     require_ray(address)
     tell = progress or _nobody
-    place = StudyFolder(folder, study)
-    with place.locked():
-        _remove_scratch(place.path / SESSION)  # of a run that was killed
-        left = [trial for trial in study.trials if not place.ended(trial)]
+    store = StudyFolder(folder, study)
+    with store.locked():
+        _remove_scratch(store.path / SESSION)  # of a run that was killed
+        left = [trial for trial in study.trials if not store.ended(trial)]
         for trial in {trial.variant: trial for trial in left}.values():
             _check_buildable(trial)
-        place.begin()
-        place.write_results()
+        store.begin()
+        store.write_results()
         for trial in study.trials:
-            for row in place.rows(trial):
+            for row in store.rows(trial):
                 tell(trial, row)
             if trial not in left:
                 tell(trial, {"state": "done"})
         if left:
             # Ray and Tune replace these handlers and never put them back.
             kept = handlers_kept(signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
-            with kept, _ray(place, jobs, address) as scratch:
-                _tune(left, place, scratch, tell)
-    return place.results
+            with kept, _ray(store, jobs, address) as scratch:
+                _tune(left, store, scratch, tell)
+    return store.results
 
 
 def _check_buildable(trial: Trial) -> None:
@@ -176,11 +176,11 @@ def require_ray(address: str | None = None) -> None:
 
 
 @contextlib.contextmanager
-def _ray(place: StudyFolder, jobs: int | None, address: str | None) -> Iterator[Path]:
+def _ray(store: StudyFolder, jobs: int | None, address: str | None) -> Iterator[Path]:
     """Start Ray or join a cluster, with a folder for temporary files, and clean up."""
     import ray
 
-    session = place.path / SESSION
+    session = store.path / SESSION
     scratch = Path(tempfile.mkdtemp(prefix=SCRATCH))
     options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
     if address is None:
@@ -228,7 +228,7 @@ def _remove_scratch(session: Path) -> None:
     session.unlink()
 
 
-def _tune(trials: list[Trial], place: StudyFolder, scratch: Path, progress: Progress) -> None:
+def _tune(trials: list[Trial], store: StudyFolder, scratch: Path, progress: Progress) -> None:
     """Let Ray Tune run the trials."""
     import ray
     from ray import tune
@@ -236,7 +236,7 @@ def _tune(trials: list[Trial], place: StudyFolder, scratch: Path, progress: Prog
 
     here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=False)
     folder = ray.remote(StudyFolder).options(num_cpus=0, scheduling_strategy=here)
-    actor = folder.remote(place.path, place.study)
+    actor = folder.remote(store.path, store.study)
 
     def trainable(config: dict[str, Any]) -> None:
         if scratch.is_dir():  # on this machine: what a killed worker leaves is removed with it
@@ -274,7 +274,7 @@ def _tune(trials: list[Trial], place: StudyFolder, scratch: Path, progress: Prog
     found = [results[number] for number in range(len(results))]
     errors = {result.config["trial"]: _error(result) for result in found if result.config}
     for number, trial in enumerate(trials):
-        if place.ended(trial):
+        if store.ended(trial):
             progress(trial, {"state": "done"})
         elif errors.get(number) is None:
             progress(trial, {"state": "stopped"})
@@ -282,10 +282,10 @@ def _tune(trials: list[Trial], place: StudyFolder, scratch: Path, progress: Prog
             progress(trial, {"state": "failed", "error": errors[number]})
 
 
-def _run_or_tell(trial: Trial, place: Any, report: Callable[[dict[str, Any]], None]) -> None:
+def _run_or_tell(trial: Trial, store: Any, report: Callable[[dict[str, Any]], None]) -> None:
     """Run a trial; what another worker would fail of, too, is a last row and no error to Tune."""
     try:
-        run_trial(trial, place, report)
+        run_trial(trial, store, report)
     except (StudyError, OutputNotWritable) as error:
         report({"phase": FAILED, "error": _last_line(error)})
 

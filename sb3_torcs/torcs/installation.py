@@ -211,7 +211,7 @@ class Game:
         raise UnknownRobot(f"robot '{name}' has no index {index}; it has {indices}")
 
 
-class _Place(NamedTuple):
+class _Candidate(NamedTuple):
     """A folder in which something of TORCS was found."""
 
     root: Path
@@ -239,15 +239,15 @@ def find_game(home: Path | None = None) -> Game:
     :raises GameIncomplete: if there is only a part of it; names all that is missing
     """
     lacking = []
-    for place in _places(home):
-        missing = _missing(place)
+    for candidate in _candidates(home):
+        missing = _missing(candidate)
         if not missing:
-            return _game(place)
-        lacking.append((place, missing))
+            return _game(candidate)
+        lacking.append((candidate, missing))
     if not lacking:
         raise GameNotFound(_not_found(home))
-    place, missing = lacking[0]
-    where = place.data or place.libraries
+    candidate, missing = lacking[0]
+    where = candidate.data or candidate.libraries
     raise GameIncomplete(
         f"TORCS at {where} is incomplete, missing {', '.join(missing)}; {_remedy(home)}"
     )
@@ -259,9 +259,9 @@ def torcs_folders() -> list[Path]:
 
     Tracks can be read without the rest of the game; that of :func:`find_game` comes first.
     """
-    found = [place for place in _places(None) if place.data is not None]
-    found.sort(key=lambda place: bool(_missing(place)))
-    return [place.data for place in found if place.data is not None]
+    found = [candidate for candidate in _candidates(None) if candidate.data is not None]
+    found.sort(key=lambda candidate: bool(_missing(candidate)))
+    return [candidate.data for candidate in found if candidate.data is not None]
 
 
 def track_files(data: Path) -> dict[str, Path]:
@@ -316,7 +316,7 @@ def _not_found(home: Path | None) -> str:
     return f"there is no TORCS in {where}; expected {expected} in it; {_remedy(home)}"
 
 
-def _places(home: Path | None) -> Iterator[_Place]:
+def _candidates(home: Path | None) -> Iterator[_Candidate]:
     """
     Yield where something of TORCS is, in the order of preference.
 
@@ -327,14 +327,14 @@ def _places(home: Path | None) -> Iterator[_Place]:
         root = Path(os.path.expanduser(given)).absolute()
         roots = [root / prefix for prefix in PREFIXES]
         if (root / "tracks").is_dir():
-            yield _Place(root, root, _libraries_beside(root))
+            yield _Candidate(root, root, _libraries_beside(root))
     else:
         roots = [*SYSTEM_ROOTS, *(user_folder() / prefix for prefix in PREFIXES)]
     for root in roots:
         data = next((root / d for d in DATA_FOLDERS if (root / d / "tracks").is_dir()), None)
         libraries = _libraries(root)
         if data is not None or libraries is not None:
-            yield _Place(root, data, libraries)
+            yield _Candidate(root, data, libraries)
 
 
 def _libraries(root: Path) -> Path | None:
@@ -365,28 +365,30 @@ def _libraries_beside(data: Path) -> Path | None:
     return None
 
 
-def _missing(place: _Place) -> list[str]:
+def _missing(candidate: _Candidate) -> list[str]:
     """
     Look for everything that a race without a window needs.
 
-    :param place: of the installation
+    :param candidate: of the installation
     :return: what is not there; files with their paths
     """
     missing = []
-    if place.data is None:
-        missing.append(f"its data ({place.root / DATA_FOLDERS[0]})")
+    if candidate.data is None:
+        missing.append(f"its data ({candidate.root / DATA_FOLDERS[0]})")
     else:
-        if not (place.data / SURFACES).is_file():
-            missing.append(f"{place.data / SURFACES}")
+        if not (candidate.data / SURFACES).is_file():
+            missing.append(f"{candidate.data / SURFACES}")
         for kind, pattern in (("track", "tracks/*/*/*.xml"), ("car", "cars/*/*.xml")):
-            if next(place.data.glob(pattern), None) is None:
-                missing.append(f"any {kind} ({place.data / pattern})")
-    if place.libraries is None:
-        missing.append(f"its libraries ({place.root / 'lib' / 'torcs'})")
+            if next(candidate.data.glob(pattern), None) is None:
+                missing.append(f"any {kind} ({candidate.data / pattern})")
+    if candidate.libraries is None:
+        missing.append(f"its libraries ({candidate.root / 'lib' / 'torcs'})")
         return missing
-    missing += [str(place.libraries / m) for m in MODULES if not (place.libraries / m).is_file()]
-    if (place.libraries / PHYSICS).is_file():
-        missing += [f"plib ({name})" for name in _missing_plib(place.libraries)]
+    missing += [
+        str(candidate.libraries / m) for m in MODULES if not (candidate.libraries / m).is_file()
+    ]
+    if (candidate.libraries / PHYSICS).is_file():
+        missing += [f"plib ({name})" for name in _missing_plib(candidate.libraries)]
     return missing
 
 
@@ -419,22 +421,22 @@ def linker_knows(name: str) -> bool:
         return False
 
 
-def _game(place: _Place) -> Game:
+def _game(candidate: _Candidate) -> Game:
     """
     Describe an installation that lacks nothing.
 
-    :param place: of the installation
+    :param candidate: of the installation
     """
-    assert place.data is not None
-    assert place.libraries is not None
-    program = place.libraries / "torcs-bin"
-    beside = place.libraries.parent
+    assert candidate.data is not None
+    assert candidate.libraries is not None
+    program = candidate.libraries / "torcs-bin"
+    beside = candidate.libraries.parent
     unpacked = next(beside.glob("libplibsg.so*"), None) is not None
-    system = place.root in SYSTEM_ROOTS
+    system = candidate.root in SYSTEM_ROOTS
     return Game(
-        root=place.root,
-        data=place.data,
-        libraries=place.libraries,
+        root=candidate.root,
+        data=candidate.data,
+        libraries=candidate.libraries,
         program=program if program.is_file() else None,
         extra_libraries=beside if unpacked and not system else None,
     )

@@ -1,4 +1,4 @@
-"""``car1-trb1`` in figures, its engine and its tyres, for the fallback world.
+"""``car1-trb1`` in figures, its motor and its tyres, for the fallback world.
 
 The figures are those of ``cars/car1-trb1/car1-trb1.xml`` of torcs-data 1.3.7; the formulas follow
 TORCS's simulation, ``simuv2``.
@@ -64,13 +64,13 @@ _BRAKE_FRONT = 29.0e6 * 0.54 * 0.190 * 50.0e-4 * 0.4
 _BRAKE_REAR = 29.0e6 * 0.46 * 0.165 * 25.0e-4 * 0.4
 BRAKE = np.array([_BRAKE_FRONT, _BRAKE_FRONT, _BRAKE_REAR, _BRAKE_REAR])  # [N m]
 
-# Engine and gearbox
+# Motor and gearbox
 RPM = 2.0 * math.pi / 60.0  # [rad/s] per rpm
 TICKOVER = 900.0 * RPM
 LIMITER = 9152.0 * RPM
 REVS_MAX = 10000.0 * RPM
-ENGINE_INERTIA = 0.2423  # [kg m²] simuv2's default
-ENGINE_BRAKE = 0.33  # simuv2's default
+MOTOR_INERTIA = 0.2423  # [kg m²] simuv2's default
+MOTOR_BRAKE = 0.33  # simuv2's default
 TORQUE_STEP = 1000.0 * RPM  # [rad/s] between the points of the torque curve
 TORQUE = np.array([100, 160, 190, 280, 350, 405, 443, 465, 483, 415, 360, 360], float)  # [N m]
 FINAL_DRIVE = 4.5
@@ -93,9 +93,9 @@ LIFT_FRONT, LIFT_REAR = 0.69 * GROUND_EFFECT, 0.70 * GROUND_EFFECT
 
 
 @njit(cache=True)
-def engine_torque(engine_speed: float, throttle: float) -> float:
+def motor_torque(engine_speed: float, throttle: float) -> float:
     """
-    Torque [N m] of the engine, braking when the throttle is closed.
+    Torque [N m] of the motor, braking when the throttle is closed.
 
     :param engine_speed: [rad/s]
     :param throttle: [-] in [0, 1]
@@ -104,14 +104,14 @@ def engine_torque(engine_speed: float, throttle: float) -> float:
         return 0.0
     i = min(int(engine_speed / TORQUE_STEP), TORQUE.shape[0] - 2)
     full = TORQUE[i] + (TORQUE[i + 1] - TORQUE[i]) * (engine_speed / TORQUE_STEP - i)
-    braking = ENGINE_BRAKE * (engine_speed - TICKOVER) / (REVS_MAX - TICKOVER)
+    braking = MOTOR_BRAKE * (engine_speed - TICKOVER) / (REVS_MAX - TICKOVER)
     return full * (throttle * (1.0 + braking) - braking)
 
 
 @njit(cache=True)
 def road_speed_gear(gear: int, speed: float) -> tuple[int, float]:
     """
-    Choose gear and clutch by how fast the engine would turn if no wheel slipped.
+    Choose gear and clutch by how fast the motor would turn if no wheel slipped.
 
     :param gear: the present one, -1 reverse, 0 neutral
     :param speed: along the car [m/s]

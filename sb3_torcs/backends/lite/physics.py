@@ -33,7 +33,7 @@ DAMAGE_FACTOR = 0.8  # for a driver of the level "semi-pro"
 # The state vector
 (
     STEPS, X, Y, YAW, VX, VY, YAW_RATE, ACC_X, ACC_Y, STEER,
-    SPIN_FR, SPIN_FL, SPIN_RR, SPIN_RL, ENGINE, GEAR, SHIFT, DAMAGE,
+    SPIN_FR, SPIN_FL, SPIN_RR, SPIN_RL, MOTOR, GEAR, SHIFT, DAMAGE,
     SEGMENT, ALONG, OFFSET, TANGENT, RACED, CROSSINGS, LAPS, LAP_START, LAST_LAP, BEST_LAP,
     SINK, SINK_RATE,
 ) = range(30)  # fmt: skip
@@ -85,7 +85,7 @@ def _spin_up(spin: float, torque: float, brake: float, inertia: float) -> float:
 
 @njit(cache=True)
 def _drive(state: Floats, throttle: float, clutch: float) -> tuple[float, float]:
-    """Run engine and clutch; return the torque [N m] and inertia [kg m²] at each rear wheel."""
+    """Run motor and clutch; return the torque [N m] and inertia [kg m²] at each rear wheel."""
     gear, closed = int(state[GEAR]), 1.0 - clutch
     ratio = car.GEARS[gear + 1] * car.FINAL_DRIVE
     axle = 0.5 * (state[SPIN_RR] + state[SPIN_RL])
@@ -95,15 +95,15 @@ def _drive(state: Floats, throttle: float, clutch: float) -> tuple[float, float]
     if gear == 0 or shifts or closed <= car.OPEN_CLUTCH:
         target = axle * ratio if shifts else car.TICKOVER + throttle * (car.LIMITER - car.TICKOVER)
         target = min(max(target, car.TICKOVER), car.REVS_MAX)
-        state[ENGINE] += (target - state[ENGINE]) * (DT / 0.05)  # the free engine, 50 ms lag
+        state[MOTOR] += (target - state[MOTOR]) * (DT / 0.05)  # the free motor, 50 ms lag
         return 0.0, car.WHEEL_INERTIA_REAR
-    engine, inertia, passed = axle * ratio, car.ENGINE_INERTIA, 1.0
+    motor, inertia, passed = axle * ratio, car.MOTOR_INERTIA, 1.0
     if clutch > 0.0:
-        free = state[ENGINE] + DT * car.engine_torque(state[ENGINE], throttle) / inertia
-        engine = free + (engine - free) * closed**4
+        free = state[MOTOR] + DT * car.motor_torque(state[MOTOR], throttle) / inertia
+        motor = free + (motor - free) * closed**4
         inertia, passed = inertia * closed, min(car.FULL_TORQUE * closed, 1.0)
-    state[ENGINE] = min(max(engine, car.TICKOVER), car.REVS_MAX)
-    torque = car.engine_torque(state[ENGINE], throttle) * ratio * car.EFFICIENCY[gear + 1] * passed
+    state[MOTOR] = min(max(motor, car.TICKOVER), car.REVS_MAX)
+    torque = car.motor_torque(state[MOTOR], throttle) * ratio * car.EFFICIENCY[gear + 1] * passed
     return 0.5 * torque, car.WHEEL_INERTIA_REAR + 0.5 * inertia * ratio * ratio
 
 
@@ -312,7 +312,7 @@ def advance(
     for _tick in range(ticks):
         wanted, clutch = gear, pressed
         if gear == AUTOMATIC:
-            wanted = automatic_gear(int(state[GEAR]), state[ENGINE], car.GEARS)
+            wanted = automatic_gear(int(state[GEAR]), state[MOTOR], car.GEARS)
         elif gear == BY_ROAD_SPEED:
             speed = state[VX] * math.cos(state[YAW]) + state[VY] * math.sin(state[YAW])
             wanted, launch = car.road_speed_gear(int(state[GEAR]), speed)
@@ -353,7 +353,7 @@ def place(x: float, y: float, yaw: float, speed: float, segment: int, track: Flo
     ):
         gear += 1
     state[GEAR] = gear
-    state[ENGINE] = min(
+    state[MOTOR] = min(
         max(speed / car.RADIUS[2] * car.GEARS[gear + 1] * car.FINAL_DRIVE, car.TICKOVER),
         car.REVS_MAX,
     )
@@ -408,7 +408,7 @@ def read(
     scalars[11] = width
     scalars[12] = track[segment, column.START] + along
     scalars[13] = state[RACED]
-    scalars[14] = state[ENGINE]
+    scalars[14] = state[MOTOR]
     scalars[15] = state[GEAR]
     scalars[16] = car.FUEL
     scalars[17] = state[DAMAGE]

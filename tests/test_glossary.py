@@ -1,0 +1,116 @@
+"""One word for one thing: what `docs/glossary.md` rules out stands in no file of the project."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+ABOUT_WORDS = {"docs/glossary.md", "tests/test_glossary.py"}
+NOT_OURS = {"LICENSE"}
+RECORDS = re.compile(r"sb3_torcs/agents/[\w-]+/(args|config)\.yml")  # what a training has stored
+ENDINGS = {".py", ".pyi", ".md", ".yml", ".cfg", ".toml", ".h", ".cpp", ""}
+
+BANNED = {  # what to say instead: the words not to use for it, and where, if not everywhere
+    "timestep": (r"decision", r"\btime[- ]steps?\b", r"\b(share|some) of the steps\b"),
+    "timestep, where a noise or a callback counts": (r"\bframes?\b",),
+    "video": (r"films?\b", r"filmed", r"filming"),
+    "replay buffer": (r"\breplay[- _]memor", r"memor(y|ies)"),
+    "grid slot": (r"\bgrid[- ](place|position)", r"\bstarting[- ](place|position)"),
+    "folder": (r"\banother place\b",),
+    "motor": (r"\bengine speed", r"\bengine[_ ](torque|inertia|brake|revs)"),
+}
+ONLY_IN = {
+    "timestep, where a noise or a callback counts": re.compile(
+        r"sb3_torcs/noise\.py|sb3_torcs/callbacks/(exploration|learning)\.py|zoo_configs/"
+        r"|examples/studies/|tests/test_noise\.py"
+    ),
+}
+ALLOWED = (
+    # stored, or typed by people
+    r"[\"'`]decisions[\"'`]", r"\[\"decisions\"\]", r"line_decisions", r"noise/frames",
+    r"--film", r"grid_place", r"[\"'`(]frames\b", r"in frames,",
+    # Python's, NumPy's, C++'s, the operating system's
+    r"memoryview", r"MemoryError", r"shares_memory", r"<memory>", r"memory_order_\w+",
+    # RAM
+    r"test_torcs_memory", r"\b(in|of|no|other|own|copy|has the|fills the|filling the) memory\b",
+    r"_memory\b", r"\bmemory\(", r"\bmemory (of|in)\b",
+)  # fmt: skip
+RAM = re.compile(  # whole files that are about it
+    r"sb3_torcs/native/|docs/(architecture|engine|reliability)\.md|tests/test_(torcs_memory|native"
+    r"|scr_backend|scr_server)|tests/test_(contract|torcs_vector)\.py|sb3_torcs/bench/torcs\.py"
+    r"|sb3_torcs/agents/model_file\.py|tests/test_model_record\.py"
+)
+
+
+def tracked_texts():
+    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, check=True, capture_output=True)
+    for name in listed.stdout.decode().splitlines():
+        path = ROOT / name
+        if name in ABOUT_WORDS | NOT_OURS or RECORDS.match(name) or not path.is_file():
+            continue
+        if path.suffix in ENDINGS:
+            yield name
+
+
+def misnamed(text, name="sb3_torcs/cli/watch.py"):
+    """What a text calls by another word than the glossary's, with the lines' numbers."""
+    found = []
+    for number, line in enumerate(text.splitlines(), 1):
+        rest = re.sub("|".join(ALLOWED), "", line)
+        for word, patterns in BANNED.items():
+            if word in ONLY_IN and not ONLY_IN[word].match(name):
+                continue
+            if word == "replay buffer" and RAM.match(name):
+                continue
+            said = re.search("|".join(patterns), rest, re.IGNORECASE)
+            if said:
+                found.append(f"{name}:{number}: '{said[0]}'; say {word}")
+    return found
+
+
+@pytest.mark.parametrize("name", list(tracked_texts()))
+def test_everybody_uses_the_words_of_the_glossary(name):
+    assert not misnamed(f"{name}\n{(ROOT / name).read_text(encoding='utf-8')}", name)
+
+
+@pytest.mark.parametrize(
+    ("sentence", "word"),
+    [
+        ("It learned from 5,000 decisions.", "timestep"),
+        ("for decision in decisions:", "timestep"),
+        ("the noise of one time step", "timestep"),
+        ("Film the best lap.", "video"),
+        ("recorder.film(path)", "video"),
+        ("A model with its memory goes on.", "replay buffer"),
+        ("begins at the first starting place", "grid slot"),
+        ("make room, or choose another place", "folder"),
+        ("its gearbox goes by engine speed", "motor"),
+    ],
+)
+def test_another_word_is_caught(sentence, word):
+    (found,) = misnamed(sentence)
+    assert found.endswith(f"say {word}")
+
+
+def test_a_count_of_a_noise_is_no_frame():
+    """Where videos are written, the word is right."""
+    assert misnamed("after so many frames", "sb3_torcs/noise.py")
+    assert not misnamed("after so many frames", "sb3_torcs/rendering/encoder.py")
+
+
+@pytest.mark.parametrize(
+    "sentence",
+    ['row["decisions"]', 'add("--film", dest="video")', "grid_place=1", "np.shares_memory(a, b)"],
+)
+def test_what_is_stored_or_typed_keeps_its_name(sentence):
+    assert not misnamed(sentence)
+
+
+def test_the_glossary_has_every_word():
+    page = (ROOT / "docs" / "glossary.md").read_text(encoding="utf-8")
+    for word in BANNED:
+        assert f"\n| {word.partition(',')[0]} |" in page
