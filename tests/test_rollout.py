@@ -15,7 +15,7 @@ OFF = {"distance_from_axis": 6.0}
 
 
 class Counting:
-    """A driver with a memory: how often it was asked, since when."""
+    """A driver with a state: how often it was asked, since when."""
 
     def __init__(self):
         self.asked = []
