@@ -14,6 +14,7 @@ import torch._dynamo  # noqa: F401
 
 from sb3_torcs.car import CONTROL_TICK, CarState
 from sb3_torcs.errors import BackendUnavailable
+from sb3_torcs.sensors import SENSORS
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.tracks.track import Grid, Segment, Surface, Track
 
@@ -89,3 +90,12 @@ class ScriptedBackend:
 
     def close(self):
         self.closed += 1
+
+
+def plainly_encoded(car):
+    """Encode sensor by sensor, as the table's docstring says it."""
+    columns = [
+        np.clip(np.asarray(getattr(car, s.name)) * s.scale, s.low * s.scale, s.high * s.scale)
+        for s in SENSORS
+    ]
+    return np.hstack(columns).astype(np.float32)

@@ -1,10 +1,12 @@
-"""What of the game still runs."""
+"""Which processes still run."""
 
 from __future__ import annotations
 
 import os
 import re
 import subprocess
+import time
+from pathlib import Path
 
 
 def children() -> set[int]:
@@ -12,3 +14,19 @@ def children() -> set[int]:
     call = ["ps", "--ppid", str(os.getpid()), "-o", "pid=,comm="]
     listed = subprocess.run(call, capture_output=True, text=True, check=False).stdout
     return {int(pid) for pid in re.findall(r"^ *(\d+) (?:torcs-bin|Xvfb)\b", listed, re.MULTILINE)}
+
+
+def runs(pid):
+    """Whether a process runs: one that waits to be reaped by somebody else does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def gone_within(seconds, *conditions):
+    """Wait until nothing is there any more."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end and any(condition() for condition in conditions):
+        time.sleep(0.05)
+    return not any(condition() for condition in conditions)

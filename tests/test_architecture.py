@@ -9,6 +9,7 @@ import ast
 import configparser
 import importlib
 import io
+import re
 import tokenize
 from collections.abc import Iterator
 from pathlib import Path
@@ -241,6 +242,39 @@ def test_what_files_and_people_name_stays_importable(path):
     """Saved models, records of trainings and hyperparameter files hold these names."""
     module, _, name = path.rpartition(".")
     assert hasattr(importlib.import_module(module), name)
+
+
+TESTS = sorted(Path(__file__).parent.glob("*.py"))
+RUNS_TEXT = {"test_docs.py"}  # the snippets of the docs
+
+
+def faults_of_a_test(text: str) -> list[str]:
+    """
+    What hides that something is missing, what nobody finds, and what no linter reads.
+
+    Code for another process counts: it imports from the helpers beside the tests, too.
+    """
+    called = {
+        ast.unparse(node.func).rpartition(".")[2]
+        for node in ast.walk(ast.parse(text))
+        if isinstance(node, ast.Call)
+    }
+    imported = set(re.findall(r"\b(?:from|import) (test_\w+)", text))
+    return sorted((called & {"importorskip", "exec"}) | imported)
+
+
+def test_the_faults_of_a_test_are_found():
+    bad = "from test_a import b\nrun('import test_c')\npytest.importorskip('d')\nexec('e')\n"
+    assert faults_of_a_test(bad) == ["exec", "importorskip", "test_a", "test_c"]
+
+
+@pytest.mark.parametrize("path", TESTS, ids=lambda path: path.name)
+def test_tests_skip_nothing_and_share_helpers(path):
+    """What several tests need stands in a module of its own."""
+    if path.name == Path(__file__).name:
+        return
+    allowed = ["exec"] if path.name in RUNS_TEXT else []
+    assert faults_of_a_test(source(path)) == allowed
 
 
 def test_the_top_of_the_package_is_short():

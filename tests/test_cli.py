@@ -274,7 +274,6 @@ def test_tracks_lists_only_those_that_are_named(capsys):
 
 
 def test_a_track_is_drawn(capsys, tmp_path):
-    pytest.importorskip("sb3_torcs.tracks.plot")
     picture = tmp_path / "new" / "aalborg.png"
     assert run(capsys, "tracks", "aalborg", "--plot", str(picture))[0] == 0
     assert picture.read_bytes()[:4] == PNG
@@ -496,7 +495,6 @@ def test_a_stretch_is_recorded_in_real_time(recorded, tmp_path):
 
 
 def test_a_stretch_is_drawn(recorded, tmp_path):
-    pytest.importorskip("sb3_torcs.tracks.plot")
     recorded.draw_line(tmp_path / "line.png")
     assert (tmp_path / "line.png").read_bytes()[:4] == PNG
 

@@ -2,58 +2,19 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import signal
 import subprocess
 import sys
-import time
-from pathlib import Path
 
 import pytest
+from displays import traces
+from processes import gone_within, runs
 
 from sb3_torcs.errors import BackendUnavailable, DisplayUnavailable
 from sb3_torcs.torcs.display import VirtualDisplay, find_display
 
 SIZE = (160, 120)
-
-
-def traces(name):
-    """The files of a display's server, those of a crashed one included."""
-    number = name[1:]
-    files = [Path(f"/tmp/.X{number}-lock"), Path(f"/tmp/.X11-unix/X{number}")]
-    return [file for file in files if file.exists()]
-
-
-def left_behind(display):
-    """Its files, unless another server has its number by now, or is giving it back."""
-    end = time.monotonic() + 10.0
-    while traces(display.name):
-        lock = Path(f"/tmp/.X{display.name[1:]}-lock")
-        with contextlib.suppress(OSError, ValueError):
-            owner = int(lock.read_text())
-            if owner != display.pid and runs(owner):
-                return []
-        if time.monotonic() > end:
-            return traces(display.name)
-        time.sleep(0.05)
-    return []
-
-
-def runs(pid):
-    """Whether a process runs: one that waits to be reaped by somebody else does not."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except FileNotFoundError:
-        return False
-
-
-def gone_within(seconds, *conditions):
-    """Wait until nothing is there any more."""
-    end = time.monotonic() + seconds
-    while time.monotonic() < end and any(condition() for condition in conditions):
-        time.sleep(0.05)
-    return not any(condition() for condition in conditions)
 
 
 def program(folder, script):

@@ -15,7 +15,9 @@ from types import SimpleNamespace
 import imageio_ffmpeg
 import numpy as np
 import pytest
-from test_display import gone_within, left_behind, runs, traces
+from displays import left_behind, traces
+from processes import gone_within, runs
+from recordings import FPS, LAP, SIZE, recorded
 
 from sb3_torcs.agents.text_mode import run
 from sb3_torcs.errors import (
@@ -29,12 +31,7 @@ from sb3_torcs.rendering import game_video as video_module
 from sb3_torcs.rendering.game_video import HEADER, GameVideo, read_frame, side_by_side
 from sb3_torcs.torcs.process import GameProcess
 from sb3_torcs.torcs.race_setup import RaceSetup
-from sb3_torcs.torcs.window import window_arguments
 from sb3_torcs.tracks.trial import check_track
-
-SIZE = (160, 120)
-FPS = 5  # that the physics meets exactly: 100 of its steps
-LAP = RaceSetup("a-speedway", [("inferno", 3)], laps=1)
 
 
 @pytest.fixture(autouse=True)
@@ -45,13 +42,6 @@ def nothing_is_left(tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(private))
     yield
     assert list(private.iterdir()) == []
-
-
-def recorded(game, race=LAP, size=SIZE, **options):
-    def start(window):
-        return GameProcess(game, race, check=check_track, **window_arguments(game, window))
-
-    return GameVideo(start, size=size, **{"fps": FPS, **options})
 
 
 @pytest.fixture(scope="module")
@@ -223,7 +213,7 @@ class TestFaults:
     def test_nothing_outlives_a_process_that_is_killed_in_mid_video(self):
         code = (
             "import sys; sys.path.insert(0, 'tests')\n"
-            "from test_game_video import recorded\n"
+            "from recordings import recorded\n"
             "from sb3_torcs.torcs.installation import find_game\n"
             "video = recorded(find_game(), fps=100)\n"
             "frame = next(video.frames())\n"

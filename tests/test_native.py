@@ -7,10 +7,12 @@ import itertools
 import math
 import pickle
 import threading
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from drives import drive
 from game_copy import python
 
 from sb3_torcs.actions import controls_from_action
@@ -27,29 +29,6 @@ ALONE = [AGENT]
 ROLLS = 0.3  # [m]
 AMONG = [("inferno", 3), ("bt", 3), AGENT, ("olethros", 3)]
 GAS = Controls(0.02, 0.7, 0.0)
-
-DRIVE = """
-import hashlib, sys
-import numpy as np
-from sb3_torcs.backends.native import AGENT, make_engine
-from sb3_torcs.torcs.installation import find_game
-
-def drive(track, entries, seed, ticks=300):
-    engine = make_engine(find_game(), track, entries, session="race" if entries[1:] else "practice")
-    rng, digest = np.random.default_rng(seed), hashlib.sha256()
-    engine.start_at(rng.uniform(0, 1000), 0.0, 0.0, 30.0) if seed % 2 else engine.start()
-    for _ in range(ticks // 5):
-        steering, throttle, brake = rng.uniform([-0.2, 0, 0], [0.2, 1, 0.3])
-        engine.step(steering, throttle, brake, None, 5)
-        for car in range(len(entries)):
-            for value in engine.read(car):
-                digest.update(np.float64(value).tobytes())
-    engine.close()
-    return digest.hexdigest()
-"""
-namespace: dict = {}
-exec(DRIVE, namespace)
-drive = namespace["drive"]
 
 DRIVES = [
     ("aalborg", ALONE, 0),
@@ -88,9 +67,15 @@ class TestEqualToItself:
         assert drive(*what) == first
 
     def test_in_another_process(self):
-        code = DRIVE + "for what in eval(sys.argv[1]): print(drive(*what))"
+        code = (
+            "import ast, sys\nfrom drives import drive\n"
+            "for what in ast.literal_eval(sys.argv[1]): print(drive(*what))"
+        )
+        tests = str(Path(__file__).parent)
         # In the other order, and with a locale and a folder that are not this process's.
-        found = python(code, repr(DRIVES[::-1]), cwd="/", LC_ALL="C.UTF-8").split()
+        found = python(
+            code, repr(DRIVES[::-1]), cwd="/", LC_ALL="C.UTF-8", PYTHONPATH=tests
+        ).split()
         assert found[::-1] == [drive(*what) for what in DRIVES]
 
     def test_side_by_side(self):

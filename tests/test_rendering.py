@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_highway import stadium, state
+from stadium import ANGLES, COASTING, stadium, state
 
 from sb3_torcs.car import Controls
 from sb3_torcs.errors import EnvClosed, InvalidOption
@@ -19,8 +19,6 @@ from sb3_torcs.rendering.viewer import BEAM_END, CAR_HEIGHT, Viewer
 from sb3_torcs.tracks.catalogue import load_track
 from sb3_torcs.tracks.track import Surface
 
-ANGLES = np.radians(np.linspace(-90.0, 90.0, 19))
-COASTING = Controls(0.0, 0.0, 0.0)
 LEFT_BEND, RIGHT_BEND = stadium(0.025), stadium(-0.025)
 HEADLESS = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
 
@@ -220,8 +218,7 @@ def test_a_closed_viewer_says_so_and_closes_twice():
 PRELUDE = """
 import os
 before = dict(os.environ)
-from test_highway import stadium, state
-from test_rendering import ANGLES, COASTING
+from stadium import ANGLES, COASTING, stadium, state
 from sb3_torcs.rendering.viewer import Viewer
 from sb3_torcs.errors import EnvClosed, InvalidOption
 import pygame
