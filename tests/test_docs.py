@@ -5,9 +5,13 @@
 
 from __future__ import annotations
 
+import argparse
 import ast
+import functools
+import importlib.util
 import inspect
 import json
+import pkgutil
 import re
 import shlex
 import subprocess
@@ -145,7 +149,6 @@ def verbs_table():
             self.rows = []
 
         def add_parser(self, name, *, help, **kwargs):
-            import argparse
 
             self.rows.append([f"`sb3-torcs {name}`", help])
             return argparse.ArgumentParser(add_help=False)
@@ -378,6 +381,118 @@ def check_zoo(args):
     for keywords in (args.env_kwargs or {}, args.eval_env_kwargs or {}):
         assert keywords.keys() <= allowed.keys()
         load_track(keywords.get("track", "aalborg"))
+
+
+# ------------------------------------------------------------------------------ names in the text
+
+
+WRITTEN = {  # by runs and by people: files that docs name and that are not the project's
+    "__pycache__", "0.monitor.csv", "args.yml", "config.yml", "monitor.csv", "my.yml", "recipe.yml",
+    "report.md", "results.csv",
+}  # fmt: skip
+TOOLS_FLAGS = {"--logdir"}  # of TensorBoard
+NOT_IN_THE_PACKAGE = {  # Python's, Gymnasium's, SB3's, the game's
+    "True", "False", "None", "Box", "DDPG", "PPO", "SAC", "TD3", "DummyVecEnv", "SubprocVecEnv",
+    "SyncVectorEnv", "RecordVideo", "TimeLimit", "VecNormalize", "Monitor", "MlpPolicy",
+    "TD3Policy", "RecurrentPPO", "SCR", "Graphic",
+    "Wrapper", "RewardWrapper",
+    "learn", "predict", "render", "reset", "env_method", "make", "load", "set_num_threads",
+}  # fmt: skip
+FILE = r"[\w./-]+\.(?:py|h|cpp|md|yml|csv|sha256|webp)|(?:sb3_torcs|native|examples|tests)/[\w/]*"
+DOTTED = r"(sb3_torcs(?:\.\w+)+)\b(?!/).*"
+NAME = r"(?:[a-z]\w*\.)*(?:([A-Z]\w*[a-z]\w*)(?:\.\w+)?(?:\(.*\))?|([a-z]\w*)\(.*\))"
+
+
+def spoken(page):
+    """What stands in backticks in running text."""
+    text = re.sub(r"^```.*?^```$", "", page.read_text("utf-8"), flags=re.DOTALL | re.M)
+    return re.findall(r"`([^`\n]+)`", text)
+
+
+def names_in(pattern):
+    """Names of one form that the pages' texts hold, each once a page."""
+    for page in PAGES:
+        matches = [re.fullmatch(pattern, text) for text in dict.fromkeys(spoken(page))]
+        yield from ((page.stem, next(filter(None, m.groups()), m[0])) for m in matches if m)
+
+
+@functools.cache
+def defined():
+    """Names of all classes, functions and constants, in Python and in C++."""
+    kinds, names = (ast.ClassDef, ast.FunctionDef), set()
+    for path in PACKAGE.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, kinds):
+                names.add(node.name)
+    for path in (PACKAGE / "native").rglob("*.h"):
+        names |= set(re.findall(r"(?:class|struct) (\w+)", path.read_text("utf-8")))
+    return names
+
+
+def known_flags():
+    parser = argparse.ArgumentParser()
+    verbs = parser.add_subparsers()
+    for verb in cli.VERBS:
+        verb.add_parser(verbs)
+    known = {"--version", *TOOLS_FLAGS}
+    for verb in verbs.choices.values():
+        known |= {option for action in verb._actions for option in action.option_strings}
+    zoo_train = Path(importlib.util.find_spec("rl_zoo3.train").origin)
+    for path in [zoo_train, *(ROOT / "examples").glob("*.py")]:
+        known |= set(re.findall(r"\"(--[\w-]+)\"", path.read_text("utf-8")))
+    return known
+
+
+@functools.cache
+def tracked():
+    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, check=True, capture_output=True)
+    return "".join(f"/{name}\n" for name in listed.stdout.decode().splitlines())
+
+
+def is_there(name):
+    """Whether a file, or a folder that ends with a slash; NAME stands for any."""
+    ending = "" if name.endswith("/") else "$"
+    pattern = "/" + re.escape(name).replace("NAME", r"[\w-]+") + ending
+    return bool(re.search(pattern, tracked(), re.M)) or Path(name).name in WRITTEN
+
+
+@pytest.mark.parametrize(("page", "name"), sorted(set(names_in(FILE))))
+def test_a_file_that_the_docs_name_is_there(page, name):
+    assert is_there(name)
+
+
+@pytest.mark.parametrize(("page", "name"), sorted(set(names_in(DOTTED))))
+def test_a_dotted_path_in_the_docs_imports(page, name):
+    assert resolved(name) is not None
+
+
+def resolved(name):
+    """What a dotted path names: a module, or something in one."""
+    return pkgutil.resolve_name(name)
+
+
+@pytest.mark.parametrize(("page", "name"), sorted(set(names_in(NAME))))
+def test_a_class_or_function_that_the_docs_name_exists(page, name):
+    assert name in NOT_IN_THE_PACKAGE | defined()
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_a_flag_in_the_docs_is_one_of_a_command(page):
+    said = {flag for text in spoken(page) for flag in re.findall(r"(?<!\S)--[a-z][\w-]*", text)}
+    assert said <= known_flags()
+
+
+def test_names_that_are_not_there_would_be_found(tmp_path, monkeypatch):
+    """A page of mistakes: nothing of it is known."""
+    page = tmp_path / "page.md"
+    page.write_text("`sb3_torcs.nothing`, `NoSuchClass`, `no_such()`, `--no-flag`, `no/file.py`")
+    monkeypatch.setattr(sys.modules[__name__], "PAGES", [page])
+    assert [is_there(name) for _, name in names_in(FILE)] == [False]
+    assert [name for _, name in names_in(NAME)] == ["NoSuchClass", "no_such"]
+    assert not {"NoSuchClass", "no_such"} & defined()
+    assert "--no-flag" not in known_flags()
+    with pytest.raises(AttributeError):
+        resolved(*[name for _, name in names_in(DOTTED)])
 
 
 # ------------------------------------------------------------------------------ links, docstrings
