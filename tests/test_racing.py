@@ -102,16 +102,6 @@ def test_controls_are_held_for_the_action_repeat(oval):
     assert env.backend.calls[-1] == ("step", Controls(0.5, 1.0, 0.0), 7)
 
 
-def test_a_world_that_encodes_its_own_states_is_asked_to(oval):
-    class Encoding(ScriptedBackend):
-        def encode(self, car):
-            return np.full(29, car.speed_x, np.float32)
-
-    env = RacingEnv(Encoding(oval, {"speed_x": 7.0}))
-    assert env.reset(seed=0)[0].tolist() == [20.0] * 29
-    assert env.step(GAS)[0].tolist() == [7.0] * 29
-
-
 def test_reset_options_place_the_car(oval):
     env = RacingEnv(ScriptedBackend(oval))
     env.reset(seed=0, options={"distance": 100.0, "speed": 20.0, "track_position": 0.5})

@@ -20,11 +20,9 @@ class Backend(Protocol):
     """
     One car in one world.
 
-    A world may also have a method ``encode(car)`` that does for the state which it has just
-    returned what :func:`sb3_torcs.sensors.encode` does for any, to the bit, but faster: then the
-    environment calls that. One that has several tracks has a method ``draw_track(rng)``, which the
-    environment calls before it draws a start on that track. One whose car has more or fewer than
-    six forward gears has an attribute ``gears``.
+    A world that has several tracks has a method ``draw_track(rng)``, which the environment calls
+    before it draws a start on that track. One whose car has more or fewer than six forward gears
+    has an attribute ``gears``.
     """
 
     track: Track
