@@ -13,7 +13,8 @@ LINKED_DEEP = ("cars", "tracks", "categories", "drivers")  # folders whose files
 
 TRY = """
 import json, sys
-from sb3_torcs.backends.native import AGENT, make_engine
+from sb3_torcs.backends.native import make_engine
+from sb3_torcs.torcs.starting_list import AGENT
 from sb3_torcs.errors import Sb3TorcsError
 from sb3_torcs.torcs.installation import find_game
 

@@ -308,6 +308,16 @@ def test_worlds_know_nothing_of_agents(path):
     assert forbidden(path, {"gymnasium", "torch", "stable_baselines3", "rl_zoo3"}) == []
 
 
+@pytest.mark.parametrize("path", files_of({"backends"}), ids=named)
+def test_a_world_knows_no_other_world(path):
+    """What two of them need stands below both."""
+    own = path.relative_to(PACKAGE / "backends").parts[0].removesuffix(".py")
+    siblings = {
+        f"sb3_torcs.backends.{world}" for world in ("lite", "native", "scr") if world != own
+    }
+    assert forbidden(path, siblings) == []
+
+
 @pytest.mark.parametrize("path", files_of({"envs"}), ids=named)
 def test_environments_know_nothing_of_learning(path):
     assert forbidden(path, {"torch", "stable_baselines3", "rl_zoo3"}) == []

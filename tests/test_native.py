@@ -17,11 +17,12 @@ from game_copy import python
 
 from sb3_torcs.actions import controls_from_action
 from sb3_torcs.agents.scripted import ScriptedDriver
-from sb3_torcs.backends.native import AGENT, Fleet, NativeBackend, make_engine
+from sb3_torcs.backends.native import Fleet, NativeBackend, make_engine
 from sb3_torcs.car import Controls, Start
 from sb3_torcs.errors import CarLost, InvalidOption
 from sb3_torcs.sensors import encode
 from sb3_torcs.torcs.installation import find_game
+from sb3_torcs.torcs.starting_list import AGENT
 
 ALONE = [AGENT]
 # The car settles on its springs, and rolls while it does: on a slope by a few centimetres. At the

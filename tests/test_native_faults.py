@@ -21,7 +21,7 @@ from game_copy import attempts, compiled, copy_game, python, replace
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
-from sb3_torcs.backends.native import AGENT, NativeBackend, make_engine
+from sb3_torcs.backends.native import NativeBackend, make_engine
 from sb3_torcs.car import Controls
 from sb3_torcs.errors import (
     BackendUnavailable,
@@ -38,6 +38,7 @@ from sb3_torcs.errors import (
     UnknownRobot,
 )
 from sb3_torcs.torcs.installation import MODULES, SURFACES, find_game
+from sb3_torcs.torcs.starting_list import AGENT
 
 INSTALL = "sb3-torcs install-torcs"
 SMALL = "g-track-1"  # loads in no time
@@ -46,7 +47,8 @@ INFERNO = [["inferno", 3]]
 BEGIN = """
 import json, math, os, sys, threading, numpy as np
 from sb3_torcs import errors
-from sb3_torcs.backends.native import AGENT, Fleet, NativeBackend, make_engine
+from sb3_torcs.backends.native import Fleet, NativeBackend, make_engine
+from sb3_torcs.torcs.starting_list import AGENT
 from sb3_torcs.car import Controls, Start
 from sb3_torcs.torcs.installation import find_game
 

@@ -12,10 +12,11 @@ import pytest
 
 from sb3_torcs.agents.robots import MAX_ROBOTS, race
 from sb3_torcs.agents.text_mode import run as run_game
-from sb3_torcs.backends.native import AGENT, make_engine
+from sb3_torcs.backends.native import make_engine
 from sb3_torcs.car import CONTROL_TICK
 from sb3_torcs.errors import InvalidOption, OutputNotWritable, TrackNotFound, UnknownRobot
 from sb3_torcs.telemetry import TELEMETRY_FIELDS
+from sb3_torcs.torcs.starting_list import AGENT
 
 ROBOTS = ["inferno", "berniw", "bt", "olethros", "tita", "lliaw"]
 EVERYBODY_ON = ["road/aalborg", "oval/michigan", "dirt/dirt-1"]

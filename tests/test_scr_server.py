@@ -22,10 +22,11 @@ from pathlib import Path
 import pytest
 
 from sb3_torcs import _engine
-from sb3_torcs.backends.native import AGENT, make_engine
+from sb3_torcs.backends.native import make_engine
 from sb3_torcs.scr.server import open_ports, start_server
 from sb3_torcs.torcs.process import GameProcess
 from sb3_torcs.torcs.race_setup import RaceSetup
+from sb3_torcs.torcs.starting_list import AGENT
 from sb3_torcs.tracks.trial import check_track
 
 PATIENCE = 20.0  # [s] for an answer on a busy machine

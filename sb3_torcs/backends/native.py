@@ -19,13 +19,13 @@ from sb3_torcs.car import (
     FloatArray,
     Start,
     checked_laps,
-    is_count,
 )
 from sb3_torcs.errors import BackendUnavailable, InvalidOption, TrackFileError
 from sb3_torcs.sensors import RangeFinderName, range_finder_angles
 from sb3_torcs.torcs.building import build_command
-from sb3_torcs.torcs.installation import Game, find_game
+from sb3_torcs.torcs.installation import Game, find_game, track_path
 from sb3_torcs.torcs.race_setup import SCR_SERVER, SESSIONS, RaceSetup, Session
+from sb3_torcs.torcs.starting_list import AGENT, starting_list
 from sb3_torcs.torcs.trial_child import encoded
 from sb3_torcs.tracks.catalogue import load_track
 from sb3_torcs.tracks.track import Track
@@ -34,18 +34,7 @@ from sb3_torcs.tracks.trial import check_road, engine_arguments, try_race
 if TYPE_CHECKING:
     from sb3_torcs._engine import Engine
 
-__all__ = [
-    "AGENT",
-    "Fleet",
-    "NativeBackend",
-    "check_layout",
-    "make_engine",
-    "starting_list",
-    "track_path",
-]
-
-AGENT = ("", 0)
-"""The agent's entry in a starting list; robots have a name and an index."""
+__all__ = ["Fleet", "NativeBackend", "check_layout", "make_engine"]
 
 MIN_SHIFT = 1.0  # [m] between the game's frame and the track's, from which positions are moved
 
@@ -106,51 +95,6 @@ def make_engine(
         engine.close()
         raise
     return engine
-
-
-def track_path(game: Game, track: str | os.PathLike[str]) -> Path:
-    """
-    Find a track of the game, or a file of that format.
-
-    :param game: the installation
-    :param track: a name, or the path of an XML file
-    :return: the path of its XML file, absolute
-    """
-    if not isinstance(track, (str, os.PathLike)) or track == "random":
-        raise InvalidOption(
-            f"track is {track!r}; Torcs-v0 takes the name of an installed track (`sb3-torcs "
-            "tracks` lists them) or the path of a TORCS .xml; random tracks are for TorcsLite-v0"
-        )
-    if os.fspath(track).lower().endswith(".xml"):
-        return Path(os.path.expanduser(track)).absolute()
-    return game.tracks()[game.find_track(os.fspath(track))].absolute()
-
-
-def starting_list(
-    game: Game, opponents: Sequence[str], grid_place: int | None
-) -> list[tuple[str, int]]:
-    """
-    Say who starts where.
-
-    :param game: the installation
-    :param opponents: robots, e.g. ``("inferno", "berniw:3")``
-    :param grid_place: of the agent among them, 1 in front; ``None`` is behind them all
-    :return: names and indices, and :data:`AGENT`
-    :raises InvalidOption: if there is no such slot, or the opponents are no list
-    :raises UnknownRobot: if there is no such robot
-    """
-    if not isinstance(opponents, (list, tuple)) or not all(isinstance(o, str) for o in opponents):
-        raise InvalidOption(
-            f"opponents is {opponents!r}; expected a list of names, e.g. ['inferno', 'berniw:3']"
-        )
-    entries = [game.parse_robot(name) for name in opponents]
-    slot = len(entries) + 1 if grid_place is None else grid_place
-    if not is_count(slot) or slot > len(entries) + 1:
-        raise InvalidOption(
-            f"grid_place is {grid_place!r}; expected 1 to {len(entries) + 1}, or None"
-        )
-    entries.insert(slot - 1, AGENT)
-    return entries
 
 
 class NativeBackend:
@@ -253,9 +197,20 @@ class NativeBackend:
     def step(self, controls: Controls, ticks: int) -> CarState:
         """Drive on; see :class:`~sb3_torcs.backends.base.Backend`."""
         steering, throttle, brake, gear, clutch = controls
-        self._state = self.engine.step(steering, throttle, brake, gear, ticks, clutch)
+        state = self.engine.step(steering, throttle, brake, gear, ticks, clutch)
+        self.arrive(controls, ticks, state)
+        return state
+
+    def arrive(self, controls: Controls, ticks: int, state: CarState) -> None:
+        """
+        Note a step that is done: the engine may have been driven by a :class:`Fleet`.
+
+        :param controls: as of ``step``
+        :param ticks: as of ``step``
+        :param state: the car after it
+        """
+        self._state = state
         self._drive.append((controls, ticks))
-        return self._state
 
     def focus(self, direction: float) -> FloatArray:
         """
@@ -337,9 +292,7 @@ class Fleet:
         :return: as of ``step``
         """
         state: CarState = self._fleet.wait(index)
-        backend = self._backends[index]
-        backend._state = state
-        backend._drive.append(self._begun[index])
+        self._backends[index].arrive(*self._begun[index], state)
         return state
 
     def finish(self) -> None:

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from sb3_torcs.actions import checked_gearbox, controls_from_action
-from sb3_torcs.backends.native import AGENT, starting_list, track_path
 from sb3_torcs.car import CONTROL_TICK, DEFAULT_CAR, MANY_LAPS, CarState, Controls, Start, is_count
 from sb3_torcs.errors import EngineForked, GameFailed, GameTimeout, InvalidOption, ServerLost
 from sb3_torcs.scr.car_reader import CarReader
@@ -22,9 +21,10 @@ from sb3_torcs.scr.protocol import ScrAction, format_action, parse_motor, parse_
 from sb3_torcs.scr.rehearsal import Rehearsal
 from sb3_torcs.scr.server import SCR_PORT, open_ports, start_server
 from sb3_torcs.sensors import RangeFinderName, encode, range_finder_angles
-from sb3_torcs.torcs.installation import find_game
+from sb3_torcs.torcs.installation import find_game, track_path
 from sb3_torcs.torcs.process import GameProcess, compiled_library
 from sb3_torcs.torcs.race_setup import SCR_SERVER, RaceSetup
+from sb3_torcs.torcs.starting_list import AGENT, starting_list
 from sb3_torcs.tracks.catalogue import load_track
 from sb3_torcs.tracks.track import Track
 

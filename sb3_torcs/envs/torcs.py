@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from sb3_torcs.actions import ActionName, GearboxName, used_gearbox
 from sb3_torcs.backends.base import Backend
-from sb3_torcs.backends.native import NativeBackend, track_path
+from sb3_torcs.backends.native import NativeBackend
 from sb3_torcs.backends.scr import ScrBackend
 from sb3_torcs.backends.several import SeveralTracks, is_several
 from sb3_torcs.car import DEFAULT_CAR, StartName, is_count
@@ -20,7 +20,7 @@ from sb3_torcs.envs.racing import RacingEnv, RenderMode
 from sb3_torcs.errors import EnvClosed, InvalidOption, near_miss
 from sb3_torcs.rewards import RewardChoice
 from sb3_torcs.sensors import RangeFinderName
-from sb3_torcs.torcs.installation import find_game
+from sb3_torcs.torcs.installation import find_game, track_path
 from sb3_torcs.torcs.scenery import find_scenery
 from sb3_torcs.torcs.window import ViewName, Window
 

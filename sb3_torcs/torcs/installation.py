@@ -34,6 +34,7 @@ __all__ = [
     "linker_knows",
     "torcs_folders",
     "track_files",
+    "track_path",
     "user_folder",
 ]
 
@@ -277,6 +278,24 @@ def track_files(data: Path) -> dict[str, Path]:
         for path in files
         if path.stem == path.parent.name
     }
+
+
+def track_path(game: Game, track: str | os.PathLike[str]) -> Path:
+    """
+    Find a track of the game, or a file of that format.
+
+    :param game: the installation
+    :param track: a name, or the path of an XML file
+    :return: the path of its XML file, absolute
+    """
+    if not isinstance(track, (str, os.PathLike)) or track == "random":
+        raise InvalidOption(
+            f"track is {track!r}; Torcs-v0 takes the name of an installed track (`sb3-torcs "
+            "tracks` lists them) or the path of a TORCS .xml; random tracks are for TorcsLite-v0"
+        )
+    if os.fspath(track).lower().endswith(".xml"):
+        return Path(os.path.expanduser(track)).absolute()
+    return game.tracks()[game.find_track(os.fspath(track))].absolute()
 
 
 def _given(home: Path | None) -> str | None:
