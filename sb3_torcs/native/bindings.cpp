@@ -11,7 +11,7 @@
 
 #include "engine.h"
 #include "errors.h"
-#include "pool.h"
+#include "fleet.h"
 #include "road.h"
 #include "scr/messages.h"
 
@@ -88,60 +88,11 @@ std::array<double, RANGE_FINDERS> angles_of(const std::vector<double>& angles) {
     return array;
 }
 
-// Several engines that are driven at once. Python keeps them alive.
-class Fleet {
-public:
-    Fleet(const std::vector<Engine*>& engines, int threads)
-        : tasks_(engines.size()),
-          pool_(threads, tasks_.size(), [this](std::size_t i) { work(i); }) {
-        for (std::size_t i = 0; i < engines.size(); i++) {
-            if (!engines[i]) throw py::type_error("engine is None; expected an Engine");
-            tasks_[i].engine = engines[i];
-        }
-    }
-
-    void begin(std::size_t index, const Controls& controls, int ticks) {
-        Task& task = tasks_.at(index);
-        pool_.wait(index);
-        task.controls = controls;
-        task.ticks = ticks;
-        pool_.begin(index);
-    }
-
-    const Reading& wait(std::size_t index) {
-        Task& task = tasks_.at(index);
-        pool_.wait(index);
-        if (task.failure) std::rethrow_exception(task.failure);
-        return task.reading;
-    }
-
-    void finish() { pool_.finish(); }
-
-private:
-    struct Task {
-        Engine* engine;
-        Controls controls;
-        int ticks;
-        Reading reading;
-        std::exception_ptr failure;
-    };
-
-    void work(std::size_t index) {
-        Task& task = tasks_[index];
-        task.failure = nullptr;
-        try {
-            Engine::Access race(*task.engine);
-            Engine::check_agent(*race);
-            race->drive(task.controls, task.ticks);
-            task.reading = task.engine->read(*race, race->agent());
-        } catch (...) {
-            task.failure = std::current_exception();
-        }
-    }
-
-    std::vector<Task> tasks_;
-    Pool pool_;  // last, so that its threads end first
-};
+std::unique_ptr<Fleet> make_fleet(const std::vector<Engine*>& engines, int threads) {
+    for (const Engine* engine : engines)
+        if (!engine) throw py::type_error("engine is None; expected an Engine");
+    return std::make_unique<Fleet>(engines, threads);
+}
 
 // The game's side of the SCR protocol, so that its client can be held to it.
 void bind_scr(py::module_& module) {
@@ -339,8 +290,7 @@ PYBIND11_MODULE(_engine, module) {
         });
 
     py::class_<Fleet>(module, "Fleet", "Engines that are driven at once, on threads that stay.")
-        .def(py::init<const std::vector<Engine*>&, int>(), py::keep_alive<1, 2>(), "engines"_a,
-             "threads"_a)
+        .def(py::init(&make_fleet), py::keep_alive<1, 2>(), "engines"_a, "threads"_a)
         .def("begin",
              [](Fleet& fleet, std::size_t index, double steering, double throttle, double brake,
                 std::optional<int> gear, int ticks, double clutch) {
