@@ -4,7 +4,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 BUILT := $(VENV)/.built
-SOURCES := setup.py $(wildcard sb3_torcs/native/*.* sb3_torcs/native/*/*)
+NATIVE := $(wildcard sb3_torcs/native/*.* sb3_torcs/native/*/*)
+SOURCES := setup.py $(NATIVE)
 SHELL := /bin/bash
 
 # One thread per process: on few cores torch's own threads get in each other's way.
@@ -65,14 +66,20 @@ bench: install ## measure speeds
 format: install ## sort imports and format
 	$(BIN)/ruff check --select I --fix --quiet .
 	$(BIN)/ruff format .
+	$(BIN)/clang-format -i $(NATIVE)
 
 check-codestyle: install ## check the format only
 	$(BIN)/ruff check --select I .
 	$(BIN)/ruff format --check .
+	$(BIN)/clang-format --dry-run --Werror $(NATIVE)
 
 lint: install ## lint code and hyperparameter files
 	$(BIN)/ruff check .
 	$(BIN)/yamllint --strict zoo_configs examples/studies
+	@includes="$$($(BIN)/python -c 'import pybind11, sysconfig; \
+	  print("-isystem", pybind11.get_include(), "-isystem", sysconfig.get_path("include"))')"; set -x; \
+	  printf '%s\n' $(filter %.cpp,$(NATIVE)) | \
+	  xargs -P "$$(nproc)" -I FILE $(BIN)/clang-tidy --quiet FILE -- -std=c++17 $$includes
 
 type: install ## check types
 	$(BIN)/mypy

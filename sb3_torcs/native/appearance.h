@@ -10,7 +10,7 @@ namespace torcs {
 
 // First the scene, then as many cars, in the order of the race.
 struct SceneAppearance {
-    double time;       // [s] since the start
+    double time;  // [s] since the start
     std::int32_t cars_number;
     std::int32_t car_size;  // [bytes] of the record of each
 };

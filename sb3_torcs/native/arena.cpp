@@ -103,9 +103,8 @@ void* Arena::allocate_roomy(std::size_t size) {
 void Arena::release_roomy(void* memory) {
     Head& top = head();
     Roomy* end = top.roomy + top.roomy_number;
-    Roomy* found = std::find_if(top.roomy, end, [memory](const Roomy& roomy) {
-        return roomy.memory == memory;
-    });
+    Roomy* found = std::find_if(top.roomy, end,
+                                [memory](const Roomy& roomy) { return roomy.memory == memory; });
     if (found == end) return release(memory);
     release(found->block);
     *found = end[-1];

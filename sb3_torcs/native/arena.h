@@ -25,9 +25,7 @@ public:
     void release_roomy(void* memory);  // takes any block
 
     std::size_t size_of(const void* memory) const;
-    bool owns(const void* memory) const {
-        return memory >= base_ && memory < base_ + reserve_;
-    }
+    bool owns(const void* memory) const { return memory >= base_ && memory < base_ + reserve_; }
 
     // Forget everything and give the pages back; what comes next lies where it lay the first time.
     void clear();

@@ -2,7 +2,6 @@
 #include <pybind11/numpy.h>
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
-
 #include <unistd.h>
 
 #include <cmath>
@@ -33,7 +32,8 @@ public:
 #else
         const bool ending = _Py_IsFinalizing();
 #endif
-        while (ending) pause();
+        if (ending)
+            for (;;) pause();
         PyEval_RestoreThread(state_);
     }
     WithoutPython(const WithoutPython&) = delete;
@@ -81,8 +81,8 @@ Controls controls_of(double steering, double throttle, double brake, std::option
 
 std::array<double, RANGE_FINDERS> angles_of(const std::vector<double>& angles) {
     if (angles.size() != RANGE_FINDERS)
-        throw Error("InvalidOption", "range finders have " + std::to_string(angles.size()) +
-                                         " angles, expected 19");
+        throw Error("InvalidOption",
+                    "range finders have " + std::to_string(angles.size()) + " angles, expected 19");
     std::array<double, RANGE_FINDERS> array;
     std::copy(angles.begin(), angles.end(), array.begin());
     return array;
@@ -135,6 +135,7 @@ PYBIND11_MODULE(_engine, module) {
     Game::watch_forks();
     module.doc() = "The real TORCS in this process; use it through sb3_torcs.backends.native.";
 
+    // NOLINTNEXTLINE(performance-unnecessary-value-param): pybind11 hands it over so
     py::register_exception_translator([](std::exception_ptr pointer) {
         try {
             if (pointer) std::rethrow_exception(pointer);
@@ -142,8 +143,9 @@ PYBIND11_MODULE(_engine, module) {
             const py::object type =
                 py::module_::import("sb3_torcs.errors").attr(error.python_class);
             // A path in it need not be a text.
-            PyErr_SetObject(type.ptr(), py::reinterpret_steal<py::object>(
-                                            PyUnicode_DecodeFSDefault(error.what())).ptr());
+            PyErr_SetObject(
+                type.ptr(),
+                py::reinterpret_steal<py::object>(PyUnicode_DecodeFSDefault(error.what())).ptr());
         }
     });
 
@@ -203,10 +205,8 @@ PYBIND11_MODULE(_engine, module) {
         .def("set_origin", &Engine::set_origin, "Move the positions that are read by x and y [m].")
         .def("save", &Engine::save)
         .def("restore", &Engine::restore)
-        .def("focus",
-             [](Engine& engine, int car, double direction) {
-                 return read_only(engine.focus(car, direction));
-             })
+        .def("focus", [](Engine& engine, int car,
+                         double direction) { return read_only(engine.focus(car, direction)); })
         .def("appearance", [](Engine& engine) { return py::bytes(engine.appearance()); })
         .def("close", &Engine::close)
         .def("controls",
@@ -255,13 +255,12 @@ PYBIND11_MODULE(_engine, module) {
                  const Engine::Access race(engine);
                  const TrackData& track = race->track();
                  const Segment& first = *track.last->next;
-                 return py::dict("name"_a = track.name, "length"_a = track.length,
-                                 "width"_a = track.width, "segments"_a = track.segments_number,
-                                 "x"_a = 0.5 * (first.vertex[START_LEFT].x +
-                                                first.vertex[START_RIGHT].x),
-                                 "y"_a = 0.5 * (first.vertex[START_LEFT].y +
-                                                first.vertex[START_RIGHT].y),
-                                 "heading"_a = first.heading);
+                 return py::dict(
+                     "name"_a = track.name, "length"_a = track.length, "width"_a = track.width,
+                     "segments"_a = track.segments_number,
+                     "x"_a = 0.5 * (first.vertex[START_LEFT].x + first.vertex[START_RIGHT].x),
+                     "y"_a = 0.5 * (first.vertex[START_LEFT].y + first.vertex[START_RIGHT].y),
+                     "heading"_a = first.heading);
              })
         .def("road",
              [](Engine& engine) {
@@ -279,6 +278,7 @@ PYBIND11_MODULE(_engine, module) {
                                  "controls have " + std::to_string(rows.shape(1)) +
                                      " columns; expected 3: steering, throttle, brake");
                  std::vector<Controls> list;
+                 list.reserve(static_cast<std::size_t>(rows.shape(0)));
                  for (py::ssize_t i = 0; i < rows.shape(0); i++)
                      list.push_back(controls_of(rows(i, 0), rows(i, 1), rows(i, 2), {}, 0.0));
                  const WithoutPython released;
@@ -291,15 +291,15 @@ PYBIND11_MODULE(_engine, module) {
 
     py::class_<Fleet>(module, "Fleet", "Engines that are driven at once, on threads that stay.")
         .def(py::init(&make_fleet), py::keep_alive<1, 2>(), "engines"_a, "threads"_a)
-        .def("begin",
-             [](Fleet& fleet, std::size_t index, double steering, double throttle, double brake,
-                std::optional<int> gear, int ticks, double clutch) {
-                 const Controls controls = controls_of(steering, throttle, brake, gear, clutch);
-                 const WithoutPython released;
-                 fleet.begin(index, controls, ticks);
-             },
-             "index"_a, "steering"_a, "throttle"_a, "brake"_a, "gear"_a, "ticks"_a,
-             "clutch"_a = 0.0)
+        .def(
+            "begin",
+            [](Fleet& fleet, std::size_t index, double steering, double throttle, double brake,
+               std::optional<int> gear, int ticks, double clutch) {
+                const Controls controls = controls_of(steering, throttle, brake, gear, clutch);
+                const WithoutPython released;
+                fleet.begin(index, controls, ticks);
+            },
+            "index"_a, "steering"_a, "throttle"_a, "brake"_a, "gear"_a, "ticks"_a, "clutch"_a = 0.0)
         .def("wait",
              [](Fleet& fleet, std::size_t index) {
                  const Reading* reading;

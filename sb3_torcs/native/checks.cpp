@@ -145,8 +145,8 @@ void check_track(const TrackData* track, const Params& file, const std::string& 
         address = segment.next;
         length += next.length;
         if (!(std::isfinite(next.length) && next.length > 0.0f))
-            throw Error("TrackFileError", path + " has a segment that is " +
-                                              std::to_string(next.length) + " m long");
+            throw Error("TrackFileError",
+                        path + " has a segment that is " + std::to_string(next.length) + " m long");
         check_strips(probe, next, path);
         // Range finders would look past its other end.
         if (next.type != STRAIGHT && !(next.arc <= HALF_CIRCLE))

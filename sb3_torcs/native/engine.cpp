@@ -49,9 +49,8 @@ CarAppearance appearance_of(const CarElement& car) {
 
 Engine::Engine(Game& game, RaceOptions options, std::array<double, RANGE_FINDERS> angles)
     : angles_(angles), forks_(count_forks()) {
-    const auto agents =
-        std::count_if(options.entries.begin(), options.entries.end(),
-                      [](const Entry& entry) { return entry.module.empty(); });
+    const auto agents = std::count_if(options.entries.begin(), options.entries.end(),
+                                      [](const Entry& entry) { return entry.module.empty(); });
     if (options.entries.empty() || agents > 1)
         throw Error("InvalidOption", std::to_string(options.entries.size()) + " drivers, " +
                                          std::to_string(agents) +
@@ -146,8 +145,8 @@ void Engine::check_car(const Race& race, int car) {
 std::string Engine::appearance() {
     Access race(*this);
     std::string looks;
-    append(looks, SceneAppearance{race->situation().time, race->cars_number(),
-                                  sizeof(CarAppearance)});
+    append(looks,
+           SceneAppearance{race->situation().time, race->cars_number(), sizeof(CarAppearance)});
     for (int i = 0; i < race->cars_number(); i++) append(looks, appearance_of(*race->cars()[i]));
     return looks;
 }

@@ -42,8 +42,7 @@ void Game::watch_forks() {
         if (*opened) (*opened)->mutex.unlock();
         opening.unlock();
     };
-    static const int watching =
-        pthread_atfork([] { lock(); }, [] { unlock(); }, [] { unlock(); });
+    static const int watching = pthread_atfork([] { lock(); }, [] { unlock(); }, [] { unlock(); });
     (void)watching;
 }
 
@@ -132,8 +131,7 @@ int Params::misfits(const Params& reference) const {
 
 Params Params::merge(Params reference, Params own) {
     Game& game = *reference.game_;
-    void* merged =
-        game.merge_(reference.release(), own.release(), MERGE_BOTH | MERGE_RELEASES);
+    void* merged = game.merge_(reference.release(), own.release(), MERGE_BOTH | MERGE_RELEASES);
     return {game, merged};
 }
 

@@ -19,7 +19,7 @@ public:
     static Game& open(const std::string& data, const std::string& libraries,
                       const std::string& plib);
 
-    const std::string data;       // each ends in a slash
+    const std::string data;  // each ends in a slash
     const std::string libraries;
 
     // Held while races are loaded and closed: parameter files are one list for all of them, and so

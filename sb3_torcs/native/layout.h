@@ -54,8 +54,8 @@ struct Surface {
 
 struct Barrier {
     int style;
-    float width;       // [m]
-    float height;      // [m]
+    float width;   // [m]
+    float height;  // [m]
     Surface* surface;
     Unused<8> a_;
 };
@@ -63,23 +63,23 @@ struct Barrier {
 struct Segment {
     const char* name;
     int id;
-    int type;          // SegmentType
+    int type;  // SegmentType
     Unused<8> a_;
-    float length;      // [m] of its middle
-    float width;       // [m]
+    float length;  // [m] of its middle
+    float width;   // [m]
     float start_width;
     float end_width;
     float from_start;  // [m] of its beginning, from the start line
     float radius;      // [m] of its middle, 0 if straight
     float radius_right;
     float radius_left;
-    float arc;         // [rad]
+    float arc;  // [rad]
     Point center;
-    Point vertex[4];   // Vertex
-    float heading;     // [rad] of its beginning
+    Point vertex[4];  // Vertex
+    float heading;    // [rad] of its beginning
     Unused<24> b_;
     Unused<8> c_;
-    float widening;    // [m/m] or [m/rad]
+    float widening;  // [m/m] or [m/rad]
     Unused<12> d_;
     Unused<8> e_;
     unsigned race_info;
@@ -105,20 +105,20 @@ struct CarElement;
 
 struct Pit {
     TrackPosition pos;
-    int occupied_by;   // place in `cars`, -1 if free
-    float from, to;    // [m] along the road where a car can stop
+    int occupied_by;  // place in `cars`, -1 if free
+    float from, to;   // [m] along the road where a car can stop
     int cars_number;
     CarElement* cars[4];
 };
 
 struct Pits {
-    int type;          // 1: beside the road
+    int type;  // 1: beside the road
     int number;
     Unused<4> a_;
-    int side;          // SegmentType of that side's turn
-    float length;      // [m] of one
+    int side;      // SegmentType of that side's turn
+    float length;  // [m] of one
     float width;
-    float speed_limit; // [m/s]
+    float speed_limit;  // [m/s]
     Segment* entry;
     Unused<16> b_;
     Segment* exit;
@@ -139,7 +139,7 @@ struct TrackData {
     float length;
     float width;
     Pits pits;
-    Segment* last;     // whose next is the first after the start line
+    Segment* last;  // whose next is the first after the start line
     Unused<8> c_;
     Unused<24> d_;
     Unused<64> e_;
@@ -172,9 +172,9 @@ struct CarInfo {
     int race_number;
     int start_rank;
     int driver_type;
-    int skill;         // 0 rookie to 3 professional
+    int skill;  // 0 rookie to 3 professional
     Unused<12> a_;
-    Point dimension;   // [m]
+    Point dimension;  // [m]
     Unused<24> b_;
     float tank;        // [l]
     float steer_lock;  // [rad]
@@ -184,17 +184,17 @@ struct CarInfo {
 };
 
 struct CarPublic {
-    Motion local;      // in the car's axes, but its position
-    Motion global;     // in the track's frame
-    float speed;       // [m/s]
+    Motion local;   // in the car's axes, but its position
+    Motion global;  // in the track's frame
+    float speed;    // [m/s]
     Unused<64> a_;
     TrackPosition track;
-    int status;        // CarStatus
+    int status;  // CarStatus
     Pose corner[4];
 };
 
 struct Penalty {
-    int kind;          // 1: drive through, 2: stop and go
+    int kind;  // 1: drive through, 2: stop and go
     int lap_to_clear;
     Penalty* next;
     Penalty** prev;
@@ -206,25 +206,25 @@ struct PenaltyList {
 };
 
 struct CarRace {
-    double best_lap_time;     // [s]
-    bool best_lap_counts;     // a lap that hit a wall or cut a corner does not
+    double best_lap_time;  // [s]
+    bool best_lap_counts;  // a lap that hit a wall or cut a corner does not
     double delta_best_lap_time;
     double lap_time;
     double last_lap_time;
     double total_time;
     float top_speed;
     float lowest_speed;
-    int crossings;            // of the start line: whole laps and one
+    int crossings;  // of the start line: whole laps and one
     int pit_stops;
     int remaining_laps;
-    int position;             // 1 is the leader
-    double behind_leader;     // [s]
+    int position;          // 1 is the leader
+    double behind_leader;  // [s]
     int laps_behind_leader;
     double behind_previous;
     double before_next;
-    float distance_raced;     // [m]
+    float distance_raced;  // [m]
     float distance_from_start;
-    double event_time;        // [s] at which a pit stop ends
+    double event_time;  // [s] at which a pit stop ends
     Pit* pit;
     Unused<8> a_;
     PenaltyList penalties;
@@ -232,8 +232,8 @@ struct CarRace {
 };
 
 struct WheelState {
-    Pose pos;          // against the mass centre
-    float spin;        // [rad/s]
+    Pose pos;    // against the mass centre
+    float spin;  // [rad/s]
     Unused<12> a_;
     Segment* segment;
     Unused<4> b_;
@@ -252,9 +252,9 @@ struct CarPrivate {
     WheelState wheel[4];
     Unused<96> a_;
     int gear;
-    float fuel;            // [l]
-    float engine_speed;    // [rad/s]
-    float red_line;        // [rad/s] at which the limiter cuts in
+    float fuel;          // [l]
+    float engine_speed;  // [rad/s]
+    float red_line;      // [rad/s] at which the limiter cuts in
     Unused<20> b_;
     float gear_ratio[MAX_GEARS];  // reverse, neutral, first and up
     int gears_number;             // forward ones and neutral
@@ -262,17 +262,17 @@ struct CarPrivate {
     Unused<36> c_;
     int collision;
     Unused<28> d_;
-    int damage;            // [points]
+    int damage;  // [points]
     Unused<4> e_;
-    int dents;             // to be made in the body that is drawn
+    int dents;  // to be made in the body that is drawn
     Unused<24> f_;
 };
 
 struct Control {
-    float steering;    // [-1, 1], left positive
-    float throttle;    // [0, 1]
-    float brake;       // [0, 1]
-    float clutch;      // [0, 1], 1 is pressed
+    float steering;  // [-1, 1], left positive
+    float throttle;  // [0, 1]
+    float brake;     // [0, 1]
+    float clutch;    // [0, 1], 1 is pressed
     int gear;
     int race_command;
     char message[4][NAME_LENGTH];
@@ -281,9 +281,9 @@ struct Control {
 };
 
 struct PitCommand {
-    float fuel;        // [l] to take in
-    int repair;        // [points] to mend
-    int stop_type;     // 0: repair, 1: stop and go
+    float fuel;     // [l] to take in
+    int repair;     // [points] to mend
+    int stop_type;  // 0: repair, 1: stop and go
     unsigned char setup[936];
 };
 
@@ -320,14 +320,14 @@ constexpr double ROBOT_STEP = 0.02;     // [s] least time between two calls of a
 struct Situation {
     int cars_number;
     int laps;
-    int state;         // RaceState
-    int type;          // RaceType
+    int state;  // RaceState
+    int type;   // RaceType
     int max_damage;
     Unused<8> a_;
-    double delta_time; // [s] since the robots were called
-    double time;       // [s] since the start
+    double delta_time;  // [s] since the robots were called
+    double time;        // [s] since the start
     Unused<8> b_;
-    CarElement** cars; // in the order of the race
+    CarElement** cars;  // in the order of the race
 };
 
 struct RaceManager;
@@ -373,8 +373,8 @@ enum EngineState : int { LOAD_EVENT = 1 };
 // What the race engine keeps about a car beside the shared record.
 struct CarProgress {
     TrackPosition previous;
-    float lap_began;      // [s]
-    int backwards;        // crossings of the line that have to be made up for
+    float lap_began;  // [s]
+    int backwards;    // crossings of the line that have to be made up for
     Unused<40> a_;
 };
 
@@ -383,23 +383,23 @@ struct RaceManager {
     CarElement* cars;
     Situation* situation;
     TrackData* track;
-    void* params;         // of the race's file
+    void* params;  // of the race's file
     void* results;
     Unused<16> a_;
-    int state;            // EngineState
+    int state;  // EngineState
     Unused<8> b_;
     TrackInterface tracks;
     Graphics graphics;
     Simulation simulation;
     Unused<16> c_;
-    char* file_name;      // of the race, without folder and ending
+    char* file_name;  // of the race, without folder and ending
     const char* name;
     const char* race_name;
     CarProgress* progress;  // of each car, in the order of `cars`
-    double time;          // [s] on the game's clock that the simulation has come to
-    double robots_time;   // [s] since the start, when the robots were called
+    double time;            // [s] on the game's clock that the simulation has come to
+    double robots_time;     // [s] since the start, when the robots were called
     double time_factor;
-    int running;          // 0 while paused
+    int running;  // 0 while paused
     int display_mode;
     Unused<80> e_;
 };
@@ -408,12 +408,12 @@ struct RaceManager {
 
 struct SimulatedWheel {
     Unused<156> a_;
-    float spin;            // [rad/s]
+    float spin;  // [rad/s]
     float previous_spin;
     Unused<116> b_;
-    float radius;          // [m]
+    float radius;  // [m]
     Unused<56> c_;
-    float axle_spin;       // [rad/s] of the shaft that drives it
+    float axle_spin;  // [rad/s] of the shaft that drives it
     Unused<40> d_;
 };
 
@@ -426,9 +426,9 @@ struct SimulatedCar {
     Unused<120> b_;
     int gear;
     Unused<564> c_;
-    float engine_speed;    // [rad/s]
+    float engine_speed;  // [rad/s]
     Unused<76> d_;
-    float fuel;            // [l]
+    float fuel;  // [l]
     Motion local;
     Motion global;
     Unused<544> e_;

@@ -48,9 +48,10 @@ void release(void* memory) {
         free(memory);
 }
 
-// The plans of some robots (inferno, lliaw, tita) are rings of 25 kB, whose index gets below zero when
-// the car is pushed back over the ring's beginning: the remainder of a negative number. In the game
-// they then use what lies before, and crash it sooner or later. With room there the ring is whole.
+// The plans of some robots (inferno, lliaw, tita) are rings of 25 kB, whose index gets below zero
+// when the car is pushed back over the ring's beginning: the remainder of a negative number. In the
+// game they then use what lies before, and crash it sooner or later. With room there the ring is
+// whole.
 constexpr std::size_t SMALLEST_RING = 4 << 10, LARGEST_RING = 64 << 10;
 
 void* allocate_array(std::size_t size) {
@@ -243,8 +244,7 @@ void check_whole(const std::vector<char>& bytes, const std::string& path, const 
         const auto* part = reinterpret_cast<const ElfW(Phdr)*>(bytes.data() + header->e_phoff) + i;
         whole = part->p_offset <= bytes.size() && part->p_filesz <= bytes.size() - part->p_offset;
     }
-    if (!whole)
-        throw Error(error, path + " is no library, or only a part of one" + REINSTALL);
+    if (!whole) throw Error(error, path + " is no library, or only a part of one" + REINSTALL);
 }
 
 std::vector<char> read_library(const std::string& path, const char* error) {
@@ -264,8 +264,8 @@ void forget_needs(std::vector<char>& bytes, const std::string& folder) {
     };
     const auto* header = reinterpret_cast<ElfW(Ehdr)*>(at(0, sizeof(ElfW(Ehdr))));
     if (!header || std::memcmp(header->e_ident, ELFMAG, SELFMAG) != 0) return;
-    const auto* parts = reinterpret_cast<ElfW(Phdr)*>(
-        at(header->e_phoff, header->e_phnum * sizeof(ElfW(Phdr))));
+    const auto* parts =
+        reinterpret_cast<ElfW(Phdr)*>(at(header->e_phoff, header->e_phnum * sizeof(ElfW(Phdr))));
     if (!parts) return;
     ElfW(Dyn)* first = nullptr;
     std::size_t number = 0;
@@ -279,9 +279,8 @@ void forget_needs(std::vector<char>& bytes, const std::string& folder) {
     for (std::size_t i = 0; i < number; i++)
         if (first[i].d_tag == DT_STRTAB) names = first[i].d_un.d_ptr;
     for (int i = 0; i < header->e_phnum; i++) {
-        const ElfW(Phdr)& part = parts[i];
-        if (part.p_type != PT_LOAD || names < part.p_vaddr ||
-            names >= part.p_vaddr + part.p_filesz)
+        const ElfW(Phdr) & part = parts[i];
+        if (part.p_type != PT_LOAD || names < part.p_vaddr || names >= part.p_vaddr + part.p_filesz)
             continue;
         const std::size_t begin = names - part.p_vaddr + part.p_offset;
         for (std::size_t j = 0; j < number && first[j].d_tag != DT_NULL; j++) {
@@ -381,8 +380,7 @@ Library& Library::shared(const std::string& path, bool race_memory) {
         read_library(path, "GameIncomplete");
         void* handle = dlopen(path.c_str(), RTLD_NOW | RTLD_GLOBAL);
         if (!handle)
-            throw Error("GameIncomplete",
-                        path + " will not load: " + loader_message() + REINSTALL);
+            throw Error("GameIncomplete", path + " will not load: " + loader_message() + REINSTALL);
         library.reset(new Library(path, handle, race_memory));
     }
     return *library;
@@ -436,18 +434,32 @@ void Library::redirect_imports(bool race_memory) const {
     const ElfW(Sym)* symbols = nullptr;
     const char* names = nullptr;
     struct Table {
-        const ElfW(Rela)* first = nullptr;
+        const ElfW(Rela) * first = nullptr;
         std::size_t size = 0;
     } data, calls;
     for (const ElfW(Dyn)* entry = map->l_ld; entry->d_tag != DT_NULL; entry++) {
         const ElfW(Addr) address = entry->d_un.d_ptr;
         switch (entry->d_tag) {
-            case DT_SYMTAB: symbols = reinterpret_cast<const ElfW(Sym)*>(address); break;
-            case DT_STRTAB: names = reinterpret_cast<const char*>(address); break;
-            case DT_RELA: data.first = reinterpret_cast<const ElfW(Rela)*>(address); break;
-            case DT_RELASZ: data.size = entry->d_un.d_val; break;
-            case DT_JMPREL: calls.first = reinterpret_cast<const ElfW(Rela)*>(address); break;
-            case DT_PLTRELSZ: calls.size = entry->d_un.d_val; break;
+            case DT_SYMTAB:
+                symbols = reinterpret_cast<const ElfW(Sym)*>(address);
+                break;
+            case DT_STRTAB:
+                names = reinterpret_cast<const char*>(address);
+                break;
+            case DT_RELA:
+                data.first = reinterpret_cast<const ElfW(Rela)*>(address);
+                break;
+            case DT_RELASZ:
+                data.size = entry->d_un.d_val;
+                break;
+            case DT_JMPREL:
+                calls.first = reinterpret_cast<const ElfW(Rela)*>(address);
+                break;
+            case DT_PLTRELSZ:
+                calls.size = entry->d_un.d_val;
+                break;
+            default:
+                break;
         }
     }
     const auto replacement = [race_memory](const std::string& import) -> void* {
@@ -465,8 +477,8 @@ void Library::redirect_imports(bool race_memory) const {
     const auto page = static_cast<std::uintptr_t>(sysconf(_SC_PAGESIZE));
     for (const Table& table : {data, calls}) {
         for (std::size_t i = 0; i < table.size / sizeof(ElfW(Rela)); i++) {
-            const ElfW(Rela)& relocation = table.first[i];
-            const ElfW(Sym)& symbol = symbols[ELF64_R_SYM(relocation.r_info)];
+            const ElfW(Rela) & relocation = table.first[i];
+            const ElfW(Sym) & symbol = symbols[ELF64_R_SYM(relocation.r_info)];
             if (symbol.st_name == 0 || symbol.st_shndx != SHN_UNDEF) continue;
             void* target = replacement(names + symbol.st_name);
             if (!target) continue;
@@ -480,8 +492,7 @@ void Library::redirect_imports(bool race_memory) const {
 
 Variables Library::save() const {
     Variables saved;
-    for (const Range& range : variables_)
-        saved.emplace_back(range.begin, range.begin + range.size);
+    for (const Range& range : variables_) saved.emplace_back(range.begin, range.begin + range.size);
     return saved;
 }
 

@@ -1,13 +1,14 @@
 // The process that started the game, for the libraries of ours inside it.
 #pragma once
 
+#include <unistd.h>
+
 #include <chrono>
 #include <cstdlib>
 #include <filesystem>
 #include <string>
 #include <system_error>
 #include <thread>
-#include <unistd.h>
 
 namespace torcs {
 

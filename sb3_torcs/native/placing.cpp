@@ -37,8 +37,8 @@ bool is_valid(const Start& start, double track_length) {
            start.speed >= 0.0 && start.speed <= 200.0;
 }
 
-void place(const Field& field, CarElement& car, float distance, float to_right,
-           float heading_error, float height) {
+void place(const Field& field, CarElement& car, float distance, float to_right, float heading_error,
+           float height) {
     Segment* segment = segment_at(*field.manager->track, distance);
     const float along = distance - segment->from_start;
     car.pub.local = Motion{};

@@ -23,7 +23,7 @@ constexpr float SHIFT_UP = 8500.0f / 9152.0f;
 struct Field {
     CarElement* cars;
     int number;
-    int agent;                     // the car that a start is meant for
+    int agent;  // the car that a start is meant for
     RaceManager* manager;
     const Simulation* simulation;
     SimulatedCar* const* simulated;  // the simulation's own cars
@@ -35,8 +35,8 @@ struct Field {
 bool is_valid(const Start& start, double track_length);
 
 // Puts a car down, standing still; `height` [m] is that of its mass centre over the road.
-void place(const Field& field, CarElement& car, float distance, float to_right,
-           float heading_error, float height);
+void place(const Field& field, CarElement& car, float distance, float to_right, float heading_error,
+           float height);
 
 float height_over_road(const Field& field, const CarElement& car);  // [m] of the mass centre
 
@@ -44,8 +44,8 @@ float height_over_road(const Field& field, const CarElement& car);  // [m] of th
 void settle(const Field& field, Situation& situation, int steps, bool in_gear);
 
 // Puts down cars that are on the grid, each at the height at which it stands, in the gear for the
-// speed. Returns where each is on the road [m], without rounds taken off: it can be before the start
-// line, or a lap further. Drivers are to be told of the race then, and not before.
+// speed. Returns where each is on the road [m], without rounds taken off: it can be before the
+// start line, or a lap further. Drivers are to be told of the race then, and not before.
 std::vector<double> put_down(const Field& field, const Start& start,
                              const std::vector<float>& rest_heights);
 

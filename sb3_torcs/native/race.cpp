@@ -18,7 +18,7 @@ constexpr std::size_t RACE_MEMORY = std::size_t{128} << 20;  // reserved; a full
 constexpr std::size_t TRACK_MEMORY = std::size_t{64} << 20;
 
 constexpr float PIT_LENGTH = 15.0f, SHORTEST_PIT = 1.0f;  // [m] by default; longer than nothing
-constexpr double COUNTDOWN = -2.0;   // [s]
+constexpr double COUNTDOWN = -2.0;                        // [s]
 constexpr int SETTLING_STEPS = 500;  // of standing on the brake, so that the springs come to rest
 constexpr int MANY_LAPS = 1 << 30;
 
@@ -74,9 +74,7 @@ void no_shutdown(int) {}
     throw Error(error, path + ": " + reason);
 }
 
-Robot agent_robot() {
-    return {no_track, no_race, no_race, no_race, no_pit, no_shutdown, 0};
-}
+Robot agent_robot() { return {no_track, no_race, no_race, no_race, no_pit, no_shutdown, 0}; }
 
 }  // namespace
 
@@ -123,11 +121,11 @@ void Race::close() {
             CarElement& car = world_->cars[i];
             try {
                 if (i < set_up_ && car.robot->shutdown) car.robot->shutdown(car.robot->index);
-            } catch (const Error&) {
+            } catch (const Error&) {  // NOLINT(bugprone-empty-catch)
                 // Its memory goes with the race all the same.
             }
-            Params(game_, car.priv.driver_params);
-            Params(game_, car.priv.car_params);
+            const Params car_params(game_, car.priv.car_params);  // releases it
+            const Params driver_params(game_, car.priv.driver_params);
         }
     }
     if (track_) {
@@ -197,8 +195,8 @@ void Race::load_cars() {
     Hosted hosted(host_);
     session_ = Params::read(game_, "config/raceman/" + options_.session + ".xml");
     if (!session_)
-        throw Error("GameIncomplete", game_.data + "config/raceman/" + options_.session +
-                                          ".xml: " + printed());
+        throw Error("GameIncomplete",
+                    game_.data + "config/raceman/" + options_.session + ".xml: " + printed());
     race_name_ = session_.text("Races/1", "name");
     simulation_library_ = game_.take_module("modules/simu", "simuv2");
     ModuleInfo module = module_info(*simulation_library_, "simuv2", 0);
@@ -362,8 +360,8 @@ void Race::place_on_grid(CarElement& car) {
 }
 
 Field Race::field() const {
-    return {world_->cars, cars_number(),    agent_,          &world_->manager,
-            &simulation_, simulated_,       game_.to_global, game_.road_height};
+    return {world_->cars, cars_number(), agent_,          &world_->manager,
+            &simulation_, simulated_,    game_.to_global, game_.road_height};
 }
 
 void Race::assign_pits() {
@@ -580,8 +578,8 @@ void Race::shift(CarElement& car) const {
         engine_speed = std::max(car.pub.local.vel.x, 0.0f) / radius * ratio[gear];
         if (gear == 1) {
             const float launch = LAUNCH_CLUTCH * std::max(1.0f - engine_speed / shift_up, 0.0f);
-            car.control.clutch = std::max(
-                car.control.clutch, std::floor(launch * CLUTCH_STEPS + 0.5f) / CLUTCH_STEPS);
+            car.control.clutch = std::max(car.control.clutch,
+                                          std::floor(launch * CLUTCH_STEPS + 0.5f) / CLUTCH_STEPS);
         }
     }
     car.control.gear = gear;

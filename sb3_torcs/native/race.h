@@ -33,7 +33,7 @@ struct RaceOptions {
     std::string session;  // of the game's race managers, "practice" or "quickrace"
     std::string car;      // the agent's
     std::vector<Entry> entries;
-    int laps = 0;         // 0 drives on
+    int laps = 0;  // 0 drives on
     Gearbox gearbox = Gearbox::ENGINE_SPEED;
 };
 
@@ -46,19 +46,19 @@ struct Controls {
 constexpr int AUTOMATIC_GEAR = -100;
 
 struct LapRecord {
-    double time;       // [s]
-    int damage;        // [points] at its end
-    float top_speed;   // [m/s]
+    double time;      // [s]
+    int damage;       // [points] at its end
+    float top_speed;  // [m/s]
     float lowest_speed;
 };
 
 struct Result {
-    int entry;          // place in the starting list
+    int entry;  // place in the starting list
     int laps;
     double total_time;  // [s] with penalties
     double best_lap;    // [s], 0 if none counts
     int damage;
-    bool out;           // did not finish
+    bool out;  // did not finish
 };
 
 struct Snapshot {
@@ -112,8 +112,8 @@ public:
     const CarElement& car(int index) const { return world_->cars[index]; }
     CarElement* const* cars() const { return world_->order; }
     int cars_number() const { return world_->situation.cars_number; }
-    int agent() const { return agent_; }  // -1 if there is none
-    float height(int index) const;        // [m] of the mass centre above the road
+    int agent() const { return agent_; }     // -1 if there is none
+    float height(int index) const;           // [m] of the mass centre above the road
     double distance_raced(int index) const;  // [m] since the start
     std::vector<LapRecord> laps(int index) const;
     std::vector<Result> results() const;  // in the order of a race's standings
@@ -122,21 +122,21 @@ private:
     // What the race engine keeps about a car beside the shared record.
     struct Record {
         TrackPosition previous;
-        float lap_began;           // [s]
-        int backwards;             // crossings of the line that have to be made up for
-        double pit_time;           // [s] of the present stop
+        float lap_began;  // [s]
+        int backwards;    // crossings of the line that have to be made up for
+        double pit_time;  // [s] of the present stop
         float top_speed, lowest_speed;
-        int lane_state;            // of race_rules.cpp
-        double start_distance;     // [m] by the race's count, where the episode began
-        bool finished;             // drove all its laps
-        bool flying;               // began on the way: the first crossing starts the clock
+        int lane_state;         // of race_rules.cpp
+        double start_distance;  // [m] by the race's count, where the episode began
+        bool finished;          // drove all its laps
+        bool flying;            // began on the way: the first crossing starts the clock
         LapRecord* laps;
         int laps_number, laps_room;
     };
     struct World {
         Situation situation;
         RaceManager manager;
-        double last_call;          // [s] when drivers were called
+        double last_call;  // [s] when drivers were called
         Controls controls;
         CarElement** order;
         CarElement* cars;
@@ -211,7 +211,7 @@ private:
     World* world_ = nullptr;
     SimulatedCar** simulated_ = nullptr;
     int agent_ = -1;
-    int set_up_ = 0;  // drivers that know the track
+    int set_up_ = 0;                   // drivers that know the track
     std::vector<float> rest_heights_;  // [m] of each car's mass centre over the road, standing
     Snapshot unannounced_, on_grid_;
 };

@@ -50,8 +50,8 @@ void Race::measure_distance(CarElement& car) {
     const TrackPosition& position = car.pub.track;
     const Segment& segment = *position.segment;
     car.race.distance_from_start =
-        segment.from_start + (segment.type == STRAIGHT ? position.to_start
-                                                       : position.to_start * segment.radius);
+        segment.from_start +
+        (segment.type == STRAIGHT ? position.to_start : position.to_start * segment.radius);
     const int whole = car.race.crossings - (world_->records[car.index].backwards + 1);
     car.race.distance_raced =
         static_cast<float>(whole) * track_->length + car.race.distance_from_start;
@@ -186,10 +186,9 @@ void Race::stop_in_pit(CarElement& car, Record& record) {
     const PitCommand& command = car.pit_command;
     const double now = world_->situation.time;
     if (command.stop_type == 0) {
-        record.pit_time = rules_.pit_base_time +
-                          std::fabs(double(command.fuel)) / rules_.fuel_flow +
-                          float(std::fabs(double(command.repair))) * rules_.repair_factor +
-                          car.race.penalty_time;
+        record.pit_time =
+            rules_.pit_base_time + std::fabs(double(command.fuel)) / rules_.fuel_flow +
+            float(std::fabs(double(command.repair))) * rules_.repair_factor + car.race.penalty_time;
         const bool free_setup = world_->situation.type != RACE;
         game_.init_pit_setup(car.priv.car_params, car.pit_command.setup, free_setup);
     } else {
@@ -343,9 +342,9 @@ std::vector<Result> Race::results() const {
             Standing &ahead = standings[j - 1], &behind = standings[j];
             if (!(ahead.penalty > 0.0f)) break;
             const int laps = laps_of(*ahead.car), others = laps_of(*behind.car);
-            comparable = laps >= 1 && others >= 1 &&
-                         std::max(ahead.car->priv.damage, behind.car->priv.damage) <=
-                             situation.max_damage;
+            comparable =
+                laps >= 1 && others >= 1 &&
+                std::max(ahead.car->priv.damage, behind.car->priv.damage) <= situation.max_damage;
             if (!comparable) break;
             const float time = ahead.car->race.total_time + ahead.penalty;
             const float other =

@@ -15,7 +15,7 @@ constexpr double SENSOR_RANGE = 200.0;  // [m] of range finders and of opponent 
 constexpr int RANGE_FINDERS = 19;
 constexpr int FOCUS_BEAMS = 5;
 constexpr int OPPONENT_SECTORS = 36;
-constexpr double OFF_TRACK = -1.0;      // what range finders read beside the road
+constexpr double OFF_TRACK = -1.0;  // what range finders read beside the road
 
 // Direction of the road at the car minus its yaw, [rad] in [-pi, pi]: positive when the car points
 // to the right of the road.

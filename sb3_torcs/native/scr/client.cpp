@@ -137,8 +137,8 @@ std::optional<Action> Client::ask(const State& state) {
     owed_++;
     const bool forever = deadline_ == Clock::duration::zero();
     const Clock::time_point until = Clock::now() + deadline_;
-    // Who answers state after state, and was late, answers the older ones first. Taken for the answer
-    // to this one, they would keep him behind for the rest of the race.
+    // Who answers state after state, and was late, answers the older ones first. Taken for the
+    // answer to this one, they would keep him behind for the rest of the race.
     while (!ending() && !wants_restart() && (!answer_ || (owed_ > 0 && !forever))) {
         watch_owner();
         const Clock::time_point next = Clock::now() + WATCH;
@@ -256,9 +256,7 @@ void Client::adopt(std::string_view text) {
     if (is_first) note(init_.name.empty() ? "drives" : "drives, and calls itself " + name_);
 }
 
-bool Client::is_silent() const {
-    return awaited_ && Clock::now() - awaited_since_ >= SILENCE;
-}
+bool Client::is_silent() const { return awaited_ && Clock::now() - awaited_since_ >= SILENCE; }
 
 bool Client::was_refused() const {
     return sender_size_ == refused_size_ && std::memcmp(&sender_, &refused_, refused_size_) == 0;

@@ -59,7 +59,7 @@ private:
     using Clock = std::chrono::steady_clock;
 
     bool look(Clock::time_point until);
-    bool wait(Clock::time_point until);  // whether a datagram came
+    bool wait(Clock::time_point until);         // whether a datagram came
     std::optional<std::string_view> receive();  // the next one that has come
     bool is_from_client() const;
     bool wants_restart() const;

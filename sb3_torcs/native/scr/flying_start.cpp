@@ -17,8 +17,8 @@ FlyingStart& flying_start() {
 void FlyingStart::put_down(const Simulation& simulation, int cars, bool once_more) {
     simulation_ = simulation;
     simulated_ = simulated_cars(simulation);
-    field_ = {ReInfo->cars, cars, field_.agent, ReInfo, &simulation_, simulated_, to_global,
-              road_height};
+    field_ = {ReInfo->cars, cars,       field_.agent, ReInfo,
+              &simulation_, simulated_, to_global,    road_height};
     stands_ = once_more && wanted_;
     flying_ = again_ = false;
     if (stands_) distances_ = torcs::put_down(field_, start_, rest_heights_);
@@ -82,8 +82,8 @@ void FlyingStart::drive_off(Situation& situation) {
         const auto place = static_cast<std::size_t>(i);
         car.control = controls_[place];
         give_speed(field_, car, start_.speed);
-        const int ahead = crossings_of(car, distances_[place], ReInfo->track->length,
-                                       start_.distance == 0.0);
+        const int ahead =
+            crossings_of(car, distances_[place], ReInfo->track->length, start_.distance == 0.0);
         car.race.crossings = std::max(ahead, 0);
         car.race.remaining_laps -= car.race.crossings;
         ReInfo->progress[i].previous = car.pub.track;  // it may have settled across the line

@@ -47,9 +47,9 @@ private:
     Start start_{};
     bool wanted_ = false, stands_ = false, flying_ = false, refused_ = false, again_ = false;
     std::vector<double> distances_;
-    std::vector<Control> controls_;      // with which the field drives off
-    std::vector<float> rest_heights_;    // [m] of each car's mass centre over the road, standing
-    const TrackData* track_ = nullptr;   // on which these were measured
+    std::vector<Control> controls_;     // with which the field drives off
+    std::vector<float> rest_heights_;   // [m] of each car's mass centre over the road, standing
+    const TrackData* track_ = nullptr;  // on which these were measured
 };
 
 FlyingStart& flying_start();

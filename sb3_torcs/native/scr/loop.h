@@ -2,7 +2,8 @@
 //
 // The engine calls its simulation through pointers that it exports, in whose place ours stand. The
 // one for steps is called at every step after the drivers were, and passes the step on. Instead of
-// that it can do what the game's own "Restart Race" does; the engine then goes on as after any start.
+// that it can do what the game's own "Restart Race" does; the engine then goes on as after any
+// start.
 #pragma once
 
 namespace torcs::scr {

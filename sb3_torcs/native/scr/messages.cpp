@@ -24,12 +24,24 @@ struct Tag {
 
 // In the order of the members of State.
 constexpr Tag STATE_TAGS[] = {
-    {"angle", 1, 1.0},         {"curLapTime", 1, 1.0},   {"damage", 1, 1.0},
-    {"distFromStart", 1, 1.0}, {"distRaced", 1, 1.0},    {"fuel", 1, 1.0},
-    {"gear", 1, 1.0},          {"lastLapTime", 1, 1.0},  {"opponents", 36, 1.0},
-    {"racePos", 1, 1.0},       {"rpm", 1, RPM},          {"speedX", 1, KM_PER_HOUR},
-    {"speedY", 1, KM_PER_HOUR}, {"speedZ", 1, KM_PER_HOUR}, {"track", 19, 1.0},
-    {"trackPos", 1, 1.0},      {"wheelSpinVel", 4, 1.0}, {"z", 1, 1.0},
+    {"angle", 1, 1.0},
+    {"curLapTime", 1, 1.0},
+    {"damage", 1, 1.0},
+    {"distFromStart", 1, 1.0},
+    {"distRaced", 1, 1.0},
+    {"fuel", 1, 1.0},
+    {"gear", 1, 1.0},
+    {"lastLapTime", 1, 1.0},
+    {"opponents", 36, 1.0},
+    {"racePos", 1, 1.0},
+    {"rpm", 1, RPM},
+    {"speedX", 1, KM_PER_HOUR},
+    {"speedY", 1, KM_PER_HOUR},
+    {"speedZ", 1, KM_PER_HOUR},
+    {"track", 19, 1.0},
+    {"trackPos", 1, 1.0},
+    {"wheelSpinVel", 4, 1.0},
+    {"z", 1, 1.0},
     {"focus", FOCUS_BEAMS, 1.0},
 };
 
@@ -145,7 +157,7 @@ Action parse_action(std::string_view text) {
             action.focus.reset();
             if (std::abs(*value) <= 90.0) action.focus = *value * RADIANS;
         }
-        if (tag == "curLapTime") action.lap_time = *value;
+        if (tag == "curLapTime") action.lap_time = value;
     });
     return action;
 }

@@ -25,22 +25,22 @@ constexpr std::string_view RESTART = "***restart***";
 
 // What a driver senses, in the order of the protocol.
 struct State {
-    double heading_error;      // [rad] positive if the car points to the right of the road
-    double lap_time;           // [s] negative during the countdown
-    double damage;             // [points]
-    double distance;           // [m] from the start line
-    double distance_raced;     // [m]
-    double fuel;               // [l]
-    double gear;               // -1 reverse, 0 neutral
-    double last_lap_time;      // [s]
-    double opponents[36];      // [m]
-    double position;           // in the race, from 1
-    double engine_speed;       // [rad/s]
-    double velocity[3];        // [m/s] along, to the left of, and above the car
-    double range_finders[19];  // [m]
-    double track_position;     // [-] 1 is the left edge, -1 the right
-    double wheel_speeds[4];    // [rad/s]
-    double height;             // [m]
+    double heading_error;       // [rad] positive if the car points to the right of the road
+    double lap_time;            // [s] negative during the countdown
+    double damage;              // [points]
+    double distance;            // [m] from the start line
+    double distance_raced;      // [m]
+    double fuel;                // [l]
+    double gear;                // -1 reverse, 0 neutral
+    double last_lap_time;       // [s]
+    double opponents[36];       // [m]
+    double position;            // in the race, from 1
+    double engine_speed;        // [rad/s]
+    double velocity[3];         // [m/s] along, to the left of, and above the car
+    double range_finders[19];   // [m]
+    double track_position;      // [-] 1 is the left edge, -1 the right
+    double wheel_speeds[4];     // [rad/s]
+    double height;              // [m]
     double focus[FOCUS_BEAMS];  // [m]
 };
 static_assert(sizeof(State) == STATE_NUMBERS * sizeof(double));
@@ -62,9 +62,9 @@ struct Action {
 // How a client introduces itself.
 struct Init {
     std::array<double, 19> angles;  // [rad] of range finders, left negative
-    std::optional<Start> start{};  // not on the grid (an extension)
-    bool exact = false;            // states shall have all digits (an extension)
-    std::string name{};            // of the driver (an extension): plain characters only
+    std::optional<Start> start{};   // not on the grid (an extension)
+    bool exact = false;             // states shall have all digits (an extension)
+    std::string name{};             // of the driver (an extension): plain characters only
 };
 
 // Writes the state with its closing zero; returns the length with it. Six significant digits, as

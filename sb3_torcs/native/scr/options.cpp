@@ -27,8 +27,10 @@ Options read_options() {
         } else if (word == "noisy") {
             options.noisy = true;
         } else {
-            std::printf("scr_server: SB3_TORCS_SCR_OPTIONS names '%s'; it may name nofuel, "
-                        "nodamage, nolaptime and noisy\n", std::string(word).c_str());
+            std::printf(
+                "scr_server: SB3_TORCS_SCR_OPTIONS names '%s'; it may name nofuel, "
+                "nodamage, nolaptime and noisy\n",
+                std::string(word).c_str());
             std::fflush(stdout);
             std::exit(1);
         }

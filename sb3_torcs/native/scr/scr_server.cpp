@@ -56,8 +56,13 @@ extern "C" __attribute__((visibility("default"))) int scr_server(torcs::ModuleIn
     torcs::scr::hear_owner();
     for (int i = 0; i < torcs::MODULE_INTERFACES; i++) {
         const std::string name = "scr_server " + std::to_string(i);
-        modules[i] = {strdup(name.c_str()), strdup("client of the SCR protocol"),
-                      torcs::scr::fill_robot, 0, i, 0, 0};
+        modules[i] = {strdup(name.c_str()),
+                      strdup("client of the SCR protocol"),
+                      torcs::scr::fill_robot,
+                      0,
+                      i,
+                      0,
+                      0};
     }
     return 0;
 }

@@ -12,11 +12,11 @@ namespace {
 constexpr double FIRST_FRAME = -1.0;  // [s] before the start: the cars stand on the grid
 constexpr double RUN_OUT = 1.0;       // [s] after the end: the last crossing of the line is seen
 
-double now = 0;         // [s] what the game's clock shows
-double origin = 0;      // [s] simulated time of the first frame
-long frame = 0;         // number of the last one; -1 is drawn, but nobody gets it
+double now = 0;               // [s] what the game's clock shows
+double origin = 0;            // [s] simulated time of the first frame
+long frame = 0;               // number of the last one; -1 is drawn, but nobody gets it
 double last_time = HUGE_VAL;  // [s] simulated, of the last frame
-double over_since = 0;  // [s] simulated time of the race's end
+double over_since = 0;        // [s] simulated time of the race's end
 
 double frame_time() {
     static const char* text = std::getenv("SB3_TORCS_FRAME_TIME");

@@ -4,11 +4,12 @@
 // A picture shows a moment and nothing of what was before it, so that it does not matter which
 // moments were drawn before: see also the settings in rendering/game_camera.py.
 
+#include <poll.h>
+
 #include <algorithm>
 #include <cerrno>
 #include <cstdlib>
 #include <cstring>
-#include <poll.h>
 #include <string>
 #include <typeinfo>
 #include <vector>
@@ -41,12 +42,12 @@ struct CameraBehind {
 
 struct FlyingCamera {
     Camera camera;
-    int car;            // that it flew with
-    float time_left;    // [s] until it changes its mind
-    float climb;        // [m]
+    int car;          // that it flew with
+    float time_left;  // [s] until it changes its mind
+    float climb;      // [m]
     float pull, damping;
-    float offset[3];    // [m] from the car, where it wants to be
-    double time;        // [s] of the picture before
+    float offset[3];  // [m] from the car, where it wants to be
+    double time;      // [s] of the picture before
 };
 
 struct DirectedCamera {
@@ -69,7 +70,7 @@ struct Instrument {
     float value, range;        // at the lower end of the scale, and from there to the upper one
     float angle, angle_range;  // [degrees] of the needle there
     const float* shown;
-    float needle;              // [degrees] in the picture before
+    float needle;  // [degrees] in the picture before
     Unused<12> b_;
 };
 
@@ -224,7 +225,7 @@ void take_appearance() {
         situation.cars[i] = &car;
     }
     // Shining lights are drawn turned at random.
-    std::srand(1);
+    std::srand(1);  // NOLINT(bugprone-random-generator-seed): the same each time
     Screen& screen = *drawn<Screen*>("grScreens");
     pretend_a_past(*screen.car, screen, scene.time);
     // Without an end the board counts up to the lap that is driven.
