@@ -11,7 +11,6 @@ import socket
 import weakref
 from contextlib import ExitStack
 from dataclasses import replace
-from xml.etree import ElementTree
 
 import numpy as np
 import numpy.typing as npt
@@ -22,14 +21,12 @@ from sb3_torcs.torcs.display import VirtualDisplay
 from sb3_torcs.torcs.installation import Game
 from sb3_torcs.torcs.process import GameProcess
 from sb3_torcs.torcs.race_setup import SCR_SERVER, RaceSetup
-from sb3_torcs.torcs.window import GRAPHICS, Window, window_arguments
+from sb3_torcs.torcs.window import Window, window_arguments
 from sb3_torcs.tracks.trial import check_track
 
 __all__ = ["GameView"]
 
 AGENT = f"{SCR_SERVER} 0"  # as the game shows its name
-# These tell of moments before, which need not have been drawn, or were those of another episode.
-NO_PAST = ("smoke value", "skid value")
 GRACE = 5.0  # [s] for a game that hung up to be gone
 
 
@@ -51,9 +48,11 @@ class GameView:
             self._line, end = socket.socketpair()
             stack.enter_context(self._line)
             with end:
-                window = replace(window, driver=AGENT, display=display.name, frames=end.fileno())
+                window = replace(
+                    window, driver=AGENT, display=display.name, frames=end.fileno(),
+                    traces=False,  # moments before need not have been drawn, or were another race
+                )  # fmt: skip
                 arguments = window_arguments(game, window)
-                arguments["files"][GRAPHICS] = _without_past(arguments["files"][GRAPHICS])
                 arguments["environment"] |= {
                     "SB3_TORCS_APPEARANCES": str(end.fileno()),
                     "SB3_TORCS_SCR_SOCKETS": "",  # nobody drives there
@@ -91,16 +90,3 @@ class GameView:
     def close(self) -> None:
         """End the game and its display. Calling it twice does no harm."""
         self._end()
-
-
-def _without_past(graphics: str) -> str:
-    """
-    Leave out of the pictures what would show earlier ones.
-
-    :param graphics: the game's settings of them, as text
-    """
-    root = ElementTree.fromstring(graphics)
-    for name in NO_PAST:
-        for setting in root.iterfind(f"section[@name='Graphic']/attnum[@name='{name}']"):
-            setting.set("val", "0")
-    return ElementTree.tostring(root, encoding="unicode")

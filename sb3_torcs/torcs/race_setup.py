@@ -8,11 +8,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
-from xml.etree import ElementTree
 
 from sb3_torcs.car import DEFAULT_CAR, MANY_LAPS, checked_laps
 from sb3_torcs.errors import GameIncomplete, InvalidOption
 from sb3_torcs.torcs.installation import Game
+from sb3_torcs.torcs.params import Node
 
 __all__ = [
     "RACE_FILE",
@@ -123,22 +123,22 @@ def write_race(game: Game, folder: Path, race: RaceSetup) -> str:
     template = f"config/raceman/{SESSIONS[race.session]}.xml"
     _needed(game, template)
     try:
-        root = ElementTree.parse(game.data / template).getroot()
-        race_name = _text(_section(root, "Races", "1"), "name")
-        _set(_section(root, race_name), "attnum", "laps", str(race.laps))
+        root = Node.read(game.data / template)
+        race_name = root.find("Races", "1").text("name")
+        root.find(race_name).set("laps", race.laps)
         category, _, name = str(race.track).rpartition("/")
-        place = _list(_section(root, "Tracks"), 1)[0]
-        _set(place, "attstr", "name", name)
-        _set(place, "attstr", "category", category)
-        entries = _list(_section(root, "Drivers"), len(race.drivers))
-    except (ElementTree.ParseError, LookupError) as error:
+        (place,) = root.find("Tracks").number_sections(1)
+        place.set("name", name)
+        place.set("category", category)
+        entries = root.find("Drivers").number_sections(len(race.drivers))
+    except (ValueError, LookupError) as error:
         raise GameIncomplete(
             f"{game.data / template} is broken ({error}); type: `sb3-torcs install-torcs`"
         ) from error
     for entry, (module, index) in zip(entries, race.drivers, strict=True):
-        _set(entry, "attnum", "idx", str(index))
-        _set(entry, "attstr", "module", module)
-    _write(root, folder / RACE_FILE)
+        entry.set("idx", index)
+        entry.set("module", module)
+    root.write(folder / RACE_FILE)
     return race_name
 
 
@@ -149,25 +149,19 @@ def _write_scr_drivers(folder: Path, car: str) -> None:
     :param folder: private to the game
     :param car: that they drive
     """
-    root = ElementTree.Element("params", name=SCR_SERVER, type="robotdef")
-    robots = ElementTree.SubElement(root, "section", name="Robots")
-    index = ElementTree.SubElement(robots, "section", name="index")
+    root = Node.new(SCR_SERVER, "robotdef")
     for number in range(SCR_DRIVERS):
-        driver = ElementTree.SubElement(index, "section", name=str(number))
-        texts = {
-            "name": f"{SCR_SERVER} {number}",
-            "team": SCR_SERVER,
-            "author": "sb3_torcs",
-            "car name": car,
-        }
-        for name, value in texts.items():
-            _set(driver, "attstr", name, value)
-        _set(driver, "attnum", "race number", str(number + 1))
-        for channel, value in (("red", "1.0"), ("green", "0.4"), ("blue", "0.0")):
-            _set(driver, "attnum", channel, value)
+        driver = root.make("Robots", "index", str(number))
+        driver.set("name", f"{SCR_SERVER} {number}")
+        driver.set("team", SCR_SERVER)
+        driver.set("author", "sb3_torcs")
+        driver.set("car name", car)
+        driver.set("race number", number + 1)
+        for channel, share in (("red", 1.0), ("green", 0.4), ("blue", 0.0)):
+            driver.set(channel, share)
     file = folder / "drivers" / SCR_SERVER / f"{SCR_SERVER}.xml"
     file.parent.mkdir(parents=True)
-    _write(root, file)
+    root.write(file)
 
 
 def _forbid_learning(folder: Path, race: RaceSetup) -> None:
@@ -182,16 +176,6 @@ def _forbid_learning(folder: Path, race: RaceSetup) -> None:
             (folder / "drivers" / module).touch()  # where they would make a folder
 
 
-def _write(root: ElementTree.Element, file: Path) -> None:
-    """
-    Write a file of the game's format.
-
-    :param root: of the document
-    :param file: to write
-    """
-    ElementTree.ElementTree(root).write(file, encoding="UTF-8", xml_declaration=True)
-
-
 def _needed(game: Game, file: str) -> None:
     """
     Make sure that a file of the game's data is there.
@@ -201,64 +185,3 @@ def _needed(game: Game, file: str) -> None:
     """
     if not (game.data / file).is_file():
         raise GameIncomplete(f"there is no {game.data / file}; type: `sb3-torcs install-torcs`")
-
-
-def _section(section: ElementTree.Element, *names: str) -> ElementTree.Element:
-    """
-    Find a section inside another.
-
-    :param section: around it
-    :param names: from the outside in
-    :raises LookupError: naming what is not there
-    """
-    for name in names:
-        inner = next((s for s in section.findall("section") if s.get("name") == name), None)
-        if inner is None:
-            raise LookupError(f"no section '{name}'")
-        section = inner
-    return section
-
-
-def _list(section: ElementTree.Element, entries: int) -> list[ElementTree.Element]:
-    """
-    Give a section numbered entries in place of those it has.
-
-    :param section: to change
-    :param entries: how many
-    :return: the entries
-    """
-    for old in section.findall("section"):
-        section.remove(old)
-    return [
-        ElementTree.SubElement(section, "section", name=str(number))
-        for number in range(1, entries + 1)
-    ]
-
-
-def _set(section: ElementTree.Element, tag: str, name: str, value: str) -> None:
-    """
-    Set a value.
-
-    :param section: to change
-    :param tag: ``attnum`` or ``attstr``
-    :param name: of the value
-    :param value: as text
-    """
-    found = next((a for a in section.findall(tag) if a.get("name") == name), None)
-    if found is None:
-        found = ElementTree.SubElement(section, tag, name=name)
-    found.set("val", value)
-
-
-def _text(section: ElementTree.Element, name: str) -> str:
-    """
-    Read a value.
-
-    :param section: that holds it
-    :param name: of the value
-    :raises LookupError: if it is not there
-    """
-    for attribute in section:
-        if attribute.tag in ("attstr", "attnum") and attribute.get("name") == name:
-            return attribute.get("val", "")
-    raise LookupError(f"no value '{name}' in section '{section.get('name')}'")

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from xml.etree import ElementTree
 
 from sb3_torcs.errors import GameFailed
+from sb3_torcs.torcs.params import Node
 from sb3_torcs.torcs.process import GameProcess
 from sb3_torcs.torcs.race_results import Lap, RobotResult
 from sb3_torcs.torcs.race_setup import RACE_FILE, SCR_SERVER, RaceSetup
@@ -33,7 +34,7 @@ def read_results(process: GameProcess, race: RaceSetup, cars: Sequence[str]) -> 
     return _race_results(rows, by_driver, race.laps, process.last_words())
 
 
-def _results(process: GameProcess) -> ElementTree.Element:
+def _results(process: GameProcess) -> Node:
     """
     Find the results of the race.
 
@@ -43,23 +44,20 @@ def _results(process: GameProcess) -> ElementTree.Element:
     race_name = process.race_name
     for file in (process.folder / "results" / Path(RACE_FILE).stem).glob("*.xml"):
         try:
-            root = ElementTree.parse(file).getroot()
-        except ElementTree.ParseError as error:
+            root = Node.read(file)
+        except ValueError as error:
             raise GameFailed(
                 f"the results that the game wrote are cut off ({error}); is there room in "
                 f"'{process.folder.parent}'?"
             ) from error
         # The section of the track goes by the name that its author gave it: any will do.
-        for section in root.findall("section"):
-            found = section.find(f"section[@name='Results']/section[@name='{race_name}']")
-            if found is not None:
-                return found
+        for section in root.sections():
+            with suppress(LookupError):
+                return section.find("Results", race_name)
     raise GameFailed(f"the game ended without results; it last said: {process.last_words()}")
 
 
-def _practice_result(
-    rows: ElementTree.Element, robot: str, index: int, car: str, laps: int
-) -> RobotResult:
+def _practice_result(rows: Node, robot: str, index: int, car: str, laps: int) -> RobotResult:
     """
     Read the laps of a practice.
 
@@ -69,9 +67,9 @@ def _practice_result(
     :param car: that it drove
     :param laps: that were asked for
     """
-    ordered = sorted(rows.findall("section"), key=_position)
-    client = _text(rows, "driver name") if robot == SCR_SERVER else ""
-    driven = [Lap(_number(row, "time"), int(_number(row, "dammages"))) for row in ordered]
+    ordered = sorted(rows.sections(), key=_position)
+    client = rows.text("driver name") if robot == SCR_SERVER else ""
+    driven = [Lap(row.number("time"), int(row.number("dammages"))) for row in ordered]
     return RobotResult(
         robot, index, car, driven,
         total_time=round(math.fsum(lap.time for lap in driven), 6),
@@ -79,13 +77,13 @@ def _practice_result(
         damage=driven[-1].damage if driven else 0,
         out=len(driven) < laps,
         laps_completed=len(driven),
-        best_lap=(_number(ordered[-1], "best lap time") or None) if ordered else None,
+        best_lap=(ordered[-1].number("best lap time") or None) if ordered else None,
         client=client,
     )  # fmt: skip
 
 
 def _race_results(
-    rows: ElementTree.Element, cars: Mapping[tuple[str, int], str], laps: int, words: str
+    rows: Node, cars: Mapping[tuple[str, int], str], laps: int, words: str
 ) -> list[RobotResult]:
     """
     Read the order of a race.
@@ -95,12 +93,11 @@ def _race_results(
     :param laps: that were asked for
     :param words: the game's last, for an error
     """
-    ranks = next((s for s in rows.findall("section") if s.get("name") == "Rank"), None)
-    ranked = [] if ranks is None else sorted(ranks.findall("section"), key=_position)
+    ranked = sorted(rows.child("Rank").sections(), key=_position)
     if len(ranked) != len(cars):  # the game goes on without a robot that it cannot load
         raise GameFailed(f"{len(ranked)} of {len(cars)} robots raced; the game last said: {words}")
     results = [_race_result(row, rank, cars) for rank, row in enumerate(ranked, 1)]
-    last_seen = [r.total_time - _number(row, "penaltytime")
+    last_seen = [r.total_time - row.number("penaltytime")
                  for r, row in zip(results, ranked, strict=True)]  # fmt: skip
     finished = [t for r, t in zip(results, last_seen, strict=True) if r.laps_completed == laps]
     # Who was lapped ends at the line after the winner; who is out never came there.
@@ -111,9 +108,7 @@ def _race_results(
     ]
 
 
-def _race_result(
-    row: ElementTree.Element, rank: int, cars: Mapping[tuple[str, int], str]
-) -> RobotResult:
+def _race_result(row: Node, rank: int, cars: Mapping[tuple[str, int], str]) -> RobotResult:
     """
     Read one line of the order of a race.
 
@@ -121,42 +116,19 @@ def _race_result(
     :param rank: its number
     :param cars: of the robots, by name and index
     """
-    key = (_text(row, "module"), int(_number(row, "idx")))
+    key = (row.text("module"), int(row.number("idx")))
     return RobotResult(
-        *key, cars[key], laps=[], total_time=_number(row, "time"), rank=rank,
-        damage=int(_number(row, "dammages")), out=False,
-        laps_completed=int(_number(row, "laps")), best_lap=_number(row, "best lap time") or None,
-        client=_text(row, "name") if key[0] == SCR_SERVER else "",
+        *key, cars[key], laps=[], total_time=row.number("time"), rank=rank,
+        damage=int(row.number("dammages")), out=False,
+        laps_completed=int(row.number("laps")), best_lap=row.number("best lap time") or None,
+        client=row.text("name") if key[0] == SCR_SERVER else "",
     )  # fmt: skip
 
 
-def _position(section: ElementTree.Element) -> int:
+def _position(section: Node) -> int:
     """
     Read the number that a section goes by.
 
     :param section: of a list
     """
-    return int(section.get("name", "0"))
-
-
-def _text(section: ElementTree.Element, name: str) -> str:
-    """
-    Read a value.
-
-    :param section: that holds it
-    :param name: of the value
-    :return: the text; empty if it is not there
-    """
-    values = (a.get("val", "") for a in section.iterfind("*[@val]") if a.get("name") == name)
-    return next(values, "")
-
-
-def _number(section: ElementTree.Element, name: str) -> float:
-    """
-    Read a number.
-
-    :param section: that holds it
-    :param name: of the value
-    :return: the number; 0, as the game has it, if it is not there
-    """
-    return float(_text(section, name) or 0.0)
+    return int(section.name or 0)

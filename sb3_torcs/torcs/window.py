@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypedDict
-from xml.etree import ElementTree
 
 from sb3_torcs.errors import GameIncomplete, InvalidOption, near_miss
 from sb3_torcs.torcs.installation import Game
+from sb3_torcs.torcs.params import Node
 from sb3_torcs.torcs.process import compiled_library
 
 __all__ = ["VIEWS", "ViewName", "Window", "WindowArguments", "window_arguments", "window_files"]
@@ -47,6 +47,7 @@ BOARDS = {
     "debug info": 0,
     "map mode": 4,  # the whole track
 }
+TRACES = ("smoke value", "skid value")
 NO_BOARDS = {**dict.fromkeys(BOARDS, 0), "map mode": 1}
 USER_VARIABLES = (  # that a program with a window and sound needs; the rest stays outside
     "XAUTHORITY",
@@ -69,6 +70,7 @@ class Window:
         ``None`` shows the race in real time
     :param fps: pictures per second of simulated time; ``None`` if it stands still
     :param boards: whether lap times, instruments and a map are drawn over the picture
+    :param traces: whether smoke and skid marks are drawn, which tell of moments before
     :raises InvalidOption: if there is no such view, or the game cannot draw this
     """
 
@@ -79,6 +81,7 @@ class Window:
     frames: int | None = None
     fps: float | None = None
     boards: bool = True
+    traces: bool = True
 
     def __post_init__(self) -> None:
         if not isinstance(self.view, str) or self.view not in VIEWS:
@@ -149,25 +152,29 @@ def window_files(game: Game, window: Window) -> dict[str, str]:
     :raises GameIncomplete: if the game lacks one of these files, or has a broken one
     """
     screen = _parse(game, SCREEN)
+    properties = screen.make("Screen Properties")
     width, height = window.size
     numbers = {"x": width, "y": height, "window width": width, "window height": height, "bpp": 24}
     for name, number in numbers.items():
-        _set(screen, "Screen Properties", "attnum", name, str(number))
-    _set(screen, "Screen Properties", "attstr", "fullscreen", "no")
+        properties.set(name, number)
+    properties.set("fullscreen", "no")
     graphics = _parse(game, GRAPHICS)
+    display = graphics.make("Display Mode", "0")
     camera_list, camera = VIEWS[window.view]
     numbers = {"camera head list": camera_list, "camera": camera}
     numbers |= BOARDS if window.boards else NO_BOARDS
     for name, number in numbers.items():
-        _set(graphics, "Display Mode/0", "attnum", name, str(number))
+        display.set(name, number)
     if window.driver is not None:
-        _set(graphics, "Display Mode/0", "attstr", "current driver", window.driver)
+        display.set("current driver", window.driver)
+    if not window.traces:
+        for name in TRACES:
+            graphics.make("Graphic").set(name, 0)
     sound = _parse(game, SOUND)
     silent = window.frames is not None or not _has_sound()
-    _set(sound, "Sound Settings", "attstr", "state", "disabled" if silent else "openal")
-    _set(sound, "Menu Music", "attstr", "enable", "disabled")
-    roots = {SCREEN: screen, GRAPHICS: graphics, SOUND: sound}
-    return {file: ElementTree.tostring(root, encoding="unicode") for file, root in roots.items()}
+    sound.make("Sound Settings").set("state", "disabled" if silent else "openal")
+    sound.make("Menu Music").set("enable", "disabled")
+    return {SCREEN: screen.as_text(), GRAPHICS: graphics.as_text(), SOUND: sound.as_text()}
 
 
 def _has_sound() -> bool:
@@ -178,7 +185,7 @@ def _has_sound() -> bool:
     return "PULSE_SERVER" in os.environ or any(s.exists() for s in services) or any(devices)
 
 
-def _parse(game: Game, file: str) -> ElementTree.Element:
+def _parse(game: Game, file: str) -> Node:
     """
     Read one of the game's own settings.
 
@@ -186,27 +193,8 @@ def _parse(game: Game, file: str) -> ElementTree.Element:
     :param file: seen from its data
     """
     try:
-        return ElementTree.parse(game.data / file).getroot()
-    except (OSError, ElementTree.ParseError) as error:
+        return Node.read(game.data / file)
+    except (OSError, ValueError) as error:
         raise GameIncomplete(
             f"{game.data / file} cannot be read ({error}); type: `sb3-torcs install-torcs`"
         ) from error
-
-
-def _set(root: ElementTree.Element, path: str, tag: str, name: str, value: str) -> None:
-    """
-    Set a value.
-
-    :param root: of the settings
-    :param path: of the section, with ``/`` between the names; made if it is missing
-    :param tag: ``attnum`` or ``attstr``
-    :param name: of the value
-    :param value: as text
-    """
-    section = root
-    for part in path.split("/"):
-        inner = section.find(f"section[@name='{part}']")
-        section = ElementTree.SubElement(section, "section", name=part) if inner is None else inner
-    for old in section.findall(f"{tag}[@name='{name}']"):
-        section.remove(old)
-    ElementTree.SubElement(section, tag, name=name, val=value)
