@@ -21,8 +21,9 @@ __all__ = [
     "GEARBOXES",
     "GEARS",
     "PEDALS",
-    "SHIFT_DOWN",
+    "SHIFT_DOWN_RPM",
     "SHIFT_UP",
+    "SHIFT_UP_RPM",
     "ActionLayout",
     "ActionName",
     "GearboxName",
@@ -57,10 +58,15 @@ GEARS = 6
 _FLOATS = "efd"  # codes of the dtypes that tolist() turns into Python's floats
 _COUNTS = {2: "two", 3: "three", 5: "five"}
 
-SHIFT_UP = 8500.0 * 2.0 * math.pi / 60.0
-"""[rad/s] ``car1-trb1`` gives its best power at 8,000 rpm and is limited at 9,152."""
-SHIFT_DOWN = 7500.0 * 2.0 * math.pi / 60.0
-"""[rad/s] Shift down when the lower gear would turn the motor no faster than this."""
+SHIFT_UP_RPM, SHIFT_DOWN_RPM = 8500.0, 7500.0
+"""
+[rpm] of :data:`~sb3_torcs.car.DEFAULT_CAR`, with its best power at 8,000: the next gear above the
+first of them; below the second the gear before, if that would turn the motor no faster.
+"""
+SHIFT_UP = SHIFT_UP_RPM * math.tau / 60.0
+"""[rad/s]"""
+SHIFT_DOWN = SHIFT_DOWN_RPM * math.tau / 60.0
+"""[rad/s]"""
 LAUNCH_CLUTCH = 0.8
 """[-] Clutch of a standing car, by road speed. TORCS passes all torque up to two thirds of it."""
 CLUTCH_STEPS = 128.0
@@ -231,19 +237,28 @@ def _numbers(action: Any, names: tuple[str, ...]) -> list[float]:
 
 
 @njit(cache=True)
-def automatic_gear(gear: int, engine_speed: float, ratios: FloatArray) -> int:
+def automatic_gear(
+    gear: int,
+    engine_speed: float,
+    ratios: FloatArray,
+    shift_up: float = SHIFT_UP,
+    shift_down: float = SHIFT_DOWN,
+) -> int:
     """
     Choose the gear by motor speed. Compiled, and callable from compiled code.
 
     :param gear: the present gear, -1 reverse, 0 neutral, 1 and up
     :param engine_speed: the motor's own, or what it would be if no wheel slipped [rad/s]
-    :param ratios: (gears + 2,) gear ratios of reverse, neutral, 1 and up
+    :param ratios: (gears,) of the first gear and up
+    :param shift_up: above which the next gear comes [rad/s]
+    :param shift_down: the gear before comes if it would turn the motor slower than this [rad/s]
     :return: the gear to ask for; forward gears only
     """
+    gears = ratios.shape[0]
     if gear < 1:
         return 1
-    if engine_speed > SHIFT_UP and gear + 2 < ratios.shape[0]:
+    if engine_speed > shift_up and gear < gears:
         return gear + 1
-    if gear > 1 and engine_speed * ratios[gear] / ratios[gear + 1] < SHIFT_DOWN:
+    if 1 < gear <= gears and engine_speed * ratios[gear - 2] / ratios[gear - 1] < shift_down:
         return gear - 1
     return gear

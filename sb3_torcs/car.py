@@ -15,10 +15,15 @@ import numpy.typing as npt
 from sb3_torcs.errors import InvalidOption
 
 __all__ = [
+    "CAR_LENGTH",
+    "CAR_WIDTH",
     "CONTROL_TICK",
     "DEFAULT_CAR",
+    "LIMITER_RPM",
     "MANY_LAPS",
     "MAX_DAMAGE",
+    "RPM",
+    "STEER_LOCK",
     "CarState",
     "Controls",
     "FloatArray",
@@ -35,6 +40,14 @@ FloatArray = npt.NDArray[np.float64]
 
 DEFAULT_CAR = "car1-trb1"
 """The car of the SCR championship, which all worlds have."""
+CAR_LENGTH, CAR_WIDTH = 4.52, 1.94
+"""[m] of that car."""
+STEER_LOCK = math.radians(21.0)
+"""[rad] of its front wheels, to either side."""
+LIMITER_RPM = 9152.0
+"""[rpm] at which its motor is limited."""
+RPM = math.tau / 60.0
+"""[rad/s] One revolution per minute."""
 
 CONTROL_TICK = 0.02
 """[s] The interval at which TORCS calls its robots; one timestep lasts a whole number of them."""

@@ -385,6 +385,24 @@ def test_the_engine_loads_only_when_somebody_drives():
 
 
 @pytest.mark.parametrize("path", FILES, ids=named)
+def test_one_file_knows_xml(path):
+    """What of TORCS is read and written, is so in one way."""
+    assert named(path) == "torcs/params.py" or forbidden(path, {"xml"}) == []
+
+
+def test_the_car_and_its_gearbox_are_said_once():
+    """Name, length, width, lock, limiter and shift points; the engine's C++ says them once more."""
+    wanted = ["car1-trb1", 4.52, 1.94, 21.0, 9152.0, 8500.0, 7500.0]
+    said = [
+        node.value
+        for path in FILES
+        for node in ast.walk(ast.parse(source(path)))
+        if isinstance(node, ast.Constant) and type(node.value) in (str, float)
+    ]
+    assert {value: said.count(value) for value in wanted} == dict.fromkeys(wanted, 1)
+
+
+@pytest.mark.parametrize("path", FILES, ids=named)
 def test_one_file_lets_drivers_drive(path):
     """So that a lap is the same lap, whoever asks for it."""
     called = {node.func.attr for node in ast.walk(ast.parse(source(path)))

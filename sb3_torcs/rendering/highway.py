@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_torcs.car import CarState, FloatArray
+from sb3_torcs.car import CAR_LENGTH, CAR_WIDTH, CarState, FloatArray
 from sb3_torcs.tracks.track import Segment, Track
 
 
@@ -167,8 +167,7 @@ class RaceCar(Vehicle):
     :param state: where the car is
     """
 
-    LENGTH = 4.52  # [m] of car1-trb1
-    WIDTH = 1.94  # [m]
+    LENGTH, WIDTH = CAR_LENGTH, CAR_WIDTH
     MAX_SPEED = 100.0  # [m/s]
     color = (214, 62, 44)
 

@@ -7,7 +7,8 @@ import string
 
 import numpy as np
 
-from sb3_torcs.car import CarState, Controls, FloatArray
+from sb3_torcs.actions import SHIFT_UP_RPM
+from sb3_torcs.car import RPM, CarState, Controls, FloatArray
 from sb3_torcs.rendering.highway import pygame, to_highway
 from sb3_torcs.rendering.scenery import Colour
 from sb3_torcs.tracks.track import Track
@@ -27,9 +28,7 @@ BLUE: Colour = (92, 164, 236)
 CHARACTERS = string.ascii_letters + string.digits + " .:-/"
 
 KMH = 3.6  # km/h per m/s
-RPM = 60.0 / (2.0 * math.pi)  # rpm per rad/s
 REVS_SHOWN = 10000.0  # [rpm] at the bar's end
-REVS_HIGH = 8500.0  # [rpm] from here on the bar is red: best power of car1-trb1 is at 8,000
 NO_TIME = "-:--.--"  # before there is a whole lap
 GEARS = {-1: "R", 0: "N"}
 
@@ -166,12 +165,14 @@ class Dashboard:
 
         picture.blit(self._panel, place)
         speed, gear = f"{abs(car.speed_x) * KMH:.0f}", GEARS.get(car.gear, str(car.gear))
-        revs = car.engine_speed * RPM
+        revs = car.engine_speed / RPM
         self._huge.write(picture, speed, at(100, 14), align=1.0)
         self._small.write(picture, "km/h", at(100, 68), MUTED, 1.0)
         self._huge.write(picture, gear, at(140, 14), align=0.5)
         self._small.write(picture, "gear", at(140, 68), MUTED, 0.5)
-        _bar(picture, box(178, 14, 150, 16), revs / REVS_SHOWN, RED if revs > REVS_HIGH else AMBER)
+        _bar(
+            picture, box(178, 14, 150, 16), revs / REVS_SHOWN, RED if revs > SHIFT_UP_RPM else AMBER
+        )
         self._small.write(picture, f"{revs:.0f} rpm", at(253, 33), MUTED, 0.5)
         _needle(picture, box(178, 54, 150, 10), controls.steering)
         self._small.write(picture, "steering", at(253, 68), MUTED, 0.5)

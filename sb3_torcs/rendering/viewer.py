@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from sb3_torcs.car import CarState, Controls, FloatArray
+from sb3_torcs.car import STEER_LOCK, CarState, Controls, FloatArray
 from sb3_torcs.errors import EnvClosed, InvalidOption
 from sb3_torcs.rendering.highway import (
     RaceCar,
@@ -54,7 +54,6 @@ RANGE = 199.5  # [m] a beam as long as this met nothing
 TYRE = (28, 28, 30)
 AXLES, TYRES, TYRE_SIZE = (1.25, -1.40), (0.92, -0.92), (0.66, 0.34)  # [m]
 BODY_SHIFT = 1.5  # [px]
-STEER_LOCK = math.radians(21.0)  # [rad] of car1-trb1's front wheels
 SMALLEST_DASHBOARD = 240  # [px] smaller pictures show the road only: figures would be illegible
 
 

@@ -4,23 +4,18 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import NamedTuple
-from xml.etree import ElementTree
 
 import numpy as np
 
-from sb3_torcs.actions import SHIFT_DOWN, SHIFT_UP, launch_clutch
-from sb3_torcs.car import Controls
+from sb3_torcs.actions import SHIFT_DOWN_RPM, SHIFT_UP_RPM, automatic_gear, launch_clutch
+from sb3_torcs.car import LIMITER_RPM, Controls, FloatArray
 from sb3_torcs.errors import CarFileError
 from sb3_torcs.scr.protocol import MotorReading
+from sb3_torcs.torcs.params import Node
 
 __all__ = ["Gearbox", "read_gearbox"]
 
 GEARS = ("1", "2", "3", "4", "5", "6", "7", "8")  # what the game calls them
-LIMITER = 9152.0  # [rpm] of the car that the shift points are given for
-RPM = np.float32(0.104719755)  # [rad/s] per rpm, as the game has it
-REVS = np.pi / 30.0  # [rad/s] per rpm
-METRES = {"in": 0.0254, "inch": 0.0254, "inches": 0.0254, "mm": 0.001, "cm": 0.01}  # others: 1
-SHARES = {"%": 0.01}
 DIFFERENTIALS = {"FWD": "Front Differential", "4WD": "Central Differential"}
 REAR_DIFFERENTIAL = "Rear Differential"
 
@@ -28,7 +23,7 @@ REAR_DIFFERENTIAL = "Rear Differential"
 class Gearbox(NamedTuple):
     """When to shift."""
 
-    ratios: tuple[float, ...]  # [-] of the first gear and up
+    ratios: FloatArray  # (gears,) [-] of the first gear and up
     shift_up: float  # [rad/s] above which
     shift_down: float  # [rad/s] below which the lower gear would turn the motor
     rolling: float | None = None  # [rad/m] that the motor turns on the way, by a ratio of 1;
@@ -47,28 +42,11 @@ class Gearbox(NamedTuple):
         ratios = self.ratios
         present = min(max(gear, 1), len(ratios))
         if self.rolling is not None:
-            engine_speed = max(speed, 0.0) * self.rolling * ratios[present - 1]
+            engine_speed = max(speed, 0.0) * self.rolling * float(ratios[present - 1])
             if present == 1:
                 clutch = max(clutch, launch_clutch(engine_speed, self.shift_up))
-        return controls._replace(gear=self._choose(gear, engine_speed), clutch=clutch)
-
-    def _choose(self, gear: int, engine_speed: float) -> int:
-        """
-        Choose the gear.
-
-        :param gear: the present one, -1 reverse, 0 neutral
-        :param engine_speed: by which to go [rad/s]
-        :return: the gear to ask for
-        """
-        if gear < 1:
-            return 1
-        ratios = self.ratios
-        if engine_speed > self.shift_up and gear < len(ratios):
-            return gear + 1
-        if 1 < gear <= len(ratios):
-            lower = engine_speed * ratios[gear - 2] / ratios[gear - 1]
-            return gear - 1 if lower < self.shift_down else gear
-        return gear
+        wanted = automatic_gear(gear, engine_speed, ratios, self.shift_up, self.shift_down)
+        return controls._replace(gear=wanted, clutch=clutch)
 
 
 def read_gearbox(path: Path, gearbox: str = "automatic") -> Gearbox:
@@ -81,36 +59,25 @@ def read_gearbox(path: Path, gearbox: str = "automatic") -> Gearbox:
     :raises CarFileError: if the file is broken, or the car has no gears
     """
     try:
-        car = ElementTree.parse(path).getroot()
-        limiter = _limiter(car)
-        gears = "section[@name='Gearbox']/section[@name='gears']"
-        ratios = [_number(car, f"{gears}/section[@name='{gear}']", "ratio", 0.0) for gear in GEARS]
+        car = Node.read(path)
+        limiter = car.child("Engine").number("revs limiter", real=np.float32)
+        gears = car.child("Gearbox", "gears")
+        ratios = [gears.child(gear).number("ratio") for gear in GEARS]
         rolling = _rolling(car, path) if gearbox == "road_speed" else None
-    except (ElementTree.ParseError, ValueError) as error:
+    except ValueError as error:
         raise CarFileError(f"{path} is broken ({error}); type: `sb3-torcs install-torcs`") from None
     number = max((place for place, ratio in enumerate(ratios, 1) if ratio > 0.0), default=0)
     if number == 0 or limiter <= 0.0:
         raise CarFileError(f"{path} has no gears or no rev limiter; choose another car")
     # The arithmetic of the engine, which is in single precision.
-    up = np.float32(SHIFT_UP / REVS) / np.float32(LIMITER) * limiter
-    down = np.float32(SHIFT_DOWN / REVS) / np.float32(LIMITER) * limiter
-    return Gearbox(tuple(ratios[:number]), float(up), float(down), rolling)
+    up, down = (
+        float(np.float32(revs) / np.float32(LIMITER_RPM) * np.float32(limiter))
+        for revs in (SHIFT_UP_RPM, SHIFT_DOWN_RPM)
+    )
+    return Gearbox(np.array(ratios[:number]), up, down, rolling)
 
 
-def _limiter(car: ElementTree.Element) -> np.float32:
-    """
-    Read at which motor speed the limiter cuts in.
-
-    :param car: the file
-    :return: [rad/s]; 0 if it does not say
-    """
-    entry = car.find("section[@name='Engine']/attnum[@name='revs limiter']")
-    if entry is None:
-        return np.float32(0.0)
-    return np.float32(entry.get("val", "")) * (RPM if entry.get("unit") == "rpm" else np.float32(1))
-
-
-def _rolling(car: ElementTree.Element, path: Path) -> float:
+def _rolling(car: Node, path: Path) -> float:
     """
     Work out how far a motor turns on the way, by a gear of ratio 1: as the game does.
 
@@ -118,40 +85,15 @@ def _rolling(car: ElementTree.Element, path: Path) -> float:
     :param path: where it is; its category is beside the cars
     :return: [rad/m]
     """
-    drivetrain = "section[@name='Drivetrain']/attstr[@name='type']"
-    category = car.find("section[@name='Car']/attstr[@name='category']")
-    kind = car.find(drivetrain)
-    if kind is None and category is not None:
-        file = path.parents[2] / "categories" / f"{category.get('val')}.xml"
-        kind = ElementTree.parse(file).getroot().find(drivetrain) if file.is_file() else None
-    driven = "RWD" if kind is None else kind.get("val", "")
-    final = f"section[@name='{DIFFERENTIALS.get(driven, REAR_DIFFERENTIAL)}']"
-    wheel = "section[@name='Rear Right Wheel']"
-    width = _number(car, wheel, "tire width", 0.145, METRES)
-    height = width * _number(car, wheel, "tire height-width ratio", 0.75, SHARES)
-    radius = 0.5 * _number(car, wheel, "rim diameter", 0.33, METRES) + height
+    driven = car.child("Drivetrain").text("type")
+    category = car.child("Car").text("category")
+    file = path.parents[2] / "categories" / f"{category}.xml"
+    if not driven and category and file.is_file():
+        driven = Node.read(file).child("Drivetrain").text("type")
+    wheel = car.child("Rear Right Wheel")
+    height = wheel.number("tire width", 0.145) * wheel.number("tire height-width ratio", 0.75)
+    radius = 0.5 * wheel.number("rim diameter", 0.33) + height
     if radius <= 0.0:
         raise ValueError(f"the rear wheels have a radius of {radius:g} m")
-    return _number(car, final, "ratio", 1.0) / radius
-
-
-def _number(
-    car: ElementTree.Element,
-    section: str,
-    name: str,
-    fallback: float,
-    units: dict[str, float] | None = None,
-) -> float:
-    """
-    Read a number.
-
-    :param car: the file
-    :param section: where it stands
-    :param name: what it is called
-    :param fallback: if it is not there
-    :param units: their factors; 1 for those that are not named
-    """
-    entry = car.find(f"{section}/attnum[@name='{name}']")
-    if entry is None:
-        return fallback
-    return float(entry.get("val", "")) * (units or {}).get(entry.get("unit", ""), 1.0)
+    final = car.child(DIFFERENTIALS.get(driven, REAR_DIFFERENTIAL))
+    return final.number("ratio", 1.0) / radius

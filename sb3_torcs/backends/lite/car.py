@@ -12,17 +12,16 @@ import numpy as np
 from numba import njit
 
 from sb3_torcs.actions import SHIFT_UP, automatic_gear, launch_clutch
+from sb3_torcs.car import CAR_LENGTH, CAR_WIDTH, LIMITER_RPM, RPM
 
 GRAVITY = 9.80665  # [m/s²]
 
 # Body
 FUEL = 94.0  # [l] a full tank, 1 kg per litre in TORCS
 MASS = 1150.0 + FUEL  # [kg]
-LENGTH = 4.52  # [m]
-WIDTH = 1.94  # [m]
 CG_HEIGHT = 0.25  # [m]
 FRONT_WEIGHT = 0.52  # share of the weight on the front axle
-INERTIA_ARM = 0.62**2 * LENGTH**2 + WIDTH**2  # [m²] "mass repartition coefficient" 0.62
+INERTIA_ARM = 0.62**2 * CAR_LENGTH**2 + CAR_WIDTH**2  # [m²] "mass repartition coefficient" 0.62
 YAW_INERTIA = MASS * INERTIA_ARM / 12.0  # [kg m²]
 MAX_YAW_RATE = 9.0  # [rad/s] the limit of simuv2
 AXLE_FRONT, AXLE_REAR = 1.22, -1.42  # [m] in the car file's frame
@@ -39,7 +38,6 @@ LOAD_LAG = 0.05  # [s] stands for the suspension: how late loads follow accelera
 HEAVE_STIFFNESS = 4 * 5500.0 * 175.127 * 1.1**2  # [N/m] four springs of 5500 lbs/in, bellcrank 1.1
 
 # Steering
-STEER_LOCK = math.radians(21.0)  # [rad]
 STEER_RATE = math.radians(360.0)  # [rad/s]
 
 # Tyres
@@ -65,9 +63,8 @@ _BRAKE_REAR = 29.0e6 * 0.46 * 0.165 * 25.0e-4 * 0.4
 BRAKE = np.array([_BRAKE_FRONT, _BRAKE_FRONT, _BRAKE_REAR, _BRAKE_REAR])  # [N m]
 
 # Motor and gearbox
-RPM = 2.0 * math.pi / 60.0  # [rad/s] per rpm
 TICKOVER = 900.0 * RPM
-LIMITER = 9152.0 * RPM
+LIMITER = LIMITER_RPM * RPM
 REVS_MAX = 10000.0 * RPM
 MOTOR_INERTIA = 0.2423  # [kg m²] simuv2's default
 MOTOR_BRAKE = 0.33  # simuv2's default
@@ -76,7 +73,8 @@ TORQUE = np.array([100, 160, 190, 280, 350, 405, 443, 465, 483, 415, 360, 360], 
 FINAL_DRIVE = 4.5
 GEARS = np.array([-4.0, 0.0, 3.0, 1.9, 1.4, 1.1, 0.9, 0.77])  # reverse, neutral, 1 to 6
 EFFICIENCY = np.array([0.957, 1.0, 0.955, 0.957, 0.95, 0.983, 0.948, 0.94]) * 0.9625
-TOP_GEAR = 6
+RATIOS = GEARS[2:].copy()  # of the forward gears
+TOP_GEAR = len(RATIOS)
 OPEN_CLUTCH = 0.01  # [-] of its way to closed: up to here nothing is passed on
 FULL_TORQUE = 3.0  # [-] a clutch passes all torque from a third of its way on
 SHIFT_TIME = 0.15  # [s] the clutch is open after a change of gear
@@ -120,7 +118,7 @@ def road_speed_gear(gear: int, speed: float) -> tuple[int, float]:
     ratio = GEARS[max(gear, 1) + 1] * FINAL_DRIVE
     engine_speed = max(speed, 0.0) / RADIUS[2] * ratio
     launch = launch_clutch(engine_speed, SHIFT_UP) if gear <= 1 else 0.0
-    return automatic_gear(gear, engine_speed, GEARS), launch
+    return automatic_gear(gear, engine_speed, RATIOS), launch
 
 
 @njit(cache=True)

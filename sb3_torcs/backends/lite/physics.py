@@ -17,7 +17,7 @@ from sb3_torcs.actions import automatic_gear
 from sb3_torcs.backends.lite import car
 from sb3_torcs.backends.lite.rays import cast
 from sb3_torcs.backends.lite.road import ground, project, road_width, walls, wrap
-from sb3_torcs.car import CONTROL_TICK, MAX_DAMAGE, CarState
+from sb3_torcs.car import CAR_LENGTH, CAR_WIDTH, CONTROL_TICK, MAX_DAMAGE, STEER_LOCK, CarState
 from sb3_torcs.car import FloatArray as Floats
 from sb3_torcs.tracks import track as column
 
@@ -113,13 +113,13 @@ def _hit_walls(state: Floats, track: Floats) -> None:
     segment, along = int(state[SEGMENT]), state[ALONG]
     left, right = walls(track, segment, along)
     offset = state[OFFSET]
-    if abs(offset) + car.LENGTH < min(left, right):  # nowhere near
+    if abs(offset) + CAR_LENGTH < min(left, right):  # nowhere near
         return
     cos_yaw, sin_yaw = math.cos(state[YAW]), math.sin(state[YAW])
     to_left_x, to_left_y = -math.sin(state[TANGENT]), math.cos(state[TANGENT])
     for corner in range(4):
-        ahead = (0.5 if corner < 2 else -0.5) * car.LENGTH
-        aside = (0.5 if corner % 2 else -0.5) * car.WIDTH
+        ahead = (0.5 if corner < 2 else -0.5) * CAR_LENGTH
+        aside = (0.5 if corner % 2 else -0.5) * CAR_WIDTH
         dx = ahead * cos_yaw - aside * sin_yaw
         dy = ahead * sin_yaw + aside * cos_yaw
         lateral = offset + dx * to_left_x + dy * to_left_y
@@ -153,7 +153,7 @@ def _hit_walls(state: Floats, track: Floats) -> None:
 def _steer(state: Floats, command: float) -> tuple[float, float]:
     """Turn the steering at its limited rate; return the angles of the right and left wheel."""
     step = car.STEER_RATE * DT
-    state[STEER] += min(max(command * car.STEER_LOCK - state[STEER], -step), step)
+    state[STEER] += min(max(command * STEER_LOCK - state[STEER], -step), step)
     angle = state[STEER]
     tangent = math.tan(abs(angle))
     outer = math.atan2(
@@ -312,7 +312,7 @@ def advance(
     for _tick in range(ticks):
         wanted, clutch = gear, pressed
         if gear == AUTOMATIC:
-            wanted = automatic_gear(int(state[GEAR]), state[MOTOR], car.GEARS)
+            wanted = automatic_gear(int(state[GEAR]), state[MOTOR], car.RATIOS)
         elif gear == BY_ROAD_SPEED:
             speed = state[VX] * math.cos(state[YAW]) + state[VY] * math.sin(state[YAW])
             wanted, launch = car.road_speed_gear(int(state[GEAR]), speed)
