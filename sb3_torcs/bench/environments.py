@@ -49,6 +49,9 @@ def _drive(env: gym.Env[Any, Any], actions: list[Any]) -> float:
     """
     Do actions from a reset on, and begin again where an episode ends.
 
+    ``gymnasium.utils.performance`` does random actions, by the wall clock and with the resets: on a
+    busy machine, and with a car that leaves the road at once, it measures something else.
+
     :param env: any environment
     :param actions: to do
     :return: processor time without the resets [s]

@@ -125,6 +125,9 @@ def table(headers: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """
     Lay out a table: words to the left, numbers to the right.
 
+    It is plain text of any width, which ``cut`` and ``awk`` read. rich's table would need as much
+    code to be kept from folding cells, drawing lines and reading ``[...]`` as markup.
+
     :param headers: of the columns
     :param rows: cells, as many per row as there are headers
     :return: lines without trailing spaces

@@ -65,6 +65,7 @@ class StudyFolder:
         """Keep others out; a killed process lets go of the lock by itself."""
         with (self.path / LOCK).open("w") as file:
             try:
+                # What filelock does, in as few lines.
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
                 raise StudyError(
