@@ -53,9 +53,9 @@ DRAWS = {
     "rendering/highway.py", "rendering/hud.py", "rendering/scenery.py", "rendering/viewer.py",
 }  # fmt: skip
 STARTS_PROGRAMS = {
-    "cli/install_torcs.py",
     "torcs/display.py",
     "torcs/libraries.py",
+    "torcs/packages.py",
     "torcs/process.py",
 }
 STARTS_A_CHILD = {
@@ -66,7 +66,7 @@ STARTS_A_CHILD = {
 HAS_THE_GAME_RUN = {  # and nothing else: no world but one needs another process
     "agents/text_mode.py", "backends/scr.py", "evaluation/watching.py",
     "rendering/game_camera.py", "rendering/game_video.py", "scr/server.py", "torcs/libraries.py",
-    "torcs/results.py", "torcs/window.py",
+    "torcs/packages.py", "torcs/results.py", "torcs/window.py",
 }  # fmt: skip
 USES_A_NETWORK = {"rendering/game_camera.py", "scr/client.py", "scr/server.py", "torcs/display.py"}
 LOADS_THE_ENGINE = {"backends/native.py", "torcs/trial_child.py"}

@@ -20,9 +20,10 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_torcs import __version__
 from sb3_torcs.agents import model_record, models
 from sb3_torcs.bench.stages import KEYS
-from sb3_torcs.cli import VERBS, common, doctor, evaluate, main, recording, train
+from sb3_torcs.cli import VERBS, common, doctor, evaluate, main, train
 from sb3_torcs.errors import BackendUnavailable, InvalidOption
 from sb3_torcs.evaluation import protocol as evaluation
+from sb3_torcs.evaluation import recording
 from sb3_torcs.telemetry import TELEMETRY_FIELDS
 from sb3_torcs.torcs import building
 from sb3_torcs.torcs import process as game_process

@@ -27,12 +27,12 @@ import sb3_torcs  # noqa: F401  registers the environments
 from sb3_torcs import cli, rewards
 from sb3_torcs.agents.models import shipped_agents
 from sb3_torcs.callbacks.metrics import DrivingMetricsCallback
-from sb3_torcs.cli import install_torcs
 from sb3_torcs.envs.torcs import TorcsEnv
 from sb3_torcs.envs.torcs_lite import TorcsLiteEnv
 from sb3_torcs.noise import BLOG
 from sb3_torcs.sensors import RANGE_FINDERS, sensor_table
 from sb3_torcs.studies.config import read_study
+from sb3_torcs.torcs.packages import VIDEO_PACKAGES
 from sb3_torcs.tracks.catalogue import BUNDLED_FOLDER, load_track
 from sb3_torcs.training import zoo
 from sb3_torcs.training.run import TrainOptions
@@ -334,7 +334,7 @@ def test_a_command_in_the_docs_parses_and_names_what_exists(page, line, parsed, 
             assert what == "."
         case ["sudo", "apt", "install", *packages]:
             tools = {"git", "make", "g++", "python3-dev", "python3-venv"}
-            assert set(packages) <= {*tools, *install_torcs.VIDEO_PACKAGES}
+            assert set(packages) <= {*tools, *VIDEO_PACKAGES}
         case other:
             pytest.fail(f"{other} is nothing that a test knows")
 

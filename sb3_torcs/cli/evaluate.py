@@ -103,8 +103,8 @@ def _drive(args: argparse.Namespace) -> tuple[list[Episode], Any]:
     """Build the environment, load the driver, drive."""
     from sb3_torcs.agents.models import load_driver
     from sb3_torcs.agents.wrapping import wrapped
-    from sb3_torcs.cli.recording import Recorder
     from sb3_torcs.evaluation.protocol import choose_world, evaluate, time_limit
+    from sb3_torcs.evaluation.recording import Recorder
     from sb3_torcs.training.zoo import check_racing
 
     record = told_record(args.model)
