@@ -3,8 +3,8 @@
 A study is a table of variants by seeds. A variant is an entry of a hyperparameter file of the RL
 Zoo with some of its values changed; a trial is one variant with one seed.
 
-The checks are written by hand: a schema of pydantic would take as many lines, since most mistakes
-lie in the RL Zoo's entry below a study, and each needs its own words for what to type instead.
+The checks are written by hand: as a schema of pydantic they are longer, since each mistake needs
+its own words for what to type instead, and most lie in the RL Zoo's entry, which no schema knows.
 """
 
 from __future__ import annotations
