@@ -272,12 +272,7 @@ class ScrBackend:
             raise GameFailed(f"{self._process.epitaph()}; call reset to begin anew")
 
     def _failure(self, error: ServerLost) -> Exception:
-        """
-        Say what has happened to a server that is lost.
-
-        :param error: as the client sees it
-        :return: what to raise
-        """
+        """Say what has happened to a server that is lost."""
         if self._process is None:
             return error
         with suppress(GameTimeout, GameFailed):

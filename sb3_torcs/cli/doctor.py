@@ -120,11 +120,7 @@ def _guarded(check: Callable[[], Check]) -> Check:
 
 
 def _found_and_fix(error: Sb3TorcsError) -> tuple[str, str]:
-    """
-    Split a message into what was found and what to do.
-
-    :param error: whose message ends in what to type
-    """
+    """Split a message into what was found and what to do."""
     found, _, remedy = str(error).rpartition("; ")
     typed = remedy.removeprefix("type: ")
     return found, typed if typed == remedy else typed.strip("`")
@@ -310,11 +306,5 @@ def _video() -> Check:
 
 
 def _optional(name: str, found: str, users: str) -> Check:
-    """
-    Say what was found of something that neither environment needs to drive.
-
-    :param name: of the check
-    :param found: what is there, or is not
-    :param users: what does need it
-    """
+    """Say what was found of something that neither environment needs to drive."""
     return Check(name, True, f"{found}; only for {users}", None)

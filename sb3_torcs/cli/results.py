@@ -16,12 +16,7 @@ RACE_HEADERS = ("rank", "driver", "car", "laps", "total s", "best lap s", "damag
 
 
 def _own(results: list[RobotResult], robot: tuple[str, int]) -> RobotResult:
-    """
-    Find the result of one robot.
-
-    :param results: of all
-    :param robot: name and index
-    """
+    """Find the result of one robot."""
     return next(result for result in results if (result.robot, result.index) == robot)
 
 

@@ -121,11 +121,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _announce(args: argparse.Namespace) -> None:
-    """
-    Say where clients are awaited.
-
-    :param args: from the command line
-    """
+    """Say where clients are awaited."""
     last = args.port + args.drivers - 1
     ports = f"port {args.port}" if last == args.port else f"ports {args.port} to {last}"
     time = "the game waits for every answer" if args.wait else f"{args.deadline:g} ms per answer"
@@ -133,11 +129,7 @@ def _announce(args: argparse.Namespace) -> None:
 
 
 def _report(line: str) -> None:
-    """
-    Pass on what our drivers say.
-
-    :param line: that the game printed
-    """
+    """Pass on what our drivers say."""
     if line.startswith(REPORT):
         print(line, flush=True)
 

@@ -186,12 +186,7 @@ def _in_window(show: Show, args: argparse.Namespace) -> None:
 
 
 def _report(name: str, show: Show) -> None:
-    """
-    Say how it ended.
-
-    :param name: of the model or robot
-    :param show: the race
-    """
+    """Say how it ended."""
     if show.results:
         show_results(show.results, show.race.drivers[0], str(show.track))
     elif show.agent is not None and show.agent.end is not None:

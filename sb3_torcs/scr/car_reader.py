@@ -108,11 +108,7 @@ class CarReader:
 
 
 def _read_only(numbers: tuple[float, ...]) -> FloatArray:
-    """
-    Make an array that nobody can change.
-
-    :param numbers: that it holds
-    """
+    """Make an array that nobody can change."""
     array = np.array(numbers)
     array.flags.writeable = False
     return array

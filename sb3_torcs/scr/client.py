@@ -256,11 +256,7 @@ class ScrClient:
         return None
 
     def _take(self, flags: int = 0) -> bytes:
-        """
-        Take a datagram.
-
-        :param flags: of ``recv``
-        """
+        """Take a datagram."""
         size = self._socket.recv_into(self._buffer, 0, flags)
         return self._buffer[:size].tobytes()
 
@@ -299,11 +295,7 @@ class ScrClient:
         return state
 
     def _unreachable(self, error: OSError) -> ServerLost:
-        """
-        Build the error.
-
-        :param error: of the socket
-        """
+        """Build the error."""
         closed = isinstance(error, ConnectionError)
         return self._lost("its port is closed" if closed else error.strerror or str(error))
 

@@ -416,11 +416,6 @@ def _numbers(name: bytes, words: list[bytes], size: int) -> tuple[float, ...]:
 
 
 def _broken(what: str, text: bytes) -> MessageBroken:
-    """
-    Build the error.
-
-    :param what: is wrong
-    :param text: where it was found
-    """
+    """Build the error."""
     shown = text[:60] + (b"..." if len(text) > 60 else b"")
     return MessageBroken(f"a message of the SCR protocol {what}: {shown!r}")

@@ -89,14 +89,7 @@ def _figure(trials: Sequence[Results]) -> tuple[Any, Any]:
 
 
 def _bands(panels: Any, every: Sequence[dict[str, Array]], colour: Any) -> tuple[Array, Any]:
-    """
-    Draw the means of a variant's seeds, as far as all seeds are.
-
-    :param panels: of :func:`_figure`
-    :param every: curves of each seed
-    :param colour: of the lines
-    :return: timesteps in thousands, and the curves that far, each (seeds, evaluations)
-    """
+    """Draw the means of a variant's seeds, as far as all seeds are."""
     length = min(len(curves["timesteps"]) for curves in every)
     shared = {name: np.array([curves[name][:length] for curves in every]) for name in every[0]}
     timesteps = shared["timesteps"].mean(axis=0) / 1000.0

@@ -299,21 +299,12 @@ def track_path(game: Game, track: str | os.PathLike[str]) -> Path:
 
 
 def _given(home: Path | None) -> str | None:
-    """
-    Say where alone to look.
-
-    :param home: by the caller, who goes before the environment variable
-    :return: a path, or ``None`` for everywhere
-    """
+    """Say where alone to look."""
     return os.environ.get(HOME_VARIABLE) or None if home is None else os.fspath(home)
 
 
 def _remedy(home: Path | None) -> str:
-    """
-    Say what to type.
-
-    :param home: as given by the caller
-    """
+    """Say what to type."""
     if home is None and _given(home):
         return f"let {HOME_VARIABLE} name another folder, or unset it and type: {INSTALL}"
     return f"type: {INSTALL}"
@@ -357,12 +348,7 @@ def _candidates(home: Path | None) -> Iterator[_Candidate]:
 
 
 def _libraries(root: Path) -> Path | None:
-    """
-    Find the folder of the game's libraries.
-
-    :param root: of the installation
-    :return: the folder, if there is one; that of this processor first
-    """
+    """Find the folder of the game's libraries."""
     found = [path for pattern in LIBRARY_FOLDERS for path in sorted(root.glob(pattern))]
     own = getattr(sys.implementation, "_multiarch", "")
     found.sort(key=lambda path: path.parent.name != own)

@@ -103,13 +103,7 @@ def _apt_install(packages: Sequence[str], otherwise: str, tell: Tell) -> None:
 
 
 def _shown(call: Sequence[str], tell: Tell) -> int:
-    """
-    Run a program that shows its own progress.
-
-    :param call: program and arguments
-    :param tell: shows them
-    :return: the exit status
-    """
+    """Run a program that shows its own progress."""
     tell(f"+ {' '.join(call)}")
     return subprocess.run(
         call, env=_environment(), stdin=subprocess.DEVNULL, check=False
@@ -122,12 +116,7 @@ def _environment() -> dict[str, str]:
 
 
 def _output(call: Sequence[str]) -> str:
-    """
-    Run a program for what it prints.
-
-    :param call: program and arguments
-    :return: its standard output; empty if it fails
-    """
+    """Run a program for what it prints."""
     done = subprocess.run(
         call, env=_environment(), stdin=subprocess.DEVNULL, capture_output=True, check=False
     )
@@ -135,11 +124,7 @@ def _output(call: Sequence[str]) -> str:
 
 
 def _apt_knows(options: Sequence[str]) -> bool:
-    """
-    Ask apt whether it knows the game.
-
-    :param options: for apt
-    """
+    """Ask apt whether it knows the game."""
     return bool(_output(["apt-cache", *options, "show", "--no-all-versions", *PACKAGES]))
 
 
@@ -191,12 +176,7 @@ def _apt_options(staging: Path) -> list[str]:
 
 
 def _wanted(options: Sequence[str]) -> list[str]:
-    """
-    Find out which packages to get: the game, and what it needs and the system has not.
-
-    :param options: for apt
-    :return: names of packages
-    """
+    """Find out which packages to get: the game, and what it needs and the system has not."""
     call = ["apt-get", *options, "--simulate", "--no-install-recommends", "install", *PACKAGES]
     words = [line.split() for line in _output(call).splitlines()]
     # With the version it has in brackets, a line is about a package that is there.
@@ -290,11 +270,7 @@ def _quietly(call: Sequence[str], folder: Path, look: Callable[[], None]) -> Non
 
 
 def _last_words(words: IO[bytes]) -> str:
-    """
-    Read the end of what a program printed.
-
-    :param words: the file that it printed to
-    """
+    """Read the end of what a program printed."""
     words.seek(0)
     lines = words.read().decode(errors="replace").splitlines()
     return " / ".join([line.strip() for line in lines if line.strip()][-LAST_LINES:]) or "no words"

@@ -103,12 +103,7 @@ class _Parser:
         return f"{path}, line {parser.CurrentLineNumber}"
 
     def _fail(self, message: str) -> TrackFileError:
-        """
-        Build the error for the present line.
-
-        :param message: what is wrong
-        :return: the error, to be raised
-        """
+        """Build the error for the present line."""
         return TrackFileError(f"{self._place}: {message}")
 
     def _feed(self, path: Path, parser: expat.XMLParserType) -> None:
@@ -241,11 +236,7 @@ class _Parser:
                 inside.texts[name] = text
 
     def _end(self, tag: str) -> None:
-        """
-        Take in a closing tag.
-
-        :param tag: its name
-        """
+        """Take in a closing tag."""
         self._depth -= 1
         if tag == "section":
             self._open.pop()
@@ -267,14 +258,7 @@ class _Parser:
         return name
 
     def _attribute(self, tag: str, attributes: dict[str, str], name: str) -> str:
-        """
-        Read an attribute that has to be there.
-
-        :param tag: that has it
-        :param attributes: of the tag
-        :param name: of the attribute
-        :return: its text
-        """
+        """Read an attribute that has to be there."""
         if name not in attributes:
             raise self._fail(f"<{tag}> without '{name}'")
         return attributes[name]
@@ -337,12 +321,7 @@ def digests(path: Path, data: Sequence[Path] = ()) -> tuple[str, ...]:
 
 
 def _surface_files(path: Path, data: Sequence[Path]) -> list[Path]:
-    """
-    List where the surfaces may lie that a track includes; the first one that is there counts.
-
-    :param path: of the track's file
-    :param data: folders of TORCS's data
-    """
+    """List where the surfaces may lie that a track includes; the first one that is there counts."""
     real = path.resolve()
     folders = [real.parent, *real.parents[3:4], *data]
     shared = [folder / "data" / "tracks" / SHARED_SURFACES for folder in folders]

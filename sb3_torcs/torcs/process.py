@@ -255,22 +255,12 @@ def game_environment(game: Game, folder: Path) -> dict[str, str]:
 
 
 def _is_own(race: RaceSetup) -> bool:
-    """
-    Say whether the track is a file of the user's, not one of the game's.
-
-    :param race: with the track
-    """
+    """Say whether the track is a file of the user's, not one of the game's."""
     return os.fspath(race.track).lower().endswith(".xml")
 
 
 def _track_file(game: Game, race: RaceSetup) -> Path:
-    """
-    Find the file of the track.
-
-    :param game: the installation
-    :param race: with the track
-    :return: its path, absolute
-    """
+    """Find the file of the track."""
     if _is_own(race):
         return Path(os.path.expanduser(race.track)).absolute()
     return game.tracks()[game.find_track(os.fspath(race.track))].absolute()
@@ -328,13 +318,7 @@ def _libraries(game: Game, folder: Path, race: RaceSetup) -> Path:
 
 
 def _link_all(source: Path, target: Path, besides: str = "") -> None:
-    """
-    Link to everything in a folder.
-
-    :param source: the folder
-    :param target: where the links are put; what is there stays
-    :param besides: a name to leave out
-    """
+    """Link to everything in a folder."""
     for path in source.iterdir():
         if path.name != besides and not os.path.lexists(target / path.name):
             (target / path.name).symlink_to(path)
@@ -368,13 +352,7 @@ def _start(
 
 
 def _end(process: subprocess.Popen[bytes], folder: Path, owner: int) -> None:
-    """
-    End the game and remove its folder.
-
-    :param process: of the game
-    :param folder: private to it
-    :param owner: the process that started it; a fork of that leaves the game alone
-    """
+    """End the game and remove its folder."""
     if os.getpid() != owner:
         return
     process.kill()  # it has nothing to save

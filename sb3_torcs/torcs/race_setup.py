@@ -177,11 +177,6 @@ def _forbid_learning(folder: Path, race: RaceSetup) -> None:
 
 
 def _needed(game: Game, file: str) -> None:
-    """
-    Make sure that a file of the game's data is there.
-
-    :param game: the installation
-    :param file: seen from its data
-    """
+    """Make sure that a file of the game's data is there."""
     if not (game.data / file).is_file():
         raise GameIncomplete(f"there is no {game.data / file}; type: `sb3-torcs install-torcs`")

@@ -126,9 +126,5 @@ def _race_result(row: Node, rank: int, cars: Mapping[tuple[str, int], str]) -> R
 
 
 def _position(section: Node) -> int:
-    """
-    Read the number that a section goes by.
-
-    :param section: of a list
-    """
+    """Read the number that a section goes by."""
     return int(section.name or 0)

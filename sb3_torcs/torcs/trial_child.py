@@ -52,12 +52,7 @@ def encoded(race: dict[str, Any]) -> dict[str, Any]:
 
 
 def _answer(status: int, answer: bytes) -> None:
-    """
-    Hand over the answer and end, before any more of the game's code runs.
-
-    :param status: of the process
-    :param answer: the road's numbers, or the error
-    """
+    """Hand over the answer and end, before any more of the game's code runs."""
     sys.stdout.flush()
     sys.stdout.buffer.write(ANSWER + answer)
     sys.stdout.buffer.flush()
@@ -65,12 +60,7 @@ def _answer(status: int, answer: bytes) -> None:
 
 
 def _look_around(engine: Any, places: int) -> None:
-    """
-    Put the car on the road here and there, and drive: a few heights or widths may be absurd.
-
-    :param engine: of the race
-    :param places: along the road
-    """
+    """Put the car on the road here and there, and drive: a few heights or widths may be absurd."""
     length = engine.track_summary()["length"]
     for place in range(places):
         with contextlib.suppress(Sb3TorcsError):  # who starts there is told so

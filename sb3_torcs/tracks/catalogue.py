@@ -94,13 +94,7 @@ def _known_files() -> dict[str, tuple[Path, str]]:
 
 
 def _read(path: Path, source: str) -> Track:
-    """
-    Read a track file of either kind, once per content: times may stay as they are.
-
-    :param path: of the file
-    :param source: where it came from
-    :return: the track
-    """
+    """Read a track file of either kind, once per content: times may stay as they are."""
     return _read_once(path.resolve(), source, digests(path, torcs_folders()))
 
 

@@ -191,12 +191,7 @@ def read_track_file(path: Path) -> Track:
 
 
 def _surfaces(segment: Segment) -> tuple[Surface, ...]:
-    """
-    List the surfaces of a segment in the order of the file.
-
-    :param segment: that has them
-    :return: its surfaces
-    """
+    """List the surfaces of a segment in the order of the file."""
     return segment.road, segment.left, segment.right, segment.left_wall, segment.right_wall
 
 

@@ -73,13 +73,7 @@ def check_pits(main: Section, version: int, names: Sequence[str], steps: Sequenc
 
 
 def _beside(names: Sequence[str], start: str, end: str) -> list[int]:
-    """
-    List the steps that the game's loader visits: those of the pits, and one before and after.
-
-    :param names: of the steps' segments
-    :param start: the first segment of the pits
-    :param end: the last one
-    """
+    """List the steps that the game's loader visits: those of the pits, and one before and after."""
     first = names.index(start) - 1
     last = len(names) - names[::-1].index(end)
     if last < first:

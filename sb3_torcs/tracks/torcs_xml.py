@@ -93,14 +93,7 @@ class _Builder:
         """Of the segments that these steps are of."""
 
     def _of(self, section: Section, verge: _Verge, part: str) -> _Keys:
-        """
-        Find what a section says of a part of the verge.
-
-        :param section: of the segment, or the one with the defaults
-        :param verge: left or right
-        :param part: ``"side"``, ``"border"`` or ``"barrier"``
-        :return: the way to the values
-        """
+        """Find what a section says of a part of the verge."""
         if self.version >= 4:
             return _Keys(section.child(f"{verge.side.title()} {part.title()}"), "")
         return _Keys(section, f"{verge.side[0]}{part} ")
