@@ -53,8 +53,8 @@ def test_for_people_it_prints_three_lines(race, capsys):
     words = ["compete", "scripted", "--port", str(port), "--track", "a-speedway"]
     assert main([*words, "--name", "Ann Other"]) == 0
     ready, awaiting, first, second, third = capsys.readouterr().out.splitlines()
-    assert ready == f"scripted gets ready to drive in the race at 127.0.0.1, UDP port {port}"
-    assert awaiting.startswith(f"awaiting the SCR server at 127.0.0.1, UDP port {port}")
+    assert ready == f"scripted is being loaded for the race at 127.0.0.1, UDP port {port}"
+    assert awaiting.startswith(f"waiting for the SCR server at 127.0.0.1, UDP port {port}")
     assert "calls itself Ann Other" in process.words()
     assert re.fullmatch(r"lap times s: [\d.]+; \d+ m", first)
     assert re.fullmatch(r"lost ticks: \d+; answers: \d+", second)
@@ -68,7 +68,7 @@ def test_a_server_that_is_not_there_is_told(monkeypatch, capsys):
     bound.close()
     assert main(["compete", "scripted", "--port", str(port)]) == 2
     out, err = capsys.readouterr()
-    assert f"awaiting the SCR server at 127.0.0.1, UDP port {port}" in out
+    assert f"waiting for the SCR server at 127.0.0.1, UDP port {port}" in out
     assert f"no SCR server answers at 127.0.0.1:{port}" in err
 
 
@@ -82,7 +82,7 @@ def test_what_it_waits_for_is_told_before_anything_is_loaded():
     )
     loaded = []
     for line in process.stdout:
-        if f"gets ready to drive in the race at 127.0.0.1, UDP port {port}" in line:
+        if f"is being loaded for the race at 127.0.0.1, UDP port {port}" in line:
             break
         loaded.append(line.split("|")[-1].strip())
     bound.close()

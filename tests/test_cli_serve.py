@@ -75,7 +75,7 @@ def test_a_client_drives_a_race_to_its_end(folder):
         assert client.drive() == b"***shutdown***\0"
     out, err = process.communicate(timeout=PATIENCE)
     assert process.returncode == 0, err
-    assert f"awaiting SCR clients at 127.0.0.1, UDP port {port}; the game waits" in out
+    assert f"waiting for SCR clients at 127.0.0.1, UDP port {port}; the game waits" in out
     assert f"scr_server 0: {client.address}: {client.answers} timesteps, 0 late" in out
     assert f"{client.address}, car1-trb1, a-speedway" in out
 
@@ -162,7 +162,7 @@ def test_what_was_driven_until_it_is_ended_is_told(folder, number):
 def test_what_clients_do_wrong_is_told_while_the_race_runs(folder):
     port = free_ports()
     process = serve(folder, port, "--wait")
-    assert "awaiting SCR clients" in process.stdout.readline()
+    assert "waiting for SCR clients" in process.stdout.readline()
     with ThirdParty(port) as client, ThirdParty(port) as stranger:
         client.identify()
         assert f"{client.address} drives" in process.stdout.readline()

@@ -165,7 +165,7 @@ def test_without_a_display_it_offers_a_video(monkeypatch, capsys):
     ("words", "message"),
     [
         (["infernal"], "there is no model 'infernal'"),
-        (["infernal"], "nor is there a robot 'infernal'; did you mean 'inferno'?"),
+        (["infernal"], "and there is no robot 'infernal'; did you mean 'inferno'?"),
         (["inferno", "--beside", "bt"], "--beside is for videos; add --video FILE.mp4"),
         (["inferno", "--fps", "10"], "--fps is for videos; add --video FILE.mp4"),
         (["inferno", "--beside", "bt:4", "--car", "buggy", "--video", "lap.mp4"], "--car is for"),

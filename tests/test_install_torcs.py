@@ -237,7 +237,7 @@ def test_elsewhere_it_says_what_to_do(machine, capsys):
 def test_a_named_folder_without_a_game_is_not_papered_over(machine, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("SB3_TORCS_HOME", str(tmp_path / "empty"))
     assert main(["install-torcs"]) == 1
-    assert "would not be looked at while SB3_TORCS_HOME is set" in capsys.readouterr().err
+    assert "no other folder is looked at while SB3_TORCS_HOME is set" in capsys.readouterr().err
     assert log(machine) == []
 
 

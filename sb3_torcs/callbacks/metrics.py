@@ -265,7 +265,7 @@ class DrivingMetricsCallback(BaseCallback):
     ``EvalCallback`` anywhere in the training's callbacks, one more lap is driven in its environment
     and drawn, if TensorBoard listens.
 
-    :param q_every: timetimesteps of the vector of environments between two looks at Q
+    :param q_every: timesteps of the vector of environments between two looks at Q
     :param q_size: transitions to ask the critic about
     :param line: whether to draw the line after evaluations
     :param line_timesteps: timesteps after which a lap is given up

@@ -47,7 +47,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     Run one verb.
 
     :param argv: the words after the command's name; ``None`` takes those of the process
-    :return: the exit status: 0, 2 for a mistake in what was asked, 130 after Ctrl-C
+    :return: the exit status: 0, 2 if the command cannot be run as typed, 130 after Ctrl-C
     """
     words = list(sys.argv[1:] if argv is None else argv)
     with any_terminal():
@@ -56,7 +56,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parsed(words: list[str]) -> argparse.Namespace | None:
-    """Read the command line; without a verb, which has nothing to be run, say what there is."""
+    """Read the command line. Without a verb, print the help and return ``None``."""
     split = words.index("--") if "--" in words else len(words)
     parser, verbs = _parser()
     if split > 0:
@@ -67,14 +67,14 @@ def _parsed(words: list[str]) -> argparse.Namespace | None:
         parser.print_help()
         return None
     if args.zoo_args and args.verb != "train":
-        parser.error(f"{args.verb} passes nothing on; leave out '--' and what follows it")
+        parser.error(f"{args.verb} takes no arguments after '--'; leave them out")
     return args
 
 
 def _run(args: argparse.Namespace) -> int:
-    """Run a verb, and tell what stops it in one line."""
+    """Run a verb; print an error as one line."""
     try:
-        # nohup ignores the latter.
+        # Under nohup, SIGHUP is ignored and stays so.
         ends = [n for n in (SIGTERM, SIGHUP) if signal.getsignal(n) == signal.SIG_DFL]
         with answered(_end, *ends):
             status: int = args.run(args)
@@ -82,7 +82,7 @@ def _run(args: argparse.Namespace) -> int:
     except Sb3TorcsError as error:
         print(f"sb3-torcs: {error}", file=sys.stderr)
         return USAGE_ERROR
-    except BrokenPipeError:  # the reader, e.g. `head`, has seen enough
+    except BrokenPipeError:  # the reader, e.g. `head`, has ended
         _drop_output()
         return READER_LEFT
     except OSError as error:
@@ -98,14 +98,14 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _end(number: int, frame: FrameType | None) -> None:
-    """Clean up before SIGTERM, or the terminal's going away, ends the process."""
+    """Let SIGTERM and SIGHUP end the process as an exception does, so that it cleans up."""
     del frame
     raise SystemExit(128 + number)
 
 
 def _drop_output() -> None:
-    """Let Python, when it ends, write what it still holds to nowhere."""
-    with contextlib.suppress(OSError):  # it is no file
+    """Discard what is still to be written to standard output."""
+    with contextlib.suppress(OSError):  # standard output is not a file
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 

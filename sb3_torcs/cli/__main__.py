@@ -1,4 +1,4 @@
-"""``python -m sb3_torcs.cli``: the command, where its script is not installed."""
+"""``python -m sb3_torcs.cli``: the same command, also where its script is not installed."""
 
 from __future__ import annotations
 

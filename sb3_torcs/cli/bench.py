@@ -11,20 +11,27 @@ from sb3_torcs.cli.common import print_json, quiet_output, table
 __all__ = ["add_parser", "run"]
 
 DESCRIPTION = """\
-Measure speeds on one core, in processor time, the compared ones in turns.
+Measure speeds on one core, in processor time. Figures to be compared are measured in turns.
 
-lite_ticks_per_s: env.step of TorcsLite-v0, action_repeat=1, on actions that a scripted driver
-chose beforehand; resets are not counted. racetrack_v1_steps_per_s: env.step of highway-env's
-racetrack-v1. torcs_limit_ticks_per_s: the bare physics of the game along a recorded drive;
-torcs_cpp_ticks_per_s: that drive in the engine, with rules and sensors; torcs_env_*: env.step of
-Torcs-v0 on it. torcs_reset_ms: to the grid and to random places by turns. torcs_load_ms: gym.make
-on the track that takes longest. torcs_vector2_ratio: what a second thread brings to gym.make_vec
-with 16 races, over what a second process brings to bare engines. scr_ticks_per_s: env.step with
-backend="scr", five ticks per timestep; scr_reset_ms: as torcs_reset_ms; game_frames_per_s: of
-render_mode="game", 640x480. These last four are by the wall clock, since processes take turns.
-policy_*: updates of a DDPG with SplitHeadPolicy, batch 64. training_env_share: part of a DDPG
-training timestep (shipped hyperparameters) that the environment and the callbacks take.
-What cannot be measured here is null.
+lite_ticks_per_s          env.step of TorcsLite-v0, action_repeat=1, without resets; a scripted
+                          driver has chosen the actions beforehand
+racetrack_v1_steps_per_s  env.step of highway-env's racetrack-v1
+torcs_limit_ticks_per_s   the game's bare physics, along a recorded drive
+torcs_cpp_ticks_per_s     the same drive in the engine, with rules and sensors
+torcs_env_*               the same drive by env.step of Torcs-v0
+torcs_reset_ms            resets of Torcs-v0, to the grid and to random positions in turns
+torcs_load_ms             gym.make on the track that takes longest
+torcs_vector2_ratio       the gain by a second thread in gym.make_vec with 16 races, divided by the
+                          gain by a second process with bare engines
+scr_ticks_per_s           env.step with backend="scr", five ticks per timestep
+scr_reset_ms              resets with backend="scr"
+game_frames_per_s         render_mode="game" at 640x480
+policy_*                  updates of a DDPG with SplitHeadPolicy, batch size 64
+training_env_share        share of a DDPG training (shipped hyperparameters) that the environment
+                          and the callbacks take
+
+torcs_vector2_ratio, scr_* and game_frames_per_s are measured by the wall clock, since several
+processes or threads work. A figure that cannot be measured on this machine is null.
 """
 
 

@@ -1,4 +1,4 @@
-"""What several verbs share: numbers from the command line, files to write, JSON."""
+"""Helpers of several verbs: numbers from the command line, JSON, tables."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ __all__ = [
 
 MODEL_HELP = "a saved .zip, a run's folder, a shipped agent, or 'scripted'"
 
-TRUST_HELP = "run the code that is pickled in the model: only if you know who made it"
+TRUST_HELP = "run the code that is pickled in the model: only if you trust its author"
 
 
 def told_record(driver: str) -> TrainingRecord:
     """
-    Read how a driver was trained, and tell on standard error if nothing is known.
+    Read how a driver was trained; warn on standard error if no record is found.
 
     :param driver: as typed
-    :return: what is known
+    :return: the record, which may be empty
     """
     from sb3_torcs.agents.models import driver_record
     from sb3_torcs.agents.scripted import SCRIPTED
@@ -43,8 +43,8 @@ def told_record(driver: str) -> TrainingRecord:
     record = driver_record(driver)
     if not record.known and driver != SCRIPTED:
         print(
-            f"sb3-torcs: '{driver}' has no record of its training: track, car, action repeat and "
-            "range finders are the defaults where you do not give them",
+            f"sb3-torcs: '{driver}' has no record of its training; track, car, action repeat "
+            "and range finders are the defaults, unless you give them",
             file=sys.stderr,
         )
     return record
@@ -105,7 +105,7 @@ def quiet_output(active: bool) -> Iterator[None]:
 
 def print_json(value: Any) -> None:
     """
-    Print one JSON value; what is not a finite number becomes ``null``.
+    Print one JSON value; infinities and NaN become ``null``.
 
     :param value: of plain Python types
     """

@@ -1,4 +1,4 @@
-"""``sb3-torcs compete``: a trained agent as an ordinary SCR client in somebody else's race."""
+"""``sb3-torcs compete``: a trained agent as a client in a race of another SCR server."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ if TYPE_CHECKING:
 __all__ = ["add_parser", "run"]
 
 KEPT = ("track", "car", "action_repeat", "range_finders", "action", "gearbox")
-"""What is taken from the training, unless the command line says otherwise."""
+"""Settings that are taken from the training, unless they are given on the command line."""
 
 DESCRIPTION = """\
-Drive a saved model in a race that runs elsewhere: `sb3-torcs serve`, a patched game, a league's
-server. The agent decides as often as in its training and answers every tick in between; it drives
-to the end of the race, whatever happens.
+Drive a saved model in a race of an SCR server: `sb3-torcs serve`, a patched game, a league's
+server. The agent chooses an action as often as in its training, and repeats it at every control
+tick in between. It drives to the end of the race, even beside the road.
 
-The protocol does not tell the track and the car: --track and --car say what runs there. The track
-only serves to place the car on the map, the car for its gearbox.
+The protocol does not tell the client which track and which car it drives: give them with --track
+and --car. The track is used to compute the car's position, the car for its gearbox.
 """
 
 
@@ -47,9 +47,11 @@ def add_parser(subparsers: Any) -> None:
     add("model", metavar="MODEL", help=MODEL_HELP)
     add("--host", default="127.0.0.1", metavar="H", help="default: 127.0.0.1")
     add("--port", type=positive, default=3001, metavar="P", help="default: 3001")
-    add("--track", metavar="T", help="that runs there; default: that of the training, or aalborg")
-    add("--car", metavar="C", help="that one drives there; default: that of the training")
-    add("--name", metavar="N", help="of the driver, which `serve` shows; default: the model's")
+    add(
+        "--track", metavar="T", help="track of that race; default: that of the training, or aalborg"
+    )
+    add("--car", metavar="C", help="car of that race; default: that of the training")
+    add("--name", metavar="N", help="name of the driver, which `serve` shows; default: the model's")
     add("--algo", help="the model's algorithm, if it cannot be found out")
     add("--trust", action="store_true", help=TRUST_HELP)
     add("--json", action="store_true", help="print one JSON object and nothing else")
@@ -62,8 +64,8 @@ def run(args: argparse.Namespace) -> int:
     :return: the exit status
     """
     where = f"{args.host}, UDP port {args.port}"
-    with quiet_output(args.json):  # loading takes seconds; whoever waits is told at once for what
-        print(f"{args.model} gets ready to drive in the race at {where}", flush=True)
+    with quiet_output(args.json):  # said first, because loading takes seconds
+        print(f"{args.model} is being loaded for the race at {where}", flush=True)
 
     from sb3_torcs.agents.models import driver_name, one_track
     from sb3_torcs.agents.remote import Agent
@@ -76,8 +78,8 @@ def run(args: argparse.Namespace) -> int:
     with quiet_output(args.json):
         name = args.name or driver_name(args.model)
         agent = Agent(args.model, settings, args.algo, args.trust, name)
-        print(f"awaiting the SCR server at {where}, and there the start of the race", flush=True)
-    # To look through all that was loaded for what can be freed takes longer than a tick.
+        print(f"waiting for the SCR server at {where} and the start of its race", flush=True)
+    # A garbage collection over everything that was loaded would take longer than a tick.
     gc.collect()
     gc.freeze()
     try:
@@ -85,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
             agent.drive()
     finally:
         gc.unfreeze()
-        # What was driven counts, also when the server is gone or Ctrl-C has ended it.
+        # The results so far are told, also after Ctrl-C and when the server is gone.
         if agent.backend.latencies and args.json:
             print_json(_figures(agent))
         elif agent.backend.latencies:
@@ -95,7 +97,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _figures(agent: Agent) -> dict[str, Any]:
     """
-    Collect what is told.
+    Collect the results.
 
     :param agent: after its drive
     """
@@ -115,7 +117,7 @@ def _figures(agent: Agent) -> dict[str, Any]:
 
 def _show(agent: Agent) -> None:
     """
-    Print what is told, for people.
+    Print the results as text.
 
     :param agent: after its drive
     """

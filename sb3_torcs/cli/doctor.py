@@ -34,7 +34,7 @@ PACKAGES = {
     "tensorboard": "tensorboard",
     "torch": "torch",
 }
-"""Distributions, and what is imported of them."""
+"""Names of distributions, and of the modules that are imported of them."""
 
 EXTENSION = "sb3_torcs._engine"
 COMPILERS = ("c++", "g++", "clang++")
@@ -46,7 +46,7 @@ REINSTALL = "sudo apt-get install --reinstall torcs torcs-data"
 
 @dataclass(frozen=True)
 class Check:
-    """One thing that was looked at."""
+    """The result of one check."""
 
     name: str
     ok: bool
@@ -91,9 +91,9 @@ def run(args: argparse.Namespace) -> int:
 
 def checks() -> list[Check]:
     """
-    Look at everything.
+    Run all checks.
 
-    :return: one result per thing
+    :return: one result per check
     """
     results = [_python(), *(_package(name, module) for name, module in PACKAGES.items())]
     lite = (_compile_cache, _bundled_tracks, _video_encoder, _torcslite)
@@ -108,7 +108,7 @@ def checks() -> list[Check]:
 
 
 def _guarded(check: Callable[[], Check]) -> Check:
-    """Look at something that may be too broken to look at: that, too, is a finding."""
+    """Run a check; if it raises, the error is its result."""
     name = check.__name__.strip("_").replace("_", " ")
     try:
         return check()
@@ -142,7 +142,7 @@ def _package(name: str, module: str) -> Check:
 
 
 def _compile_cache() -> Check:
-    """Where numba keeps compiled code; without it each start compiles anew, for seconds."""
+    """Find numba's cache. Without one, each start compiles for seconds."""
     from numba.core import config
 
     import sb3_torcs.backends
@@ -185,7 +185,7 @@ def _torcslite() -> Check:
 
 
 def _compiler() -> Check:
-    """Look for what builds the extension: once that is there, nobody misses the compiler."""
+    """Look for a C++ compiler, which is needed until the extension is built."""
     named = os.environ.get("CXX")
     compilers = (named,) if named else COMPILERS
     path = next((found for name in compilers if (found := shutil.which(name))), None)
@@ -213,7 +213,7 @@ def _game() -> Check:
 
 
 def _tracks() -> Check:
-    """Read the game's own tracks, every one."""
+    """Read all tracks of the game."""
     from sb3_torcs.tracks.catalogue import load_track
 
     tracks = find_game().tracks()
@@ -259,7 +259,7 @@ def _torcs() -> Check:
 
 
 def _game_program() -> Check:
-    """See whether the game's own program runs: the engine of this process does without."""
+    """Check that the game's program would start. `Torcs-v0` does not need it."""
     from sb3_torcs.torcs.libraries import missing_libraries
 
     try:
@@ -276,7 +276,7 @@ def _game_program() -> Check:
 
 
 def _game_libraries() -> Check:
-    """Look for what we built for the inside of the game's own program."""
+    """Look for our libraries that the game's program loads."""
     from sb3_torcs.torcs.process import compiled_library
 
     try:
@@ -295,7 +295,7 @@ def _window() -> Check:
 
 
 def _video() -> Check:
-    """Look for the display that nobody sees."""
+    """Look for Xvfb."""
     from sb3_torcs.torcs.display import INSTALL, PROGRAM
 
     program = shutil.which(PROGRAM)
@@ -306,5 +306,5 @@ def _video() -> Check:
 
 
 def _optional(name: str, found: str, users: str) -> Check:
-    """Say what was found of something that neither environment needs to drive."""
+    """Report something that no environment needs to drive."""
     return Check(name, True, f"{found}; only for {users}", None)

@@ -1,4 +1,4 @@
-"""``sb3-torcs evaluate``: drive some laps and write down what happened."""
+"""``sb3-torcs evaluate``: drive some laps and report the results."""
 
 from __future__ import annotations
 
@@ -28,16 +28,15 @@ __all__ = ["add_parser", "environment_kwargs", "run"]
 HEADERS = ("episode", "laps", "lap times s", "distance m", "end", "damage", "return")
 
 DESCRIPTION = """\
-Drive some episodes from the grid, deterministically, and write down what happened.
+Drive some episodes from the grid, deterministically, and report the results.
 
-An episode ends after --laps laps or when the car leaves the road, faces backwards, stands or
-breaks. The time limit is what the slowest car needs that does not count as standing, so it cuts
-no lap short.
+An episode ends after --laps laps, or when the car leaves the road, faces backwards, stands still
+or breaks. The time limit is long enough for the slowest car that does not count as standing still.
 
-What is not given is as in the training, if its config.yml lies beside the model (the RL Zoo puts
-it there): environment, track, car, reward, action repeat and range finders. A model that does not
-say where it was trained drives in the game, or in TorcsLite-v0 where Torcs-v0 does not run.
-Standard error tells which world that is, and why.
+Environment, track, car, reward, action repeat and range finders are those of the training, unless
+you give others. They are read from the model's record, or from the config.yml beside it. A model
+without either drives in the game, or in TorcsLite-v0 where Torcs-v0 does not run; standard error
+tells which, and why.
 """
 
 
@@ -66,7 +65,7 @@ def add_parser(subparsers: Any) -> None:
     add("--json", action="store_true", help="print one JSON object and nothing else")
     add("--video", metavar="FILE.mp4", help="record the best lap from above")
     add("--line", metavar="FILE.png", help="draw the line of the best lap, coloured by speed")
-    add("--telemetry", metavar="FILE.csv", help="write the drives themselves down")
+    add("--telemetry", metavar="FILE.csv", help="write all timesteps to a table")
     parser.set_defaults(run=run)
 
 
@@ -115,7 +114,7 @@ def _drive(args: argparse.Namespace) -> tuple[list[Episode], Any]:
     check_racing(env_id)
     kwargs = environment_kwargs(args, record)
     recorder = Recorder(env_id, kwargs, time_limit(kwargs))
-    # Wrappers are around the recorder: what comes through them is what the car did.
+    # The recorder is inside the wrappers, so it records the actions that reach the car.
     env = wrapped(recorder, record.hyperparameters, trust=args.trust)
     driver = load_driver(args.model, env, args.algo, args.trust)
     result = evaluate(env, driver, episodes=args.episodes, seed=args.seed)
@@ -124,9 +123,9 @@ def _drive(args: argparse.Namespace) -> tuple[list[Episode], Any]:
 
 def environment_kwargs(args: argparse.Namespace, record: TrainingRecord) -> dict[str, Any]:
     """
-    Decide what environment to drive in.
+    Choose the keyword arguments of the environment.
 
-    :param args: from the command line; they win
+    :param args: from the command line, which go before the record
     :param record: of the training
     :return: keyword arguments of the environment
     """

@@ -1,4 +1,4 @@
-"""``sb3-torcs install-torcs``: get the game, with or without root."""
+"""``sb3-torcs install-torcs``: install the game, with or without root."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from sb3_torcs.torcs.packages import Tell, install_display, install_game
 __all__ = ["add_parser", "run"]
 
 DESCRIPTION = """\
-Get TORCS, if it is not here yet.
+Install TORCS, if it is not installed yet.
 
-Debian and Ubuntu: as root by apt-get; otherwise, or with --user, its packages and those of the
-libraries that this system lacks are downloaded and unpacked into your own data folder, which
-needs no root and changes nothing else.
+This works on Debian and Ubuntu. Root installs the packages with apt-get. Other users, and root
+with --user, download the packages and those of missing libraries, and unpack them into their own
+data folder; nothing else changes.
 
-With --video also Xvfb, as root only: a video or a picture of the game needs it where there is no
-display.
+--video also installs Xvfb, which needs root. Videos and pictures of the game need Xvfb where there
+is no display.
 """
 
 
@@ -32,13 +32,17 @@ def add_parser(subparsers: Any) -> None:
     """
     parser = subparsers.add_parser(
         "install-torcs",
-        help="get the game that Torcs-v0 drives",
+        help="install the game, which Torcs-v0 needs",
         description=DESCRIPTION,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
-    add("--check", action="store_true", help="only say whether it is here; 1 if it is not")
-    add("--user", action="store_true", help="unpack it for this user, even as root")
+    add(
+        "--check",
+        action="store_true",
+        help="only check; the exit status is 1 if it is not installed",
+    )
+    add("--user", action="store_true", help="unpack it for this user, also as root")
     add(
         "--video",
         action="store_true",
@@ -51,7 +55,7 @@ def add_parser(subparsers: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     """
     :param args: from the command line
-    :return: the exit status: 1 when the game is not there at the end
+    :return: the exit status: 1 if the game is not installed at the end
     """
     tell = partial(print, flush=True)
     try:
@@ -66,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _found_or_installed(args: argparse.Namespace, tell: Tell) -> Game:
-    """Find the game, and install it if it is not there and may be."""
+    """Find the game; install it if it is missing, unless --check is given."""
     try:
         return find_game()
     except BackendUnavailable as absent:

@@ -1,4 +1,4 @@
-"""The command line's parser: a mistake is answered with the word that was probably meant."""
+"""The command line's parser, which suggests the word that was probably meant."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["Parser"]
 
 
 class Parser(argparse.ArgumentParser):
-    """Knows near misses of verbs and options, and refuses an unknown option by its verb's usage."""
+    """Suggests near misses of verbs and options; shows the verb's usage for an unknown option."""
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """
@@ -38,7 +38,7 @@ class Parser(argparse.ArgumentParser):
             self.error(f"there is no verb '{word}'{hint}")
 
     def _refuse(self, unknown: list[str]) -> NoReturn:
-        """Say which words are unknown; the first option among them is perhaps a near miss."""
+        """Refuse unknown words, and suggest a near miss for the first option among them."""
         options = [option for action in self._actions for option in action.option_strings]
         wrong = next((word for word in unknown if word.startswith("-")), unknown[0])
         hint = near_miss(wrong.partition("=")[0], options)

@@ -1,4 +1,4 @@
-"""Output that fits any terminal: what its encoding lacks is written with plain letters."""
+"""Output for any terminal: characters that its encoding lacks are written in ASCII."""
 
 from __future__ import annotations
 
@@ -12,11 +12,14 @@ __all__ = ["any_terminal"]
 
 HANDLER = "sb3_torcs.plain"
 PLAIN = {"→": "->", "–": "-", "—": "-", "−": "-", "×": "x", "·": "*", "°": " deg", "’": "'"}
-FIRST_BYTE, LAST_BYTE = "\udc80", "\udcff"  # how Python holds the bytes of a path that is no text
+FIRST_BYTE, LAST_BYTE = (
+    "\udc80",
+    "\udcff",
+)  # surrogates that stand for bytes of a path that is not valid text
 
 
 def _plain(error: UnicodeError) -> tuple[str | bytes, int]:
-    """Replace one character that an encoding lacks; of a path, give back the byte."""
+    """Replace a character that an encoding lacks; write a byte of a path as it is."""
     if not isinstance(error, UnicodeEncodeError):
         raise error
     sign, after = error.object[error.start], error.start + 1
@@ -31,7 +34,7 @@ codecs.register_error(HANDLER, _plain)
 
 @contextlib.contextmanager
 def any_terminal() -> Iterator[None]:
-    """Let standard output and error take every text for a while, whatever their encoding."""
+    """Let standard output and error accept any text, whatever their encoding."""
     streams = [s for s in (sys.stdout, sys.stderr) if hasattr(s, "reconfigure")]
     before = [stream.errors for stream in streams]
     for stream in streams:

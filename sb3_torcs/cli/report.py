@@ -16,12 +16,13 @@ def add_parser(subparsers: Any) -> None:
     """
     parser = subparsers.add_parser(
         "report",
-        help="learning curves and tables of a study, every seed shown",
-        description="Write report.md and its pictures from the results of a study, also while it "
-        "still runs.",
+        help="write learning curves and tables of a study, with every seed",
+        description="Write report.md and its pictures. The study may still run.",
     )
-    parser.add_argument("folder", metavar="FOLDER", help="of the study, e.g. logs/studies/smoke")
-    parser.add_argument("--output", metavar="DIR", help="for the report; default: FOLDER")
+    parser.add_argument(
+        "folder", metavar="FOLDER", help="the study's folder, e.g. logs/studies/smoke"
+    )
+    parser.add_argument("--output", metavar="DIR", help="folder of the report; default: FOLDER")
     parser.set_defaults(run=run)
 
 

@@ -1,4 +1,4 @@
-"""Results of races, for people and for programs."""
+"""Results of races, as text and as JSON."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def results_as_json(
     results: list[RobotResult], robot: tuple[str, int], track: str
 ) -> dict[str, Any]:
     """
-    Make the JSON object: the named robot's drive, and in a race everybody's.
+    Make the JSON object: the named robot's drive, and in a race all drivers'.
 
     :param results: of all
     :param robot: that was named
@@ -50,7 +50,7 @@ def results_as_json(
 
 def show_results(results: list[RobotResult], robot: tuple[str, int], track: str) -> None:
     """
-    Print tables for people.
+    Print tables.
 
     :param results: of all
     :param robot: that was named

@@ -1,4 +1,4 @@
-"""``sb3-torcs robots``: what the game's own robots drive, by the engine or by the game itself."""
+"""``sb3-torcs robots``: laps of the game's robots, in the engine or in the game itself."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ __all__ = ["add_parser", "run"]
 ROBOT_HEADERS = ("robot", "index", "name", "car")
 
 DESCRIPTION = """\
-List the robots that are installed; or, with NAME, let one of them drive: alone in a practice
-session, or against the robots that --with names in a race.
+List the installed robots. With NAME, let one of them drive: alone in a practice session, or in a
+race against the robots that --with names.
 
-The engine runs the race in this process. With --game the game's own text mode runs it instead, for
+The engine runs the race in this process. With --game, the game's text mode runs it instead, for
 comparison.
 """
 
@@ -88,7 +88,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _list(game: Game, as_json: bool) -> None:
     """
-    Show the robots that are installed and whose cars are: some packages leave cars out.
+    Show the robots whose cars are installed, too: some packages leave cars out.
 
     :param game: the installation
     :param as_json: whether as JSON
@@ -115,7 +115,7 @@ def _drive(
     telemetry: Path | None,
 ) -> list[RobotResult]:
     """
-    Let them drive.
+    Let the robots drive.
 
     :param game: the installation
     :param robots: names and indices

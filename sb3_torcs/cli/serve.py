@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 
 __all__ = ["add_parser", "run"]
 
-DEFAULT_DEADLINE = 10.0  # [ms] as the SCR server has it
+DEFAULT_DEADLINE = 10.0  # [ms] as in the SCR server
 SHORTEST_DEADLINE = 0.001  # [ms] the server counts in microseconds
 LONGEST_DEADLINE = 3_600_000.0  # [ms]
-REPORT = "scr_server"  # begins the lines that our drivers print
+REPORT = "scr_server"  # prefix of the lines that our drivers print
 OPTIONS = {
     "no_fuel": ("nofuel", "no car uses fuel"),
     "no_damage": ("nodamage", "no car takes damage; clients are told what it would be"),
@@ -32,13 +32,14 @@ OPTIONS = {
 """Of the command, what the game's drivers call them, and what they do."""
 
 DESCRIPTION = """\
-Start the installed game with drivers that are clients of the SCR protocol (arXiv:1304.1672), one
-UDP port each; robots of the game start behind them. The race begins when every client has said who
-it is. The command ends with the race, and leaves nothing behind. Ctrl-C or SIGTERM ends the race
-for all clients, and prints the results so far.
+Start the installed game as a server of the SCR protocol (arXiv:1304.1672). Each client drives one
+car over a UDP port of its own; robots of the game start behind the clients. The race begins when
+every client has identified itself. The command ends with the race and leaves no files or processes
+behind. Ctrl-C and SIGTERM end the race for all clients and print the results so far.
 
-A client has 10 ms of real time for an answer, or what --deadline says; who is later drives on as
-before. With --wait the game waits, however long it takes: the drive is the same at any speed.
+A client has 10 ms of real time for an answer, or as much as --deadline says. If its answer is late,
+the car repeats the last action. With --wait the game waits for every answer, so that the drive
+does not depend on the client's speed.
 """
 
 
@@ -55,18 +56,18 @@ def add_parser(subparsers: Any) -> None:
     add = parser.add_argument
     add("--track", default="aalborg", metavar="T", help="default: aalborg")
     add("--drivers", type=positive, default=1, metavar="N", help="clients, 1 to 10; default: 1")
-    add("--robots", metavar="NAME:I,…", help="of the game, who start behind the clients")
+    add("--robots", metavar="NAME:I,…", help="robots of the game, which start behind the clients")
     add("--car", default=DEFAULT_CAR, metavar="C",
-        help=f"of the clients; default: {DEFAULT_CAR}")  # fmt: skip
+        help=f"car of the clients; default: {DEFAULT_CAR}")  # fmt: skip
     add("--laps", type=positive, default=20, metavar="L", help="default: 20")
     add("--host", default="127.0.0.1", metavar="H",
-        help="address to listen at; default: 127.0.0.1, 0.0.0.0 lets others in")  # fmt: skip
+        help="address; default: 127.0.0.1; 0.0.0.0 accepts other machines")  # fmt: skip
     add("--port", type=positive, default=3001, metavar="P",
-        help="of the first client; the others follow; default: 3001")  # fmt: skip
+        help="UDP port of the first client; the others follow; default: 3001")  # fmt: skip
     time = parser.add_mutually_exclusive_group()
     time.add_argument("--wait", action="store_true", help="wait for every answer")
     time.add_argument("--deadline", type=float, default=DEFAULT_DEADLINE, metavar="MS",
-                      help="for an answer; default: 10")  # fmt: skip
+                      help="ms for an answer; default: 10")  # fmt: skip
     for option, (_, effect) in OPTIONS.items():
         add(f"--{option.replace('_', '-')}", action="store_true", help=effect)
     add("--window", action="store_true", help="show the game's 3D view")
@@ -121,22 +122,22 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _announce(args: argparse.Namespace) -> None:
-    """Say where clients are awaited."""
+    """Print the addresses at which clients may connect."""
     last = args.port + args.drivers - 1
     ports = f"port {args.port}" if last == args.port else f"ports {args.port} to {last}"
     time = "the game waits for every answer" if args.wait else f"{args.deadline:g} ms per answer"
-    print(f"{args.track}: awaiting SCR clients at {args.host}, UDP {ports}; {time}", flush=True)
+    print(f"{args.track}: waiting for SCR clients at {args.host}, UDP {ports}; {time}", flush=True)
 
 
 def _report(line: str) -> None:
-    """Pass on what our drivers say."""
+    """Print the lines of our drivers."""
     if line.startswith(REPORT):
         print(line, flush=True)
 
 
 def _interrupt(process: GameProcess, race: RaceSetup, cars: Sequence[str]) -> None:
     """
-    End the race for all clients, and print what was driven.
+    End the race for all clients, and print the results.
 
     :param process: of the game
     :param race: who races where
@@ -146,10 +147,10 @@ def _interrupt(process: GameProcess, race: RaceSetup, cars: Sequence[str]) -> No
     from sb3_torcs.torcs.results import read_results
 
     process.end_race()
-    # A game that was still loading, or was paused, has none; nor does a closed terminal show any.
+    # A game that is loading or paused writes no results; a closed terminal cannot show them.
     with suppress(GameFailed, OSError):
         process.follow(_report)
-        # Who did not come to the end is not out of a race that was cut short.
+        # In a race that was ended early, nobody is out for not having finished it.
         results = [replace(r, out=False) for r in read_results(process, race, cars)]
         print("the race was ended early:")
         show_results(results, race.drivers[0], str(race.track))

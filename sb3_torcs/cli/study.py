@@ -22,11 +22,11 @@ REFRESHES = 2  # [1/s] of the table
 COLUMNS = ("variant", "seed", "timesteps", "laps", "best lap s", "completes", "state")
 
 DESCRIPTION = """\
-Run a study: every variant with every seed is trained, evaluated while it learns, and its best model
-measured on the study's tracks. docs/evaluation.md says what FILE holds and how results are meant.
+Run a study: train every variant with every seed, evaluate it while it learns, and measure its best
+model on the study's tracks. docs/evaluation.md describes FILE and the results.
 
-Ctrl-C, or a kill, loses at most what was learned since the last evaluation: the same command goes
-on, and comes to the same results. So it does when a machine of a cluster is lost.
+Ctrl-C, a kill or the loss of a machine of a cluster loses at most what was learned since the last
+evaluation. The same command then continues the study, and comes to the same results.
 """
 
 
@@ -42,10 +42,14 @@ def add_parser(subparsers: Any) -> None:
     )
     add = parser.add_argument
     add("file", metavar="FILE.yml", help="e.g. examples/studies/smoke.yml")
-    add("--folder", metavar="DIR", help="for results; default: logs/studies/NAME")
+    add("--folder", metavar="DIR", help="folder of the results; default: logs/studies/NAME")
     where = parser.add_mutually_exclusive_group().add_argument
     where("--jobs", type=positive, metavar="N", help="agents at a time; default: one per core")
-    where("--address", metavar="A", help="of a Ray cluster that this machine belongs to, or auto")
+    where(
+        "--address",
+        metavar="A",
+        help="address of a Ray cluster that this machine belongs to, or auto",
+    )
     add("--json", action="store_true", help="print one JSON object and nothing else")
     parser.set_defaults(run=run)
 
@@ -63,7 +67,9 @@ def run(args: argparse.Namespace) -> int:
     study = read_study(args.file)
     folder = writable_folder(args.folder or Path("logs") / "studies" / study.name)
     board = Board(study)
-    interrupted = contextlib.suppress(KeyboardInterrupt)  # Tune swallows it, others do not
+    interrupted = contextlib.suppress(
+        KeyboardInterrupt
+    )  # Ray Tune handles Ctrl-C itself while it runs
     with interrupted, quiet_output(args.json), board.shown():
         run_study(study, folder, jobs=args.jobs, address=args.address, progress=board.update)
     store = StudyFolder(folder, study)
@@ -84,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _command(args: argparse.Namespace) -> str:
-    """Compose the command line that goes on."""
+    """Compose the command that continues the study."""
     words = ["sb3-torcs", "study", args.file]
     for name in ("folder", "jobs", "address"):
         if getattr(args, name) is not None:
@@ -94,7 +100,7 @@ def _command(args: argparse.Namespace) -> str:
 
 class Board:
     """
-    One line per trial: how far it is, and its best so far.
+    A table with the progress and the best lap of each trial.
 
     :param study: whose trials they are
     """
@@ -107,7 +113,7 @@ class Board:
 
     def update(self, trial: Trial, row: dict[str, Any]) -> None:
         """
-        Note what is new.
+        Take a new result.
 
         :param trial: which one
         :param row: of its results, or its state
@@ -120,7 +126,7 @@ class Board:
                 line.update({key: row[key] for key in ("laps", "completes", "best_flying_lap_s")})
 
     def errors(self) -> dict[str, str]:
-        """Return what the trials that failed have said, by name."""
+        """Return the messages of the trials that failed, by name."""
         return {name: row["error"] for name, row in self._rows.items() if "error" in row}
 
     def as_json(self) -> list[dict[str, Any]]:
@@ -132,7 +138,7 @@ class Board:
 
     @contextlib.contextmanager
     def shown(self) -> Iterator[None]:
-        """Show the table on standard error as long as it lasts, if somebody looks."""
+        """Keep the table on standard error up to date, if that is a terminal."""
         from rich.console import Console
         from rich.live import Live
 
@@ -140,7 +146,7 @@ class Board:
         if not console.is_terminal:
             yield
             return
-        # By the clock and not by the rows, of which a study that goes on has hundreds at once.
+        # Drawn by the clock and not for each row: a continued study reads hundreds of rows at once.
         with Live(get_renderable=self._table, console=console, refresh_per_second=REFRESHES):
             yield
 

@@ -1,4 +1,4 @@
-"""``sb3-torcs tracks``: which tracks there are, and what they look like."""
+"""``sb3-torcs tracks``: list the tracks, or draw one."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
     if args.plot is not None:
         if len(tracks) != 1:
             raise InvalidOption(
-                f"--plot draws one track, {len(tracks)} are named; "
+                f"--plot draws one track, but {len(tracks)} are named; "
                 "type e.g.: sb3-torcs tracks aalborg --plot aalborg.png"
             )
         path = writable_file(args.plot, (".png",))

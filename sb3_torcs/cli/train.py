@@ -1,4 +1,4 @@
-"""``sb3-torcs train``: a thin front to the RL Zoo that finds and checks the files itself."""
+"""``sb3-torcs train``: train with the RL Zoo and the shipped hyperparameters."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ __all__ = ["add_parser", "run"]
 
 
 EPILOG = """\
-What follows -- goes to the RL Zoo as it is, after our own words, so it wins:
+Arguments after -- go to the RL Zoo unchanged, and override ours:
   sb3-torcs train --timesteps 20000 -- --save-freq 5000 --hyperparams batch_size:64
 
-Ctrl-C keeps what was learned and prints the command that goes on. A kill or a full disk loses at
-most what was learned since the last evaluation.
+Ctrl-C saves the model and prints the command that continues the training. A kill or a full disk
+loses at most what was learned since the last evaluation.
 """
 
 
@@ -33,7 +33,7 @@ def add_parser(subparsers: Any) -> None:
         "train",
         help="train an agent with the RL Zoo and the shipped hyperparameters",
         description="Train an agent with the RL Zoo and the shipped hyperparameters, which are "
-        "found and checked before anything starts.",
+        "checked before anything starts.",
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -42,29 +42,40 @@ def add_parser(subparsers: Any) -> None:
     add("--env", metavar="ID", help="default: TorcsLite-v0")
     add("--entry", metavar="NAME", help='entry of the file, e.g. "as the post"; default: the id')
     add("--conf-file", metavar="FILE", help="hyperparameter file; default: the shipped one")
-    add("--track", metavar="T", help="instead of the entry's; `sb3-torcs tracks` lists them")
-    add("--timesteps", type=positive, metavar="N", help="timesteps; default: what the entry says")
+    add("--track", metavar="T", help="track; default: the entry's; `sb3-torcs tracks` lists them")
+    add(
+        "--timesteps",
+        type=positive,
+        metavar="N",
+        help="timesteps to learn from; default: the entry's",
+    )
     add("--seed", type=seed, default=0, metavar="S", help="default: 0")
-    add("--folder", default="logs", help="for models and logs; default: logs")
+    add("--folder", default="logs", help="folder of models and logs; default: logs")
     add("--tensorboard", metavar="DIR", help="default: FOLDER/tensorboard")
     add(
         "--eval-freq",
         type=int,
         metavar="N",
-        help="timesteps between evaluations; default: a fortieth",
+        help="timesteps between evaluations; default: a fortieth of the training",
     )
-    add("--eval-episodes", type=positive, default=1, metavar="N", help="per evaluation; default: 1")
+    add(
+        "--eval-episodes",
+        type=positive,
+        default=1,
+        metavar="N",
+        help="per evaluation; default: 1",
+    )
     add(
         "--resume",
         metavar="MODEL",
-        help="go on from a saved model (.zip) or a run's folder, with its --algo and --env; this "
-        "runs what is pickled in model and replay buffer: only if you know who made them",
+        help="continue from a saved model (.zip) or a run's folder, with its --algo and --env; "
+        "runs code that is pickled in model and replay buffer: only if you trust their author",
     )
     add(
         "--trust",
         action="store_true",
-        help="go on from a model without a record, too; evaluate Python in the "
-        "strings of the hyperparameter file: only if you know who made them",
+        help="accept a model without a record, and evaluate Python in the strings of the "
+        "hyperparameter file: only if you trust their author",
     )
     add("--progress", action=argparse.BooleanOptionalAction, default=True, help="progress bar")
     parser.set_defaults(run=run)
@@ -85,7 +96,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _trained_before(args: argparse.Namespace) -> dict[str, str]:
-    """Take algorithm and environment from the model to go on from, where they are not given."""
+    """Take algorithm and environment from the model to resume, unless they are given."""
     from sb3_torcs.agents.models import TrainingRecord, find_model, training_record
 
     record = TrainingRecord()
@@ -98,7 +109,7 @@ def _trained_before(args: argparse.Namespace) -> dict[str, str]:
 
 
 def _closing_words(options: TrainOptions, result: Run) -> list[str]:
-    """Say what there is now, and what to type next."""
+    """Name the files and the commands to type next."""
     if result.last_model is None:
         return [f"the RL Zoo has searched; its reports: {result.folder / 'report_*.csv'}"]
     learned = f"learned from {result.timesteps} of {result.wanted} timesteps"

@@ -1,4 +1,4 @@
-"""``sb3-torcs watch``: an agent or a robot in the game's own 3D window, or in a video of it."""
+"""``sb3-torcs watch``: an agent or a robot in the game's 3D window, or in a video."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ KEPT = ("car", "action_repeat", "range_finders", "action", "gearbox")
 """What an agent drives with as in its training, unless the command line says otherwise."""
 
 DESCRIPTION = """\
-Watch a saved model, or a robot of the game, drive a car in the game's own window. The game's keys
-work there: F2 to F11 change the view, p pauses, + and - change the pace, Esc ends the race.
+Show a saved model or a robot in the game's own window. The game's keys work there: F2 to F11 change
+the view, p pauses, + and - change the speed of time, Esc ends the race.
 
 With --video the command writes a video instead, frame by frame in simulated time: no frame is
 dropped or doubled, however slow the machine. It needs no display, only the program Xvfb, which
@@ -41,7 +41,7 @@ def add_parser(subparsers: Any) -> None:
 
     parser = subparsers.add_parser(
         "watch",
-        help="see an agent or a robot in the game's own window, or record a video of it",
+        help="show an agent or a robot in the game's own window, or record a video",
         description=DESCRIPTION,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -49,7 +49,7 @@ def add_parser(subparsers: Any) -> None:
     add("name", metavar="MODEL|ROBOT", help=f"{MODEL_HELP}; or a robot, e.g. inferno")
     add("--track", metavar="T", help="the track; default: that of the training, or aalborg")
     add("--car", metavar="C", help="the car that a model drives; default: that of its training")
-    add("--robots", metavar="NAME:I,…", help="robots that race, too, and start behind")
+    add("--robots", metavar="NAME:I,…", help="robots to race against, which start behind")
     add("--laps", type=positive, default=1, metavar="L", help="laps to drive; default: 1")
     add(
         "--view",
@@ -71,7 +71,7 @@ def add_parser(subparsers: Any) -> None:
     add(
         "--beside",
         metavar="MODEL|ROBOT",
-        help="show this driver's race, too, in the right half of the video",
+        help="also show this driver's race, in the right half of the video",
     )
     parser.set_defaults(run=run)
 
@@ -119,7 +119,7 @@ def _size(text: str) -> tuple[int, int]:
 
 def _shows(game: Game, names: Sequence[str], args: argparse.Namespace) -> list[Show]:
     """
-    Decide who drives what, all on one track.
+    Choose driver and car of each race, all on one track.
 
     :param game: the installation
     :param names: of models or robots
@@ -155,7 +155,7 @@ def _shows(game: Game, names: Sequence[str], args: argparse.Namespace) -> list[S
 
 def _record(game: Game, name: str) -> TrainingRecord:
     """
-    Read how a model was trained, and mention robots if there is none.
+    Read how a model was trained; if there is no such model, suggest a robot.
 
     :param game: the installation
     :param name: as typed
@@ -166,7 +166,7 @@ def _record(game: Game, name: str) -> TrainingRecord:
         return told_record(name)
     except InvalidOption as error:
         hint = near_miss(name, game.robots())
-        raise InvalidOption(f"{error}; nor is there a robot '{name}'{hint}") from None
+        raise InvalidOption(f"{error}; and there is no robot '{name}'{hint}") from None
 
 
 def _in_window(show: Show, args: argparse.Namespace) -> None:
@@ -186,7 +186,7 @@ def _in_window(show: Show, args: argparse.Namespace) -> None:
 
 
 def _report(name: str, show: Show) -> None:
-    """Say how it ended."""
+    """Print how the race ended."""
     if show.results:
         show_results(show.results, show.race.drivers[0], str(show.track))
     elif show.agent is not None and show.agent.end is not None:

@@ -1,4 +1,4 @@
-"""What was driven, kept: the best lap as a video and as a line on the map."""
+"""A record of the drives of an evaluation: the best lap as a video and as a line on the map."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ VIDEO_FPS = 25
 
 
 class Timestep(NamedTuple):
-    """One timestep of a drive, and where it led."""
+    """One timestep of a recorded drive."""
 
     action: npt.NDArray[np.float32]
     car: CarState
     lap_time: float  # [s] if it completed a lap, else 0
-    controls: Controls = Controls(0.0, 0.0, 0.0)  # that the action has become
+    controls: Controls = Controls(0.0, 0.0, 0.0)  # that the action stands for
 
 
 class Stretch(NamedTuple):
-    """Some timesteps of an episode."""
+    """A range of timesteps of an episode."""
 
     episode: int
     first: int
@@ -60,7 +60,7 @@ def best_stretch(episodes: list[list[Timestep]]) -> Stretch:
 
 class Recorder(gym.Wrapper[Any, Any, Any, Any]):
     """
-    An environment for an evaluation that remembers what was done in it.
+    An environment that records the drives of an evaluation.
 
     :param env_id: a registered environment
     :param kwargs: of the environment
@@ -109,7 +109,7 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
 
     def write(self, path: Path, driver: str) -> None:
         """
-        Write the drives down, as those of robots are; the index is the episode, from 1.
+        Write the drives to a table like those of robots; the index is the episode, from 1.
 
         :param path: of the CSV file
         :param driver: its name
@@ -153,7 +153,7 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
         write_video(path, self._frames(stretch, repeat), VIDEO_FPS, total=total)
 
     def _frames(self, stretch: Stretch, repeat: int) -> Iterator[npt.NDArray[np.uint8]]:
-        """Drive the episode again, tick by tick, and look at the stretch."""
+        """Drive the episode again, tick by tick, and render the stretch."""
         timesteps = self.episodes[stretch.episode]
         with self._again(stretch.episode, action_repeat=1, render_mode="rgb_array") as env:
             tick = 0
@@ -170,6 +170,6 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
         kwargs = {**self._kwargs, **changes}
         env = gym.make(self.env_id, max_episode_steps=limit, **kwargs)
         env.reset(seed=self._seed)
-        for _ in range(episode):  # the generator goes on from episode to episode
+        for _ in range(episode):  # each reset draws from the same generator
             env.reset()
         return env

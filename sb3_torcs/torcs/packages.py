@@ -22,28 +22,28 @@ from sb3_torcs.torcs.installation import HOME_VARIABLE, Game, find_game, user_fo
 __all__ = ["VIDEO_PACKAGES", "Tell", "install_display", "install_game"]
 
 PACKAGES = ("torcs", "torcs-data")
-VIDEO_PACKAGES = ("xvfb", "libgl1-mesa-dri")  # a display without a screen, and what draws on it
+VIDEO_PACKAGES = ("xvfb", "libgl1-mesa-dri")  # a virtual display, and OpenGL for it
 LOOK_AGAIN = 0.1  # [s] between two looks at a running program
-LAST_LINES = 5  # of what a failed program said
+LAST_LINES = 5  # shown of the output of a program that failed
 LOCK_PATIENCE = 120  # [s] to wait for another apt
 
 Tell = Callable[[str], None]
 """Shows a line at once: the program that it names may print, too."""
 
 ELSEWHERE = """\
-apt-get and dpkg-deb, which this command uses, are not here. Get TORCS 1.3.7 by hand:
+this command needs apt-get and dpkg-deb, which are missing. Install TORCS 1.3.7 by hand:
   Fedora:  sudo dnf install torcs
   Arch:    build the package `torcs` of the AUR
   others:  from https://torcs.sourceforge.net: ./configure; make; make install; make datainstall
 Then type: sb3-torcs doctor
-If it went neither to /usr nor to /usr/local, let SB3_TORCS_HOME name the folder first."""
+If it is neither in /usr nor in /usr/local, set SB3_TORCS_HOME to its folder first."""
 
 
 def install_game(absent: BackendUnavailable, tell: Tell, *, for_user: bool) -> Game:
     """
     Install the game in the way that this machine has.
 
-    :param absent: why it has to be
+    :param absent: the error of not finding the game
     :param tell: shows which programs run
     :param for_user: whether to leave the system as it is
     :return: what was installed
@@ -51,8 +51,8 @@ def install_game(absent: BackendUnavailable, tell: Tell, *, for_user: bool) -> G
     """
     if os.environ.get(HOME_VARIABLE):
         raise InstallFailed(
-            f"{absent} (an installation elsewhere would not be looked at while {HOME_VARIABLE} is "
-            "set)"
+            f"{absent} (no other folder is looked at while {HOME_VARIABLE} is set; unset it, "
+            "or correct it)"
         )
     if not all(shutil.which(program) for program in ("apt-get", "apt-cache", "dpkg-deb")):
         raise InstallFailed(ELSEWHERE)
@@ -66,19 +66,19 @@ def install_game(absent: BackendUnavailable, tell: Tell, *, for_user: bool) -> G
 
 def install_display(tell: Tell, *, only_look: bool = False) -> Path:
     """
-    Install Xvfb, if it is not there.
+    Install Xvfb, if it is missing.
 
     :param tell: shows which programs run
     :param only_look: whether to install nothing
     :return: the program
-    :raises InstallFailed: if it is not there at the end
+    :raises InstallFailed: if it is missing at the end
     """
     found = shutil.which("Xvfb")
     if found:
         return Path(found)
     by_hand = f"sudo apt-get install {' '.join(VIDEO_PACKAGES)}"
     if only_look or os.geteuid() != 0 or not shutil.which("apt-get"):
-        raise InstallFailed(f"Xvfb is not installed, and only root can; type: {by_hand}")
+        raise InstallFailed(f"Xvfb is not installed, and only root can install it; type: {by_hand}")
     _apt_install(VIDEO_PACKAGES, by_hand, tell)
     return install_display(tell, only_look=True)
 
@@ -94,7 +94,7 @@ def _apt_install(packages: Sequence[str], otherwise: str, tell: Tell) -> None:
     install = ["apt-get", "install", "--yes", "--no-install-recommends", *packages]
     install += ["-o", f"DPkg::Lock::Timeout={LOCK_PATIENCE}"]
     if _shown(install, tell) != 0:
-        # An old list names versions that the server has no more.
+        # Outdated package lists name versions that the server no longer has.
         _shown(["apt-get", "update"], tell)
         if _shown(install, tell) != 0:
             raise InstallFailed(
@@ -103,7 +103,7 @@ def _apt_install(packages: Sequence[str], otherwise: str, tell: Tell) -> None:
 
 
 def _shown(call: Sequence[str], tell: Tell) -> int:
-    """Run a program that shows its own progress."""
+    """Run a program and let it print."""
     tell(f"+ {' '.join(call)}")
     return subprocess.run(
         call, env=_environment(), stdin=subprocess.DEVNULL, check=False
@@ -111,12 +111,12 @@ def _shown(call: Sequence[str], tell: Tell) -> int:
 
 
 def _environment() -> dict[str, str]:
-    """Make the environment of a program: no questions, and words that can be read."""
+    """Return the environment variables of a program: no questions, English output."""
     return {**os.environ, "LC_ALL": "C", "DEBIAN_FRONTEND": "noninteractive"}
 
 
 def _output(call: Sequence[str]) -> str:
-    """Run a program for what it prints."""
+    """Run a program and return its output, which is empty if it fails."""
     done = subprocess.run(
         call, env=_environment(), stdin=subprocess.DEVNULL, capture_output=True, check=False
     )
@@ -130,7 +130,7 @@ def _apt_knows(options: Sequence[str]) -> bool:
 
 def _unpack_for_user(target: Path) -> Game:
     """
-    Download and unpack the game; until all of it is there, the target does not change.
+    Download and unpack the game. The target only changes when everything is complete.
 
     :param target: folder for it
     :return: what was unpacked
@@ -152,12 +152,12 @@ def _unpack_for_user(target: Path) -> Game:
 
 def _apt_options(staging: Path) -> list[str]:
     """
-    Choose options with which apt knows the game, without root.
+    Choose options with which apt finds the game without root.
 
-    :param staging: where it may keep lists of its own, if the system has none
+    :param staging: a folder for package lists, if the system has none
     :return: options for apt
     """
-    # Its own user could not write to our folder; as root it would complain about that.
+    # apt's own user cannot write to our folder, and apt warns about that when it runs as root.
     options = ["-o", f"APT::Sandbox::User={'root' if os.geteuid() == 0 else ''}"]
     if _apt_knows(options):
         return options
@@ -176,10 +176,10 @@ def _apt_options(staging: Path) -> list[str]:
 
 
 def _wanted(options: Sequence[str]) -> list[str]:
-    """Find out which packages to get: the game, and what it needs and the system has not."""
+    """List the packages to download: the game's, and those that it needs and the system lacks."""
     call = ["apt-get", *options, "--simulate", "--no-install-recommends", "install", *PACKAGES]
     words = [line.split() for line in _output(call).splitlines()]
-    # With the version it has in brackets, a line is about a package that is there.
+    # A line with a version in brackets is about an installed package.
     new = [w[1] for w in words if w[:1] == ["Inst"] and not w[2].startswith("[")]
     return [*PACKAGES, *(name for name in new if name not in PACKAGES)]
 
@@ -229,7 +229,7 @@ def _unpack(archives: Sequence[Path], root: Path, staging: Path) -> None:
 
 def _verify(game: Game) -> None:
     """
-    Make sure that what was unpacked runs here.
+    Make sure that the unpacked game runs.
 
     :param game: the installation
     """
@@ -238,19 +238,19 @@ def _verify(game: Game) -> None:
     missing = missing_libraries(game)
     if missing:
         raise InstallFailed(
-            f"the unpacked game would not find {', '.join(missing)}; with root type: "
+            f"the unpacked game lacks {', '.join(missing)}; with root type: "
             "sudo apt-get install torcs"
         )
 
 
 def _quietly(call: Sequence[str], folder: Path, look: Callable[[], None]) -> None:
     """
-    Run a program whose words matter only if it fails; it ends when we are interrupted.
+    Run a program, and show its output only if it fails. Ctrl-C ends it, too.
 
     :param call: program and arguments
     :param folder: to run in
     :param look: called again and again
-    :raises InstallFailed: with its last words
+    :raises InstallFailed: with the end of its output
     """
     with tempfile.TemporaryFile() as words:
         process = subprocess.Popen(
