@@ -17,6 +17,7 @@ from sb3_torcs.cli.common import print_json, quiet_output, table
 from sb3_torcs.errors import Sb3TorcsError
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.race_results import RobotResult
+from sb3_torcs.torcs.track_names import find_track
 
 ROBOTS = "inferno,berniw,bt,olethros,tita,lliaw"
 FIELD = 4  # robots in a race
@@ -97,7 +98,9 @@ args = parser.parse_args()
 
 game = find_game()
 tracks = (
-    [game.find_track(name) for name in args.tracks.split(",")] if args.tracks else game.tracks()
+    [find_track(name, game).name for name in args.tracks.split(",")]
+    if args.tracks
+    else game.tracks()
 )
 names = args.robots.split(",")
 fields = [[name] for name in names]

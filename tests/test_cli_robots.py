@@ -135,9 +135,11 @@ class TestByTheEngine:
         out = run(capsys, "racer", "--track", "loop")[1]
         assert out.splitlines()[1:] == ["no whole lap", "best lap: none without a fault; out"]
 
-    def test_a_track_of_ones_own_is_handed_on(self, engine, capsys):
-        run(capsys, "racer", "--track", "some/where.xml")
-        assert engine["track"] == "some/where.xml"
+    def test_a_track_of_ones_own_is_handed_on(self, engine, capsys, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        (tmp_path / "some.xml").touch()
+        run(capsys, "racer", "--track", "some.xml")
+        assert engine["track"] == "some.xml"
 
 
 class TestList:

@@ -33,7 +33,8 @@ from sb3_torcs.noise import BLOG
 from sb3_torcs.sensors import RANGE_FINDERS, sensor_table
 from sb3_torcs.studies.config import read_study
 from sb3_torcs.torcs.packages import VIDEO_PACKAGES
-from sb3_torcs.tracks.catalogue import BUNDLED_FOLDER, load_track
+from sb3_torcs.torcs.track_names import BUNDLED_FOLDER
+from sb3_torcs.tracks.catalogue import load_track
 from sb3_torcs.training import zoo
 from sb3_torcs.training.run import TrainOptions
 

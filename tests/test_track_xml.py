@@ -7,8 +7,9 @@ import math
 import pytest
 
 from sb3_torcs.errors import TrackFileError
+from sb3_torcs.torcs.track_names import BUNDLED_FOLDER
 from sb3_torcs.tracks import torcs_xml
-from sb3_torcs.tracks.catalogue import BUNDLED_FOLDER, load_track
+from sb3_torcs.tracks.catalogue import load_track
 from sb3_torcs.tracks.torcs_xml import read_track_xml
 from sb3_torcs.tracks.track import closed, closing_gap
 

@@ -10,6 +10,7 @@ import pytest
 from conftest import segment
 
 from sb3_torcs.errors import InvalidOption, TrackFileError, TrackNotFound
+from sb3_torcs.torcs import track_names
 from sb3_torcs.tracks import catalogue
 from sb3_torcs.tracks import track as tracks
 from sb3_torcs.tracks.catalogue import available_tracks, load_track
@@ -40,7 +41,8 @@ def write(folder, text, name="ring.csv"):
 @pytest.fixture(autouse=True)
 def no_installed_torcs(monkeypatch):
     """Only what the package brings counts here, whatever this machine has."""
-    monkeypatch.setattr(catalogue, "torcs_folders", list)
+    for module in (catalogue, track_names):
+        monkeypatch.setattr(module, "torcs_folders", list)
 
 
 class TestGeometry:
@@ -215,7 +217,8 @@ class TestLoading:
             folder = tmp_path / "tracks" / "road" / name
             folder.mkdir(parents=True)
             write(folder, xml, f"{name}.xml")
-        monkeypatch.setattr(catalogue, "torcs_folders", lambda: [tmp_path])
+        for module in (catalogue, track_names):
+            monkeypatch.setattr(module, "torcs_folders", lambda: [tmp_path])
         sources = {entry.name: entry.source for entry in available_tracks()}
         assert sources == {**dict.fromkeys(BUNDLED, "bundled"), "loop": "torcs"}
         assert load_track("loop").length == pytest.approx(100.0 * math.pi)

@@ -23,9 +23,10 @@ from sb3_torcs.car import (
 from sb3_torcs.errors import BackendUnavailable, InvalidOption, TrackFileError
 from sb3_torcs.sensors import RangeFinderName, range_finder_angles
 from sb3_torcs.torcs.building import build_command
-from sb3_torcs.torcs.installation import Game, find_game, track_path
+from sb3_torcs.torcs.installation import Game, find_game
 from sb3_torcs.torcs.race_setup import SCR_SERVER, SESSIONS, RaceSetup, Session
 from sb3_torcs.torcs.starting_list import AGENT, starting_list
+from sb3_torcs.torcs.track_names import TrackFile, find_track
 from sb3_torcs.torcs.trial_child import encoded
 from sb3_torcs.tracks.catalogue import load_track
 from sb3_torcs.tracks.track import Track
@@ -41,7 +42,7 @@ MIN_SHIFT = 1.0  # [m] between the game's frame and the track's, from which posi
 
 def make_engine(
     game: Game,
-    track: str | os.PathLike[str],
+    track: str | os.PathLike[str] | TrackFile,
     entries: Sequence[tuple[str, int]],
     *,
     car: str = DEFAULT_CAR,
@@ -82,7 +83,7 @@ def make_engine(
             )
         if (name, index) != AGENT:
             game.find_robot(name, index)
-    path = track_path(game, track)
+    path = find_track(track, game).path
     load_track(path)  # a broken file is told here, before the game's own loader stumbles on it
     race = engine_arguments(game, path, entries, car=car, session=session, laps=laps)
     try_race(path, race)
@@ -139,10 +140,10 @@ class NativeBackend:
             "gearbox": gearbox,
         }
         self._entries = entries
-        path = track_path(game, track)
+        file = find_track(track, game)
         self.engine = make_engine(
             game,
-            path,
+            file,
             entries,
             car=car,
             session="race" if opponents else "practice",
@@ -150,7 +151,7 @@ class NativeBackend:
             angles=self.range_finder_angles,
             gearbox=gearbox,
         )
-        self.track: Track = load_track(path)
+        self.track: Track = load_track(file.path)
         self._agent = entries.index(AGENT)
         self.gears = self.engine.gears(self._agent)
         self._noise = sensor_noise

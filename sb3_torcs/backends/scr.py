@@ -21,10 +21,11 @@ from sb3_torcs.scr.protocol import ScrAction, format_action, parse_motor, parse_
 from sb3_torcs.scr.rehearsal import Rehearsal
 from sb3_torcs.scr.server import SCR_PORT, open_ports, start_server
 from sb3_torcs.sensors import RangeFinderName, encode, range_finder_angles
-from sb3_torcs.torcs.installation import find_game, track_path
+from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.process import GameProcess, compiled_library
 from sb3_torcs.torcs.race_setup import SCR_SERVER, RaceSetup
 from sb3_torcs.torcs.starting_list import AGENT, starting_list
+from sb3_torcs.torcs.track_names import find_track
 from sb3_torcs.tracks.catalogue import load_track
 from sb3_torcs.tracks.track import Track
 
@@ -92,7 +93,7 @@ class ScrBackend:
         self.range_finder_angles = range_finder_angles(range_finders)
         self._gearbox = read_gearbox(game.find_car(car), checked_gearbox(gearbox))
         self.gears = len(self._gearbox.ratios)
-        self.track: Track = load_track(track_path(game, track))
+        self.track: Track = load_track(find_track(track, game).path)
         entries = starting_list(game, opponents, grid_place)
         if self._own:
             compiled_library("_scr_server")  # what is not built is told now, not at a reset

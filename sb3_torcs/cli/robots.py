@@ -60,6 +60,7 @@ def run(args: argparse.Namespace) -> int:
     """
     from sb3_torcs.errors import InvalidOption
     from sb3_torcs.torcs.installation import find_game
+    from sb3_torcs.torcs.track_names import find_track
 
     game = find_game()
     if args.name is None:
@@ -73,8 +74,8 @@ def run(args: argparse.Namespace) -> int:
     name = args.name if args.index is None else f"{args.name}:{args.index}"
     rivals = [] if args.rivals is None else args.rivals.split(",")
     robots = [game.parse_robot(word) for word in (name, *rivals)]
-    is_file = args.track.lower().endswith(".xml") and not args.game
-    track = args.track if is_file else game.find_track(args.track)
+    file = find_track(args.track, game)
+    track = args.track if file.source == "file" else file.name
     with quiet_output(args.json):
         results = _drive(game, robots, track, args, telemetry)
     if args.json:

@@ -20,8 +20,9 @@ from sb3_torcs.envs.racing import RacingEnv, RenderMode
 from sb3_torcs.errors import EnvClosed, InvalidOption, near_miss
 from sb3_torcs.rewards import RewardChoice
 from sb3_torcs.sensors import RangeFinderName
-from sb3_torcs.torcs.installation import find_game, track_path
+from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.scenery import find_scenery
+from sb3_torcs.torcs.track_names import find_track
 from sb3_torcs.torcs.window import ViewName, Window
 
 __all__ = ["TorcsEnv"]
@@ -130,7 +131,8 @@ class TorcsEnv(RacingEnv):
             raise InvalidOption("picture 'game' is for one track; give one, not a list")
         if self.picture == "game":
             one: Any = track
-            find_scenery(find_game(), track_path(find_game(), one))
+            game = find_game()
+            find_scenery(game, find_track(one, game).path)
         super().__init__(
             _world(
                 backend,

@@ -15,6 +15,7 @@ import gymnasium as gym
 
 from sb3_torcs.agents.rollout import Driver, Timestep, drive
 from sb3_torcs.car import CONTROL_TICK
+from sb3_torcs.torcs.track_names import RANDOM_TRACK
 
 __all__ = [
     "KEPT",
@@ -34,7 +35,6 @@ __all__ = [
 
 RACE_LAPS = 3  # from the grid in a row: what it takes to *complete* a track
 GAME, WITHOUT_GAME = "Torcs-v0", "TorcsLite-v0"
-RANDOM_TRACK = "random"
 LONGEST_TRACK = 10000.0  # [m] for such a one, whose length is not known beforehand
 KEPT = ("track", "car", "reward", "action_repeat", "range_finders", "action", "gearbox")
 """What an evaluation takes from the training's environment, unless it is told otherwise."""

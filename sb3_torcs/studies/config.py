@@ -23,6 +23,7 @@ import yaml
 from sb3_torcs.agents.wrapping import unrebuilt
 from sb3_torcs.errors import StudyError, near_miss, with_new_names
 from sb3_torcs.plain_yaml import read_yaml
+from sb3_torcs.torcs.track_names import RANDOM_TRACK
 from sb3_torcs.tracks.catalogue import available_tracks, load_track
 from sb3_torcs.training import zoo
 from sb3_torcs.training.zoo_data import as_data
@@ -160,7 +161,7 @@ def track_name(track: str) -> str:
     :param track: name or path
     :return: the name without category
     """
-    return track if track == "random" else load_track(track).name
+    return track if track == RANDOM_TRACK else load_track(track).name
 
 
 def slug(text: str) -> str:

@@ -19,7 +19,6 @@ from sb3_torcs.errors import (
     GameNotFound,
     InvalidOption,
     TrackFileError,
-    TrackNotFound,
     UnknownCar,
     UnknownRobot,
     near_miss,
@@ -28,13 +27,13 @@ from sb3_torcs.torcs.params import read_params
 
 __all__ = [
     "HOME_VARIABLE",
+    "INSTALL",
     "Game",
     "RobotEntry",
     "find_game",
     "linker_knows",
     "torcs_folders",
     "track_files",
-    "track_path",
     "user_folder",
 ]
 
@@ -127,28 +126,6 @@ class Game:
         :return: the path; nothing is checked
         """
         return self.libraries / "drivers" / name / f"{name}.so"
-
-    def find_track(self, name: str) -> str:
-        """
-        Complete the name of a track.
-
-        :param name: ``"aalborg"`` or ``"road/aalborg"``
-        :return: ``"road/aalborg"``
-        :raises TrackNotFound: if there is none of this name
-        :raises GameIncomplete: if its folder is there, but not its file
-        """
-        tracks = self.tracks()
-        for full in tracks:
-            if name in (full, full.rpartition("/")[2]):
-                return full
-        short = name.rpartition("/")[2]
-        for folder in (self.data / "tracks").glob("*/*"):
-            if folder.name == short and name in (short, f"{folder.parent.name}/{short}"):
-                missing = folder / f"{short}.xml"
-                raise GameIncomplete(f"track '{name}' has no {missing}; type: {INSTALL}")
-        known = [key for full in tracks for key in (full.rpartition("/")[2], full)]
-        hint = near_miss(name, known, "`sb3-torcs tracks` lists them")
-        raise TrackNotFound(f"the game at {self.data} has no track '{name}'{hint}")
 
     def find_car(self, name: str) -> Path:
         """
@@ -278,24 +255,6 @@ def track_files(data: Path) -> dict[str, Path]:
         for path in files
         if path.stem == path.parent.name
     }
-
-
-def track_path(game: Game, track: str | os.PathLike[str]) -> Path:
-    """
-    Find a track of the game, or a file of that format.
-
-    :param game: the installation
-    :param track: a name, or the path of an XML file
-    :return: the path of its XML file, absolute
-    """
-    if not isinstance(track, (str, os.PathLike)) or track == "random":
-        raise InvalidOption(
-            f"track is {track!r}; Torcs-v0 takes the name of an installed track (`sb3-torcs "
-            "tracks` lists them) or the path of a TORCS .xml; random tracks are for TorcsLite-v0"
-        )
-    if os.fspath(track).lower().endswith(".xml"):
-        return Path(os.path.expanduser(track)).absolute()
-    return game.tracks()[game.find_track(os.fspath(track))].absolute()
 
 
 def _given(home: Path | None) -> str | None:

@@ -23,6 +23,7 @@ from sb3_torcs.torcs.building import build_command
 from sb3_torcs.torcs.installation import Game
 from sb3_torcs.torcs.race_setup import RACE_FILE, SCR_SERVER, RaceSetup, write_race
 from sb3_torcs.torcs.scenery import Scenery, find_scenery
+from sb3_torcs.torcs.track_names import TrackFile, find_track
 
 __all__ = ["GameProcess", "TrackCheck", "compiled_library", "game_environment"]
 
@@ -86,10 +87,10 @@ class GameProcess:
         self._own_scenery: Path | None = None
         self.folder = Path(tempfile.mkdtemp(prefix=PREFIX))
         try:
-            track = _track_file(game, race)
-            check(game, race, track)
-            scenery = None if preload is None else find_scenery(game, track)
-            if scenery is not None and _is_own(race):
+            track = find_track(race.track, game)
+            check(game, race, track.path)
+            scenery = None if preload is None else find_scenery(game, track.path)
+            if scenery is not None and track.source == "file":
                 self._own_scenery = scenery.folder
             data, race = _data(game, self.folder, race, track, scenery)
             libraries = _libraries(game, self.folder, race)
@@ -254,20 +255,8 @@ def game_environment(game: Game, folder: Path) -> dict[str, str]:
     }
 
 
-def _is_own(race: RaceSetup) -> bool:
-    """Say whether the track is a file of the user's, not one of the game's."""
-    return os.fspath(race.track).lower().endswith(".xml")
-
-
-def _track_file(game: Game, race: RaceSetup) -> Path:
-    """Find the file of the track."""
-    if _is_own(race):
-        return Path(os.path.expanduser(race.track)).absolute()
-    return game.tracks()[game.find_track(os.fspath(race.track))].absolute()
-
-
 def _data(
-    game: Game, folder: Path, race: RaceSetup, file: Path, scenery: Scenery | None
+    game: Game, folder: Path, race: RaceSetup, track: TrackFile, scenery: Scenery | None
 ) -> tuple[Path, RaceSetup]:
     """
     Say where the game finds the track: in its own data, or in a folder that also has a user's.
@@ -275,13 +264,14 @@ def _data(
     :param game: the installation
     :param folder: private to the game
     :param race: who races where
-    :param file: of the track
+    :param track: of the race
     :param scenery: of the track, if it is drawn
     :return: the folder of data, and the race with its track as ``category/name``
     """
-    name = f"{OWN_TRACKS}/{file.stem}" if _is_own(race) else game.find_track(os.fspath(race.track))
+    file, is_own = track.path, track.source == "file"
+    name = f"{OWN_TRACKS}/{track.name}" if is_own else track.name
     place = name if scenery is None else scenery.place
-    if place == name and not _is_own(race):
+    if place == name and not is_own:
         return game.data, replace(race, track=place)
     data, category = folder / "data", Path(place).parent.name
     own = data / "tracks" / place

@@ -10,18 +10,16 @@ from typing import Literal
 
 import numpy as np
 
-from sb3_torcs.errors import InvalidOption, TrackFileError, TrackNotFound, near_miss
-from sb3_torcs.torcs.installation import torcs_folders, track_files
+from sb3_torcs.errors import InvalidOption, TrackFileError
+from sb3_torcs.torcs.installation import torcs_folders
 from sb3_torcs.torcs.params import digests
+from sb3_torcs.torcs.track_names import RANDOM_TRACK, TrackFile, find_track, known_tracks
+from sb3_torcs.tracks.compact import read_track_file
+from sb3_torcs.tracks.generator import random_track
+from sb3_torcs.tracks.torcs_xml import read_track_xml
 from sb3_torcs.tracks.track import Track, TrackSummary, closed
 
 __all__ = ["available_tracks", "load_track"]
-
-
-BUNDLED_FOLDER = Path(__file__).parents[1] / "data" / "tracks"
-
-
-TRACK_SUFFIX = ".csv"
 
 
 CATEGORIES = ("road", "oval", "dirt")
@@ -40,40 +38,19 @@ def load_track(
     """
     if isinstance(track, Track):
         return track
-    if not isinstance(track, (str, os.PathLike)):
-        raise InvalidOption(
-            f"track is {track!r}; expected a name (`sb3-torcs tracks` lists them), a path, "
-            "'random', or a Track"
-        )
-    name = os.fspath(track)
-    if name == "random":
+    if track == RANDOM_TRACK:
         if rng is None:
             raise InvalidOption(
-                "track 'random' needs a generator; pass rng=numpy.random.default_rng(seed)"
+                f"track '{RANDOM_TRACK}' needs a generator; pass rng=numpy.random.default_rng(seed)"
             )
-        from sb3_torcs.tracks.generator import random_track
-
         return random_track(rng)
-    if Path(name).suffix.lower() in (TRACK_SUFFIX, ".xml"):
-        path = Path(os.path.expanduser(name))
-        if not path.is_file():
-            raise TrackNotFound(
-                f"there is no track file '{path}'; give the path of a TORCS .xml or a "
-                f"{TRACK_SUFFIX} file, or a name: `sb3-torcs tracks` lists them"
-            )
-        return _read(path, "file")
-    for candidate, (path, source) in _known_files().items():
-        if name in (candidate, candidate.rpartition("/")[2]):
-            return _read(path, source)
-    known = [key for full in _known_files() for key in (full.rpartition("/")[2], full)]
-    hint = near_miss(name, known, "`sb3-torcs tracks` lists them")
-    raise TrackNotFound(f"no track '{name}'{hint}")
+    return _read(find_track(track))
 
 
 def available_tracks() -> list[TrackSummary]:
     """List the bundled tracks and those of the installed TORCS, by category and name."""
     return sorted(
-        (_read(path, source).summary() for path, source in _known_files().values()),
+        (_read(file).summary() for file in known_tracks().values()),
         key=lambda entry: (
             (CATEGORIES.index(entry.category), entry.name)
             if entry.category in CATEGORIES
@@ -82,20 +59,10 @@ def available_tracks() -> list[TrackSummary]:
     )
 
 
-def _known_files() -> dict[str, tuple[Path, str]]:
-    """Map ``category/name`` to file and source: bundled tracks first, then the installed ones."""
-    files: dict[str, tuple[Path, str]] = {}
-    for path in sorted(BUNDLED_FOLDER.glob(f"*/*{TRACK_SUFFIX}")):
-        files[f"{path.parent.name}/{path.stem}"] = (path, "bundled")
-    for folder in torcs_folders()[:1]:
-        for name, path in track_files(folder).items():
-            files.setdefault(name, (path, "torcs"))
-    return files
-
-
-def _read(path: Path, source: str) -> Track:
+def _read(file: TrackFile) -> Track:
     """Read a track file of either kind, once per content: times may stay as they are."""
-    return _read_once(path.resolve(), source, digests(path, torcs_folders()))
+    content = digests(file.path, torcs_folders())
+    return _read_once(file.path.resolve(), file.source, content)
 
 
 @functools.lru_cache(maxsize=128)
@@ -111,11 +78,7 @@ def _read_once(
     :return: the track
     """
     del content
-    # The readers build tracks, so they import this module; it can import them only when asked.
-    if path.suffix.lower() == ".xml":
-        from sb3_torcs.tracks.torcs_xml import read_track_xml as read
-    else:
-        from sb3_torcs.tracks.compact import read_track_file as read
+    read = read_track_xml if path.suffix.lower() == ".xml" else read_track_file
     track = replace(read(path), source=source)
     try:
         return replace(track, segments=closed(track.segments))

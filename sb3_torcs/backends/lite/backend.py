@@ -16,6 +16,7 @@ from sb3_torcs.backends.lite.road import road_width
 from sb3_torcs.car import DEFAULT_CAR, CarState, Controls, FloatArray, Start
 from sb3_torcs.errors import CarLost, InvalidOption
 from sb3_torcs.sensors import RangeFinderName, range_finder_angles
+from sb3_torcs.torcs.track_names import RANDOM_TRACK
 from sb3_torcs.tracks.catalogue import load_track
 from sb3_torcs.tracks.track import Track
 
@@ -53,7 +54,7 @@ class LiteBackend:
         by_road = checked_gearbox(gearbox) == "road_speed"
         self._gearbox = physics.BY_ROAD_SPEED if by_road else physics.AUTOMATIC
         self.range_finder_angles = range_finder_angles(range_finders)
-        self._random = track == "random"
+        self._random = track == RANDOM_TRACK
         self._set_track(load_track(track, np.random.default_rng(0) if self._random else None))
 
     def _set_track(self, track: Track) -> None:
@@ -64,7 +65,7 @@ class LiteBackend:
     def reset(self, rng: np.random.Generator, start: Start | None) -> CarState:
         """Begin an episode; see :class:`~sb3_torcs.backends.base.Backend`."""
         if self._random:
-            self._set_track(load_track("random", rng))
+            self._set_track(load_track(RANDOM_TRACK, rng))
         self._flying = start is not None
         track = self.track
         if start is None:
