@@ -49,7 +49,6 @@ class TestGeometry:
     def test_the_figures_of_an_oval_are_those_of_geometry(self, oval):
         assert oval.length == pytest.approx(600.0 + 100.0 * math.pi, abs=1e-12)
         assert oval.width == 10.0
-        assert oval.min_width == 10.0
         assert oval.tightest_radius == 50.0
 
     def test_a_straight_has_no_tightest_radius(self):
@@ -303,3 +302,10 @@ class TestPlot:
         plot_track(oval, tmp_path / "b.png", np.zeros((2, 2)))
         assert (tmp_path / "a.png").exists()
         assert (tmp_path / "b.png").exists()
+
+
+def test_torcs_own_format_could_not_keep_the_bundled_tracks():
+    """It says radius and arc of a bend, whose product is its length."""
+    bends = [s for name in BUNDLED for s in load_track(name).segments if s.curvature]
+    lost = [s for s in bends if 1 / abs(s.curvature) * (s.length * abs(s.curvature)) != s.length]
+    assert (len(lost), len(bends)) == (186, 804)
