@@ -49,7 +49,7 @@ def test_the_lap_closes_to_a_nanometre(circuits):
 def test_the_figures_are_those_of_a_drivable_road(circuits):
     for track in circuits:
         assert 1500.0 <= track.length <= 4000.0
-        assert 10.0 <= track.min_width == track.width <= 15.0
+        assert 10.0 <= track.width <= 15.0
         assert track.tightest_radius >= 15.0
         assert min(s.length for s in track.segments) > 0.0
 

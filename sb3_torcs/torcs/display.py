@@ -26,7 +26,6 @@ ANSWER_TIME = 5.0  # [s] for a server to greet
 FIRST_TCP_PORT = 6000
 SOCKETS = Path("/tmp/.X11-unix")
 GREETING = b"l\0\x0b\0\0\0" + bytes(6)  # little endian, protocol 11.0, no password
-WELCOME = b"\x01"
 
 
 def find_display(otherwise: str) -> str:

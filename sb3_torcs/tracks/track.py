@@ -143,11 +143,6 @@ class Track:
         return self.segments[0].width_start
 
     @functools.cached_property
-    def min_width(self) -> float:
-        """Width of the road where it is narrowest [m]."""
-        return min(min(s.width_start, s.width_end) for s in self.segments)
-
-    @functools.cached_property
     def tightest_radius(self) -> float:
         """Radius of the axis in the tightest bend [m]."""
         sharpest = max(abs(s.curvature) for s in self.segments)
