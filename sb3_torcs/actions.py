@@ -1,4 +1,4 @@
-"""The numbers an agent gives, and what the car is told with them."""
+"""Layouts of actions, and how an action becomes controls of the car."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def launch_clutch(engine_speed: float, shift_up: float) -> float:
     Slip the clutch in first gear. Compiled, and callable from compiled code.
 
     :param engine_speed: what it would be if no wheel slipped, not negative [rad/s]
-    :param shift_up: at which the second gear comes [rad/s]
+    :param shift_up: speed of the motor at which the second gear is chosen [rad/s]
     :return: the clutch in [0, 1], 1 is pressed
     """
     launch = LAUNCH_CLUTCH * max(1.0 - engine_speed / shift_up, 0.0)
@@ -173,7 +173,7 @@ def checked_gearbox(gearbox: str) -> str:
 
 def used_gearbox(gearbox: str, action: str) -> str:
     """
-    Make sure that a gearbox that was chosen is of use.
+    Make sure that the choice of a gearbox has an effect.
 
     :param gearbox: one of :data:`GEARBOXES`
     :param action: one of :data:`ACTIONS`
@@ -218,7 +218,7 @@ def controls_from_action(
 
 
 def _numbers(action: Any, names: tuple[str, ...]) -> list[float]:
-    """Read an action that is no array of floats: a list, whole numbers, or a mistake."""
+    """Read an action that is not an array of floats: a list, integers, or a mistake."""
     try:
         shape: object = np.shape(action)
     except ValueError:  # lists of different lengths

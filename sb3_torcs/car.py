@@ -1,4 +1,4 @@
-"""What a car tells and what it is told: the two records every world speaks.
+"""The state of a car and its controls: the two records that all worlds use.
 
 SI units and radians throughout. Left is positive for steering, lateral position and yaw.
 """
@@ -61,7 +61,7 @@ MAX_DAMAGE = 10000.0
 
 
 def is_number(value: Any) -> bool:
-    """Whether a value is a finite real number, NumPy's included; a bool is none."""
+    """Whether a value is a finite real number, NumPy's included, but not a bool."""
     try:
         return not isinstance(value, bool) and isinstance(value, Real) and math.isfinite(value)
     except OverflowError:  # a whole number beyond all floats
@@ -105,7 +105,7 @@ def checked_laps(laps: int | None) -> int | None:
 
     :param laps: ``None`` drives on
     :return: the same
-    :raises InvalidOption: if nobody can drive so many
+    :raises InvalidOption: if it is not a possible number of laps
     """
     if laps is None:
         return None
@@ -118,7 +118,7 @@ def checked_laps(laps: int | None) -> int | None:
 
 def checked_start(start: StartName) -> StartName:
     """
-    Check where episodes shall begin.
+    Check the start of episodes.
 
     :param start: ``"grid"`` or ``"random"``
     :return: the same
@@ -131,7 +131,7 @@ def checked_start(start: StartName) -> StartName:
 
 def checked_start_speed(speed: float) -> float:
     """
-    Check the speed that random starts do not exceed.
+    Check the highest speed of random starts.
 
     :param speed: [m/s]
     :return: the same

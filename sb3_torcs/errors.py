@@ -93,7 +93,7 @@ class BackendUnavailable(Sb3TorcsError, RuntimeError):
 
 
 class GameNotFound(BackendUnavailable):
-    """TORCS is installed nowhere."""
+    """TORCS is not installed."""
 
 
 class GameIncomplete(BackendUnavailable):
@@ -101,7 +101,7 @@ class GameIncomplete(BackendUnavailable):
 
 
 class LayoutMismatch(BackendUnavailable):
-    """The installed game lays out its data otherwise than the version that is known."""
+    """The memory layout of the installed game is not that of the supported version."""
 
 
 class RobotUnavailable(BackendUnavailable):
@@ -121,15 +121,15 @@ class EngineForked(Sb3TorcsError, RuntimeError):
 
 
 class CarLost(Sb3TorcsError, RuntimeError):
-    """The game's physics has divided by zero: a car is nowhere, and this race cannot go on."""
+    """The game's physics has divided by zero: a car has no position, and the race ends."""
 
 
 class GameFailed(Sb3TorcsError, RuntimeError):
-    """The game ran and ended without results; the message holds its last words."""
+    """The game ended without results; the message holds the end of its output."""
 
 
 class GameTimeout(Sb3TorcsError, TimeoutError):
-    """The game did not come to an end in the time it was given."""
+    """The game did not end within its time limit."""
 
 
 class InstallFailed(Sb3TorcsError, RuntimeError):
@@ -145,11 +145,11 @@ class ServerNotFound(Sb3TorcsError, ConnectionError):
 
 
 class ServerLost(Sb3TorcsError, ConnectionError):
-    """An SCR server that did answer has ended, or says nothing any more."""
+    """An SCR server that did answer has ended, or does not answer any more."""
 
 
 class MessageBroken(Sb3TorcsError, ValueError):
-    """A datagram is not what the SCR protocol says; the message shows the part of it."""
+    """A datagram does not follow the SCR protocol; the message shows the part that is wrong."""
 
 
 class UnknownCar(Sb3TorcsError, LookupError):
@@ -157,7 +157,7 @@ class UnknownCar(Sb3TorcsError, LookupError):
 
 
 class CarFileError(Sb3TorcsError, ValueError):
-    """A car's file cannot be read, or describes no car that can drive."""
+    """A car's file cannot be read, or describes a car that cannot drive."""
 
 
 class UnknownRobot(Sb3TorcsError, LookupError):
@@ -169,7 +169,7 @@ class ModelMismatch(Sb3TorcsError, ValueError):
 
 
 class ModelNotTrusted(Sb3TorcsError, ValueError):
-    """Loading a model would run code that is pickled in it, and nobody said that it may."""
+    """Loading a model would run code that is pickled in it, which was not allowed."""
 
 
 class NoiseNotBound(Sb3TorcsError, RuntimeError):
@@ -181,7 +181,7 @@ class OutputNotWritable(Sb3TorcsError, OSError):
 
 
 class StudyError(Sb3TorcsError, ValueError):
-    """A study's file or folder says something that cannot be done."""
+    """A study's file or folder has a mistake."""
 
 
 class RayUnavailable(Sb3TorcsError, RuntimeError):
@@ -197,12 +197,12 @@ class PackageMissing(Sb3TorcsError, ImportError):
 
 
 class ZooConfigError(Sb3TorcsError, ValueError):
-    """A hyperparameter file has an entry that nothing would read."""
+    """A hyperparameter file has a mistake, such as a key that nothing reads."""
 
 
 def near_miss(name: str, known: Iterable[str], advice: str = "") -> str:
     """
-    End a complaint about an unknown name: with the known one that was probably meant, and advice.
+    Complete a message about an unknown name with the name that was probably meant, and advice.
 
     :param name: what was typed
     :param known: the names that exist

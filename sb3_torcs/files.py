@@ -1,4 +1,4 @@
-"""Where people let us write: checked before any work begins."""
+"""Checks of files and folders for results, before any work begins."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 def writable_folder(folder: str | Path) -> Path:
     """
-    Make a folder, and make sure that files can be put there.
+    Make a folder, and make sure that files can be written in it.
 
     :param folder: that results should go to
     :return: the folder
@@ -40,7 +40,7 @@ def writable_file(file: str | Path, suffixes: tuple[str, ...]) -> Path:
     Make sure that a file can be written.
 
     :param file: that a result should go to
-    :param suffixes: kinds that can be written, e.g. ``(".png",)``
+    :param suffixes: allowed endings, e.g. ``(".png",)``
     :return: its path
     :raises OutputNotWritable: if its folder cannot be written, or its kind is another
     """

@@ -41,7 +41,7 @@ BRAKE = 2  # index of the actuator
 
 
 class OUParameters(NamedTuple):
-    """How one actuator is perturbed."""
+    """The noise of one actuator."""
 
     mu: float  # [actuator's unit] where the noise pulls: an action or an offset, see the noises
     theta: float  # [1/timestep], or [1/s] with a dt in seconds: how strongly
@@ -62,7 +62,7 @@ class OUParameters(NamedTuple):
             found = cls(np.nan, np.nan, np.nan)
         if not np.isfinite(found).all() or found.theta < 0.0 or found.sigma < 0.0:
             raise InvalidOption(
-                f"{value!r} are no noise parameters; pass [mu, theta, sigma], or a mapping with "
+                f"{value!r} are not noise parameters; pass [mu, theta, sigma], or a mapping with "
                 "these names: finite numbers, theta and sigma not negative, e.g. [0.0, 0.6, 0.3]"
             )
         return found
@@ -77,14 +77,14 @@ BLOG = (
 
 
 class StochasticBrake(NamedTuple):
-    """In some of the timesteps, the brake gets other parameters."""
+    """Other parameters of the brake's noise, in a share of the timesteps."""
 
     probability: float  # [-] share of the timesteps
     parameters: OUParameters
 
 
 class _PolicyWatch:
-    """Keeps what a model's actor has last decided while acting, by a hook on its forward pass."""
+    """Keeps the last action of a model's actor, by a hook on its forward pass."""
 
     def __init__(self, model: OffPolicyAlgorithm) -> None:
         self.model = model
@@ -93,17 +93,17 @@ class _PolicyWatch:
         self.handle = actor.register_forward_hook(self._keep)
 
     def _keep(self, _module: th.nn.Module, _inputs: Any, output: th.Tensor) -> None:
-        # Updates call the actor too, but with gradients.
+        # Gradient steps call the actor, too, but with gradients.
         if not th.is_grad_enabled():
             self.last = output
 
     def warming_up(self) -> bool:
-        """Whether SB3 draws the actions by lot at this moment."""
+        """Whether SB3 chooses random actions at present, before ``learning_starts``."""
         return self.model.num_timesteps < self.model.learning_starts
 
     def action(self, index: int) -> FloatArray | None:
         """
-        Look up what the policy decided for the present timestep.
+        Return the policy's action of the present timestep.
 
         :param index: which of the parallel environments
         :return: (3,) in environment units, ``None`` before the first timestep
@@ -116,7 +116,7 @@ class _PolicyWatch:
 
 class ActuatorNoise(ActionNoise):
     """
-    What both noises share.
+    Base of the two noises.
 
     ``scale`` multiplies the noise, ``timesteps`` counts those of all parallel environments, and
     ``stochastic_brake`` is :class:`StochasticBrake` or ``None``.
@@ -149,7 +149,7 @@ class ActuatorNoise(ActionNoise):
         """
         Draw the noise of one timestep.
 
-        :return: (3,) to add to SB3's scaled action; zeros while SB3 still acts by lot
+        :return: (3,) to add to SB3's scaled action; zeros while SB3 chooses random actions
         """
         self.timesteps += self.n_envs
         if self._watch is not None and self._watch.warming_up():
@@ -172,7 +172,7 @@ class ActuatorNoise(ActionNoise):
 
     def attach(self, watch: _PolicyWatch, index: int, n_envs: int) -> None:
         """
-        Tell the noise which policy it perturbs. Called by :func:`bind`.
+        Connect the noise to the policy that it perturbs. Called by :func:`bind`.
 
         :param watch: sees the policy's actions
         :param index: which of the parallel environments is perturbed
@@ -181,13 +181,13 @@ class ActuatorNoise(ActionNoise):
         self._watch, self._index, self.n_envs = watch, index, n_envs
 
     def release(self) -> None:
-        """Forget the policy; the other noises of the same model are bound anew with it."""
+        """Disconnect the noise from the policy."""
         if self._watch is not None:
             self._watch.handle.remove()
         self._watch = None
 
     def __getstate__(self) -> dict[str, Any]:
-        # Those of the callbacks of one training, not of the noise.
+        # These belong to the callbacks of one training.
         return {**self.__dict__, "_watch": None, "stochastic_brake": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -197,7 +197,7 @@ class ActuatorNoise(ActionNoise):
 
     def __deepcopy__(self, memo: dict[int, Any]) -> ActuatorNoise:
         # SB3 makes the noises of parallel environments by deep copies: each needs a stream of
-        # its own. Pickles, on the other hand, go on with the same stream.
+        # its own. Pickles continue the same stream.
         twin = copy.copy(self)
         memo[id(self)] = twin
         twin._rng = self._rng.spawn(1)[0]
@@ -213,7 +213,7 @@ class SetPointNoise(ActuatorNoise):
     The noise of the original code: ``scale * (theta * (mu - a) + sigma * N(0, 1))``.
 
     It is a function of the policy's present action ``a`` alone: at scale 1 and theta 1
-    the car does what ``mu`` says, whatever the policy says. It has to know the policy:
+    the car does what ``mu`` says, whatever the policy says. It needs the policy, to which
     :class:`~sb3_torcs.callbacks.NoiseCallback` binds it.
     """
 
@@ -223,7 +223,7 @@ class SetPointNoise(ActuatorNoise):
         action = None if self._watch is None else self._watch.action(self._index)
         if action is None:
             raise NoiseNotBound(
-                "SetPointNoise depends on the policy's action and knows no policy; train with "
+                "SetPointNoise needs the policy's action, but is not bound to a policy; train with "
                 "callback=NoiseCallback(kind='set_point') of sb3_torcs.callbacks, or call "
                 "sb3_torcs.noise.bind(model) before learn()"
             )
@@ -264,7 +264,7 @@ class OUNoise(ActuatorNoise):
 
 def checked_dt(dt: float) -> float:
     """
-    Check a timestep.
+    Check the duration of a timestep.
 
     :param dt: duration of one timestep
     :return: the same
@@ -288,7 +288,7 @@ def noises_of(model: Any) -> list[ActuatorNoise]:
 
 def bind(model: OffPolicyAlgorithm) -> list[ActuatorNoise]:
     """
-    Tell a model's noises which policy they perturb; again is harmless.
+    Bind a model's noises to its policy. A second call does nothing more.
 
     :param model: a DDPG, TD3 or SAC whose ``action_noise`` is of this module
     :return: its noises, one per parallel environment

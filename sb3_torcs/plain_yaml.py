@@ -1,4 +1,4 @@
-"""YAML as data: no objects, and nothing so large, so deep or so entangled that reading it hangs."""
+"""Read YAML as plain data, with limits on size, depth and aliases, so that reading never hangs."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import yaml
 
 __all__ = ["read_yaml"]
 
-MAX_LENGTH = 2**16  # [characters] a second of reading
-MAX_BRACKETS = 100  # that are open at once: PyYAML takes their number squared
-MAX_NODES = 100_000  # with each alias written out
+MAX_LENGTH = 2**16  # [characters] PyYAML takes about a second for as many
+MAX_BRACKETS = 100  # open at once: PyYAML's time grows with their square
+MAX_NODES = 100_000  # after aliases are expanded
 
 
 def read_yaml(text: str, loader_class: type[yaml.SafeLoader] = yaml.SafeLoader) -> Any:
@@ -21,7 +21,7 @@ def read_yaml(text: str, loader_class: type[yaml.SafeLoader] = yaml.SafeLoader) 
     :param text: of the file
     :param loader_class: that builds the values
     :return: of plain Python types
-    :raises yaml.YAMLError: if it is none, or too much
+    :raises yaml.YAMLError: if it is not YAML, or beyond the limits
     """
     if len(text) > MAX_LENGTH:
         raise yaml.YAMLError(f"{len(text)} characters; at most {MAX_LENGTH} are read")
@@ -40,14 +40,14 @@ def read_yaml(text: str, loader_class: type[yaml.SafeLoader] = yaml.SafeLoader) 
         raise yaml.YAMLError("it nests too deep, or an alias is within what it stands for") from (
             error
         )
-    except ValueError as error:  # of a date or a number that is none
+    except ValueError as error:  # of an invalid date or number
         raise yaml.YAMLError(str(error)) from error
     finally:
         loader.dispose()
 
 
 def _written_out(node: yaml.Node, known: dict[int, int]) -> int:
-    """Count the nodes below one as if there were no aliases; each is visited once."""
+    """Count the nodes after aliases are expanded, visiting each once."""
     if id(node) not in known:
         parts = node.value if isinstance(node, yaml.CollectionNode) else []
         children = [child for part in parts for child in (part if type(part) is tuple else (part,))]

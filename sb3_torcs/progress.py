@@ -1,4 +1,4 @@
-"""The name by which older hyperparameter files call the progress bar."""
+"""The older path of the progress bar, for older hyperparameter files."""
 
 from sb3_torcs.callbacks.progress import RacingProgressCallback
 

@@ -1,8 +1,8 @@
-"""Rewards as sentences over measurements: named terms, weights, a sum.
+"""Rewards: weighted sums of named terms.
 
 A term is a rate per second of simulated time, measured over one timestep; a reward is the sum of
 weight × term × duration × scale, plus a single crash term when the episode ends badly. So the
-return of a drive does not depend on how often the agent decides.
+return of a drive does not depend on the length of a timestep.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def progress(before: CarState, after: CarState, controls: Controls) -> float:
 
 
 def time(before: CarState, after: CarState, controls: Controls) -> float:
-    """One per second [-]: weighted below zero, it makes haste."""
+    """One per second [-]; a negative weight rewards speed."""
     return 1.0
 
 
@@ -73,7 +73,7 @@ TERMS: dict[str, Term] = {
 }  # fmt: skip
 
 SCALE = 0.1  # [1/m] a reward of 1 for ten metres along the road
-CRASH = -1.0  # what an episode that ends off the road, backwards, stuck and so on costs
+CRASH = -1.0  # when an episode ends off the road, backwards, stuck or damaged
 
 RewardName = Literal["progress", "blog", "apex"]
 RewardChoice = RewardName | Mapping[str, float]
@@ -142,7 +142,7 @@ class Reward:
 
     def nothing(self) -> dict[str, float]:
         """
-        Value what has not begun yet.
+        Return the terms of an episode that has just begun.
 
         :return: all terms, each 0
         """
@@ -155,15 +155,15 @@ class Reward:
         Value one timestep.
 
         :param before: the car at the beginning of the timestep
-        :param after: the car when it had been carried out
-        :param controls: what was done
+        :param after: the car at its end
+        :param controls: that were held in between
         :param end: why the episode ended, or ``None``
         :return: the weighted terms, ``crash`` last; their sum is the reward
         """
         seconds = after.time - before.time
         terms = {}  # filled in a loop: a comprehension is one more call per timestep
         for name, term, weight in self._terms:
-            # A car that is lost stays where and when it was: no time, no rate.
+            # The state of a lost car does not advance: without time there is no rate.
             terms[name] = weight * seconds * term(before, after, controls) if seconds else 0.0
         terms["crash"] = self._crash if end in CRASHES else 0.0
         return terms

@@ -1,6 +1,6 @@
 """``python -m sb3_torcs.rl_zoo SCRIPT …``: the RL Zoo's own scripts, with our environments.
 
-Some of them, ``record_video`` among them, have no ``--gym-packages``.
+It is for scripts without ``--gym-packages``, such as ``record_video``.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ __all__ = ["main"]
 
 
 def main() -> None:
-    """Run the script that the first word names, with the words after it."""
+    """Run the named script with the remaining arguments."""
     script = sys.argv[1] if len(sys.argv) > 1 else ""
     name = f"rl_zoo3.{script}"
     if not script.isidentifier() or util.find_spec(name) is None:

@@ -1,4 +1,4 @@
-"""The sensor table: what an agent sees, said once.
+"""The sensor table, from which all that concerns observations is derived.
 
 Each row is one sensor of the SCR manual (arXiv:1304.1672, table 1). The observation space, the
 encoder, the documentation and the policy's view of the observation are all derived from it.
@@ -79,7 +79,7 @@ OBSERVATION_HIGH = _HIGH.astype(np.float32)
 
 
 def feature_slices() -> dict[str, slice]:
-    """Where each sensor stands in an observation."""
+    """Return the slice of each sensor in an observation."""
     slices, start = {}, 0
     for sensor in SENSORS:
         slices[sensor.name] = slice(start, start + sensor.size)
@@ -92,13 +92,13 @@ _SIZES = tuple(sensor.size for sensor in SENSORS)
 
 
 def _numbers(value: Any) -> Any:
-    """What a sensor measures, to iterate over."""
+    """Return the values of a sensor as an iterable."""
     return value if isinstance(value, np.ndarray) else (value,)
 
 
 @overload(_numbers)
 def _compiled_numbers(value: Any) -> Callable[[Any], Any]:
-    """The same in compiled code, which chooses by type before it runs."""
+    """The same for compiled code, which chooses by type when it is compiled."""
 
     def several(value: Any) -> Any:
         return value
@@ -116,7 +116,7 @@ def _scale(values: tuple[float | FloatArray, ...], observation: npt.NDArray[np.f
 
     :param values: one number or array per row of the table
     :param observation: (29,) filled
-    :return: how many rows have the size that the table says, up to the first that has not
+    :return: number of rows before the first whose size differs from the table's
     """
     row = i = 0
     for value in literal_unroll(values):
@@ -141,7 +141,7 @@ def encode(car: CarState) -> npt.NDArray[np.float32]:
 
     :param car: any state
     :return: (29,) numbers within ``OBSERVATION_LOW`` and ``OBSERVATION_HIGH``
-    :raises ValueError: if a sensor has not the size that the table says
+    :raises ValueError: if the size of a sensor differs from the table's
     """
     observation = np.empty(OBSERVATION_SIZE, np.float32)
     done = _scale(_measure(car), observation)
@@ -201,7 +201,7 @@ def range_finder_angles(choice: RangeFinderName | Sequence[float]) -> FloatArray
 
 def look_both_ways(angles: FloatArray) -> bool:
     """
-    Say whether range finders look equally far to both sides, so that there is a mirror image.
+    Check whether the angles are symmetric, so that an observation has a mirror image.
 
     :param angles: (19,) [rad]
     :return: whether they do

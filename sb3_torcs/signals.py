@@ -1,4 +1,4 @@
-"""Signals that this process answers for a while."""
+"""Handlers of signals for a limited time."""
 
 from __future__ import annotations
 
@@ -45,5 +45,7 @@ def handlers_kept(*numbers: int) -> Iterator[None]:
         yield
     finally:
         for number, handler in before.items():
-            if handler is not None:  # else it was set by other code than Python, and is not known
+            if (
+                handler is not None
+            ):  # None: the handler was not set by Python, which cannot restore it
                 signal.signal(number, handler)

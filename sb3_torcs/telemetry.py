@@ -1,4 +1,4 @@
-"""Drives as tables: one row per driver and moment, for robots and agents alike."""
+"""Telemetry: tables of drives, one row per driver and moment."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ TELEMETRY_FIELDS = ("robot", "index", *STATE_FIELDS, *CONTROL_FIELDS)
 
 def write_telemetry(path: Path, rows: Iterable[tuple[Any, ...]]) -> None:
     """
-    Write a drive down.
+    Write a drive to a CSV file.
 
-    :param path: of the CSV file, which is there when it is whole
-    :param rows: values of :data:`TELEMETRY_FIELDS`; they are taken one by one while they are driven
+    :param path: of the CSV file, which appears when it is complete
+    :param rows: values of :data:`TELEMETRY_FIELDS`; they are consumed one by one during the drive
     :raises OutputNotWritable: if the file cannot be written
     """
     aside = path.with_name(f".{path.name}")

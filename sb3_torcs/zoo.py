@@ -1,4 +1,4 @@
-"""The name by which records of older trainings call a wrapper of theirs."""
+"""The older path of a wrapper, for records of older trainings."""
 
 from sb3_torcs.training.zoo import UninterruptedWorker
 

@@ -1,6 +1,6 @@
-"""Callbacks for Stable-Baselines3, whose arguments are plain values.
+"""Callbacks for Stable-Baselines3. Their arguments are plain values.
 
-A hyperparameter file names them, e.g. ``sb3_torcs.callbacks.NoiseCallback: {kind: ou}``.
+So a hyperparameter file can name them, e.g. ``sb3_torcs.callbacks.NoiseCallback: {kind: ou}``.
 """
 
 from sb3_torcs.callbacks.exploration import (

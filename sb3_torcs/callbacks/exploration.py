@@ -38,7 +38,7 @@ class NoiseCallback(BaseCallback):
     """
     Give the model a noise of :mod:`sb3_torcs.noise`, one stream per parallel environment.
 
-    A model that was saved with such a noise goes on with it: its generator, count and scale.
+    A model that was saved with such a noise continues with its generator, count and scale.
 
     :param kind: ``"set_point"`` (as in the original code) or ``"ou"``
     :param steering: ``[mu, theta, sigma]`` in environment units
@@ -90,7 +90,7 @@ class NoiseCallback(BaseCallback):
         return KINDS[self.kind](seed=seed)
 
     def _continued(self, saved: ActuatorNoise) -> ActuatorNoise:
-        # Another number of environments goes on with the noise itself, another kind with its count.
+        # Another number of environments continues the noise, another kind only its count.
         if type(saved) is KINDS[self.kind]:
             return saved
         saved.release()
@@ -103,7 +103,7 @@ class NoiseCallback(BaseCallback):
 
 
 class _NoiseUser(BaseCallback):
-    """Base of callbacks that steer the noise: finds it before the first timestep."""
+    """Base of callbacks that change the noise, which they find before the first timestep."""
 
     noises: Sequence[ActuatorNoise] = ()
 
@@ -111,13 +111,13 @@ class _NoiseUser(BaseCallback):
         self.noises = ()
 
     def _on_rollout_start(self) -> None:
-        # Only now has every callback's training start been called, whatever their order.
+        # Not at the training's start: NoiseCallback may come later in the list.
         if self.noises:
             return
         self.noises = noises_of(self.model)
         if not self.noises:
             raise InvalidOption(
-                f"{type(self).__name__} steers a noise of sb3_torcs, but the model's action_noise "
+                f"{type(self).__name__} changes a noise of sb3_torcs, but the model's action_noise "
                 f"is {getattr(self.model, 'action_noise', None)!r}; add NoiseCallback to the "
                 "callbacks"
             )
@@ -126,7 +126,7 @@ class _NoiseUser(BaseCallback):
         self._apply()
 
     def _apply(self) -> None:
-        """Set what does not change during the training."""
+        """Change the noise, before the first timestep of a training."""
 
     def _on_step(self) -> bool:
         return True
@@ -134,10 +134,10 @@ class _NoiseUser(BaseCallback):
 
 class NoiseDecayCallback(_NoiseUser):
     """
-    Let the noise fade linearly. Its timesteps are counted across resumes.
+    Reduce the noise linearly. Its timesteps are counted across resumes.
 
-    :param timesteps: of all environments together until the floor is reached
-    :param floor: share of the noise that stays for ever
+    :param timesteps: after which the floor is reached, of all environments together
+    :param floor: share of the noise that remains
     :param verbose: as in ``BaseCallback``
     """
 
@@ -197,6 +197,6 @@ class StochasticBrakeCallback(_NoiseUser):
             noise.stochastic_brake = self.brake
 
     def _on_training_end(self) -> None:
-        # The model may be trained on without this callback.
+        # The model may be trained further without this callback.
         for noise in self.noises:
             noise.stochastic_brake = None

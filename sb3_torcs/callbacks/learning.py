@@ -26,8 +26,8 @@ class _WhileLearning(BaseCallback):
     """
     Base of callbacks that change the algorithm only while it learns.
 
-    That is from the end of a rollout to the beginning of the next: what callbacks save in between
-    is unchanged.
+    They change it at the end of a rollout and restore it at the beginning of the next, so that
+    models that other callbacks save are unchanged.
     """
 
     def _on_step(self) -> bool:
@@ -35,7 +35,7 @@ class _WhileLearning(BaseCallback):
 
     @abstractmethod
     def _undo(self) -> None:
-        """Take back what ``_on_rollout_end`` has changed, if anything."""
+        """Undo the change of ``_on_rollout_end``, if there is one."""
 
     def _on_rollout_start(self) -> None:
         self._undo()
@@ -46,13 +46,13 @@ class _WhileLearning(BaseCallback):
 
 class GradientStepsCallback(_WhileLearning):
     """
-    Learn more from each timestep at the beginning of a training, when there are few.
+    Take more gradient steps at the beginning of a training, when there are few timesteps.
 
-    A training that goes on with its replay buffer is not at its beginning. Models that callbacks
+    A training that resumes with its replay buffer is past its beginning. Models that callbacks
     save keep their own ``gradient_steps``.
 
-    :param gradient_steps: instead of the model's own, for the first timesteps
-    :param timesteps: number of these timesteps, of all environments together
+    :param gradient_steps: replace the model's own at the beginning
+    :param timesteps: length of the beginning, of all environments together
     :param verbose: as in ``BaseCallback``
     """
 
@@ -87,9 +87,9 @@ class GradientStepsCallback(_WhileLearning):
 
 class MirrorCallback(_WhileLearning):
     """
-    Learn from half of each batch as seen in a mirror, where every bend goes the other way.
+    Mirror half of each batch from left to right, so that its bends go the other way.
 
-    The replay buffer holds what was driven, and is the stock one wherever it is saved.
+    The replay buffer holds the transitions as they were driven, and is saved as the stock one.
 
     :param verbose: as in ``BaseCallback``
     """
@@ -101,7 +101,7 @@ class MirrorCallback(_WhileLearning):
         buffer = getattr(self.model, "replay_buffer", None)
         if not isinstance(buffer, ReplayBuffer):
             raise InvalidOption(
-                f"{type(self).__name__} mirrors what a replay buffer holds, and "
+                f"{type(self).__name__} mirrors samples of a replay buffer, but "
                 f"{type(self.model).__name__} has none; take it out of the callbacks"
             )
         if self.model.get_vec_normalize_env() is not None:
@@ -126,7 +126,7 @@ class MirrorCallback(_WhileLearning):
 
 
 class _MirroredSample:
-    """What a replay buffer's ``sample`` is replaced with."""
+    """Replaces the ``sample`` of a replay buffer."""
 
     def __init__(self, buffer: ReplayBuffer) -> None:
         self._buffer = buffer
@@ -135,5 +135,5 @@ class _MirroredSample:
         return mirror_half(type(self._buffer).sample(self._buffer, batch_size, env))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # Ctrl-C comes while the algorithm learns; then the buffer is saved, with its own method.
+        # After Ctrl-C the buffer may be saved while it is replaced: pickle its own method.
         return partial, (type(self._buffer).sample, self._buffer)

@@ -1,7 +1,7 @@
-"""What a training says about driving, beside what it says about returns.
+"""Metrics of driving during a training: lap times, how episodes end, speed, use of the brake.
 
-Everything goes through Stable-Baselines3's own logger (TensorBoard, CSV, the table on the screen).
-The rows of ``monitor.csv`` are Monitor's business: :data:`MONITOR_KWARGS` tells it what to write.
+They go to Stable-Baselines3's own logger (TensorBoard, CSV, the table on the screen). With
+:data:`MONITOR_KWARGS` Monitor writes some of them to ``monitor.csv``, too.
 """
 
 from __future__ import annotations
@@ -58,10 +58,12 @@ default for the first is a tuple: hence the empty list. A ``best_lap_time`` of 0
 
 ENDS = ("off_track", "backwards", "stuck", "damage", "lost", "laps", "time_limit")
 
-BRAKING = 0.05  # [-] of the pedal's way; less is a network's idea of nothing
-SATURATED = 0.01  # [-] of an actuator's range: nearer to a limit than this counts as at it
+BRAKING = 0.05  # [-] of the pedal's travel; networks seldom give exactly 0
+SATURATED = (
+    0.01  # [-] of an actuator's range; an action this near to a limit counts as at the limit
+)
 RECORD_EVERY = 100  # calls between two records of the means over timesteps
-TEXT_FORMATS = ("stdout", "log", "json", "csv")  # these refuse pictures
+TEXT_FORMATS = ("stdout", "log", "json", "csv")  # these formats refuse pictures
 
 
 def callbacks_in(callback: BaseCallback | None) -> Iterator[BaseCallback]:
@@ -82,14 +84,14 @@ def callbacks_in(callback: BaseCallback | None) -> Iterator[BaseCallback]:
 
 
 class DrivenLine(NamedTuple):
-    """Where a car went, one row per timestep."""
+    """The line that a car drove, one row per timestep."""
 
     track: Track
     x: npt.NDArray[np.float64]  # (n,) [m] in the track's frame
     y: npt.NDArray[np.float64]  # (n,) [m]
     speed: npt.NDArray[np.float64]  # (n,) [m/s] along the car
     distance: float  # [m] along the road
-    lap_time: float | None  # [s] of the lap, if it was completed
+    lap_time: float | None  # [s] of the lap; None if it was not completed
 
 
 class _FirstOf:
@@ -135,7 +137,7 @@ def drive_lap(model: BaseAlgorithm, env: VecEnv, limit: int = 1500) -> DrivenLin
     :param model: the driver
     :param env: racing environments; what the first one does is kept
     :param limit: timesteps after which to give up
-    :return: the line of the lap, or of what there was of it
+    :return: the line of the lap, or of the part that was driven
     """
     first = _FirstOf(env, model)
     cars: list[CarState] = []
@@ -156,7 +158,7 @@ def line_image(line: DrivenLine) -> npt.NDArray[np.uint8]:
     :param line: what was driven
     :return: (height, width, 3)
     """
-    # Graphics load only when there is something to draw.
+    # Imported here because graphics take long to load.
     from matplotlib.image import imread
 
     from sb3_torcs.tracks.plot import plot_track
@@ -172,7 +174,7 @@ def mean_q(model: BaseAlgorithm, size: int = 256) -> float | None:
     """
     Ask the critic about the newest transitions of the replay buffer.
 
-    They are taken in order, without drawing, so that looking changes nothing in the training.
+    They are taken in order, without a random choice, so that the training does not change.
 
     :param model: any algorithm
     :param size: transitions to ask about
@@ -202,7 +204,7 @@ def mean_q(model: BaseAlgorithm, size: int = 256) -> float | None:
 
 @dataclass
 class _Steps:
-    """Sums over timesteps, and how many there were."""
+    """Sums over timesteps, and their number."""
 
     count: int = 0
     speed: float = 0.0  # [m/s]
@@ -215,7 +217,7 @@ class _Steps:
         self.saturated = [0] * len(self.names)
 
     def add(self, other: _Steps) -> None:
-        """Take another's sums over and leave it empty."""
+        """Add the sums of another and reset that."""
         self.count += other.count
         self.speed += other.speed
         self.braking += other.braking
@@ -223,7 +225,7 @@ class _Steps:
         other.__init__(names=self.names)  # type: ignore[misc]
 
     def record(self, logger: Logger) -> None:
-        """Write the means down."""
+        """Record the means."""
         logger.record("driving/speed", self.speed / self.count)
         logger.record("driving/brake_share", self.braking / self.count)
         for name, saturated in zip(self.names, self.saturated, strict=True):
@@ -232,7 +234,7 @@ class _Steps:
 
 @dataclass
 class _Watched:
-    """An evaluation, and the last of its calls that was looked at."""
+    """An evaluation callback, and its last call that was followed."""
 
     callback: EvalCallback
     seen: int
@@ -240,7 +242,7 @@ class _Watched:
 
 class DrivingMetricsCallback(BaseCallback):
     """
-    Log how the car drives. For any algorithm, any number of environments, any kind of ``VecEnv``.
+    Log how the car drives, for any algorithm, number of environments and kind of ``VecEnv``.
 
     ========================================  ==========================================  ======
     ``driving/…``                             what                                        unit
@@ -258,14 +260,14 @@ class DrivingMetricsCallback(BaseCallback):
     ``line``                                  the driven line (TensorBoard image)
     ========================================  ==========================================  ======
 
-    Beside ``driving/…`` there is ``reward/TERM``, for each term of the reward: its sum over an
-    episode, and of that the mean of the episodes that ended.
+    ``reward/TERM`` is the sum of a term of the reward over an episode, as the mean of the episodes
+    that ended.
 
-    Means are over what happened since the logger's previous row. After each evaluation of an
-    ``EvalCallback`` anywhere in the training's callbacks, one more lap is driven in its environment
-    and drawn, if TensorBoard listens.
+    Means are taken since the logger's previous row. After each evaluation of an
+    ``EvalCallback`` of the training, one more lap is driven in its environment, and drawn if
+    TensorBoard is used.
 
-    :param q_every: timesteps of the vector of environments between two looks at Q
+    :param q_every: timesteps of the vector of environments between two estimates of Q
     :param q_size: transitions to ask the critic about
     :param line: whether to draw the line after evaluations
     :param line_timesteps: timesteps after which a lap is given up
@@ -322,7 +324,7 @@ class DrivingMetricsCallback(BaseCallback):
         ]
 
     def _on_step(self) -> bool:
-        # PPO keeps what it drew in "actions", and what the environment got beside it.
+        # PPO has two: the actions that it drew, and those clipped for the environment.
         actions = self.locals.get("clipped_actions", self.locals["actions"])
         pending, read = self._pending, self._layout.read
         for action, info, done, terms in zip(
@@ -348,7 +350,7 @@ class DrivingMetricsCallback(BaseCallback):
         return True
 
     def _on_training_end(self) -> None:
-        # An EvalCallback that stands behind this one in the list may have had the last word.
+        # An EvalCallback later in the list may have evaluated after our last call.
         self._follow_evaluations()
 
     def _record_lap(self, seconds: float) -> None:
@@ -384,13 +386,15 @@ class DrivingMetricsCallback(BaseCallback):
 
     def _record_noise(self) -> None:
         noise = getattr(self.model, "action_noise", None)
-        noise = next(iter(getattr(noise, "noises", ())), noise)  # all of a vector have the same
+        noise = next(
+            iter(getattr(noise, "noises", ())), noise
+        )  # the same in all environments of a vector
         scale = getattr(noise, "scale", None)
         if scale is not None:
             self.logger.record("driving/noise_scale", float(scale))
 
     def _follow_evaluations(self) -> None:
-        """Draw a line if an evaluation has just been finished."""
+        """Drive and draw a line if an evaluation has just ended."""
         for watched in self._evaluations:
             evaluation = watched.callback
             calls, every = evaluation.n_calls, evaluation.eval_freq
@@ -404,7 +408,7 @@ class DrivingMetricsCallback(BaseCallback):
             return
         chance = copy.deepcopy(env.get_attr("np_random"))
         line = drive_lap(self.model, env, self.line_timesteps)
-        for index, generator in enumerate(chance):  # later evaluations are as if nobody had looked
+        for index, generator in enumerate(chance):  # so that later evaluations are unchanged
             env.set_attr("np_random", generator, index)
         if line.lap_time is not None:
             best = self.best_evaluation_lap_time or math.inf
@@ -412,5 +416,5 @@ class DrivingMetricsCallback(BaseCallback):
             self.logger.record("driving/evaluation_lap_time", line.lap_time)
         picture = line_image(line)
         self.logger.record("driving/line", Image(picture, "HWC"), exclude=TEXT_FORMATS)
-        # At once, as EvalCallback does: the next row may be as far away as the next evaluation.
+        # Dump at once, as EvalCallback does: the next row may come much later.
         self.logger.dump(self.num_timesteps)

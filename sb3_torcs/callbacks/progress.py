@@ -1,4 +1,4 @@
-"""How a training is getting on, for the person who waits for it."""
+"""The progress of a training, as a bar or as lines."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ REDRAW = 0.2  # [s] between two looks of the bar
 
 def spoken_time(seconds: float) -> str:
     """
-    Say a duration.
+    Format a duration.
 
     :param seconds: [s]
     :return: e.g. ``"1 h 05 min"``, ``"12 min"`` or ``"40 s"``
@@ -35,7 +35,7 @@ def spoken_time(seconds: float) -> str:
 
 class Unbroken:
     """
-    Text output that goes on when its reader, such as ``tee``, has ended: the text is dropped.
+    Text output that drops its text when the reader of the pipe, such as ``tee``, has ended.
 
     :param stream: to write to
     """
@@ -53,7 +53,7 @@ class Unbroken:
         return len(text)
 
     def flush(self) -> None:
-        """Write what is held back."""
+        """Flush the stream."""
         with contextlib.suppress(OSError):
             self._stream.flush()
 
@@ -63,10 +63,10 @@ class Unbroken:
 
 class RacingProgressCallback(BaseCallback):
     """
-    A live line: timesteps, episode, distance of the last one, best lap, time left.
+    Show the progress: timesteps, episode, distance of the last one, best lap, time left.
 
-    On a terminal it is a bar; elsewhere (a log file, CI) a line now and then. The clock is only
-    read for display: nothing that is learned depends on it. Lap times of evaluations come from the
+    On a terminal this is a bar; elsewhere (a log file, CI) a line every ``every`` seconds. The
+    training does not depend on the clock. Lap times of evaluations come from the
     :class:`~sb3_torcs.callbacks.DrivingMetricsCallback` of the same training, if it has one.
 
     :param every: seconds between two lines where there is no terminal [s]
@@ -86,7 +86,7 @@ class RacingProgressCallback(BaseCallback):
         self.best_lap_time: float | None = None  # [s]
         self._stream = stream
         self._bar: Any = None
-        self._ended = True  # or rather, not begun
+        self._ended = True  # has not begun
 
     def _on_training_start(self) -> None:
         stream: Any = Unbroken(self._stream or sys.stderr)
@@ -138,7 +138,7 @@ class RacingProgressCallback(BaseCallback):
 
     def describe(self, now: float) -> str:
         """
-        Say everything but the timesteps.
+        Format everything but the timesteps.
 
         :param now: the present time of the monotonic clock [s]
         :return: e.g. ``"episode 12, last 345 m, best lap 91.20 s, 4 min left"``

@@ -1,4 +1,4 @@
-"""Callbacks that change the environment while it trains: its reward, where episodes start."""
+"""Callbacks that change the training environments: the reward, the start of episodes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["RandomStartCallback", "RewardCallback", "require_method"]
 
 
 class _SwitchUser(BaseCallback):
-    """Base of callbacks that change settings of environments, and give them back at the end."""
+    """Base of callbacks that change settings of environments, and restore them at the end."""
 
     _switches: Sequence[_Switch] = ()
 
@@ -31,16 +31,16 @@ class _SwitchUser(BaseCallback):
 
 class RewardCallback(_SwitchUser):
     """
-    Let the training environments give another reward.
+    Use another reward in the training environments.
 
     :param reward: name of a reward, or a mapping of terms to weights
-    :param also_eval: also in the environments of an ``EvalCallback``, whose score it changes
+    :param also_eval: also use it in the environments of an ``EvalCallback``, changing its score
     :param verbose: as in ``BaseCallback``
     """
 
     def __init__(self, *, reward: RewardChoice, also_eval: bool = False, verbose: int = 0) -> None:
         super().__init__(verbose)
-        Reward(reward)  # or a worker process would have to say what is wrong
+        Reward(reward)  # checked here, for a message of this process and not of a worker
         self.reward = reward
         self.also_eval = also_eval
 
@@ -54,12 +54,12 @@ class RewardCallback(_SwitchUser):
 
 class RandomStartCallback(_SwitchUser):
     """
-    Let training episodes start elsewhere; evaluation keeps its own start.
+    Change the start of training episodes; evaluations keep theirs.
 
-    The first episode has begun before any callback is called, and keeps the environment's start.
+    The first episode begins before any callback is called, so it keeps the environment's start.
 
     :param start: ``"random"`` or ``"grid"``
-    :param speed: that random starts do not exceed [m/s]; by default the environment's own
+    :param speed: highest speed of random starts [m/s]; by default the environment's own
     :param verbose: as in ``BaseCallback``
     """
 
@@ -79,7 +79,7 @@ class RandomStartCallback(_SwitchUser):
 
 def require_method(env: VecEnv, name: str) -> None:
     """
-    Make sure that environments have a method. A worker process without it would die of the call.
+    Make sure that environments have a method. A worker process would end with an error.
 
     :param env: of the training
     :param name: of the method
@@ -102,7 +102,7 @@ class _Switch:
         self.previous: list[Any] = env.env_method(setter, value)
 
     def undo(self) -> None:
-        """Give every environment its own previous value back."""
+        """Restore the previous value of every environment."""
         for index, value in enumerate(self.previous):
             self.env.env_method(self.setter, value, indices=[index])
         self.previous = []

@@ -1,4 +1,4 @@
-"""The loop, written once: reset, step, the end of an episode, info. It names no simulator."""
+"""The loop of all racing environments: reset, step, the end of an episode, info."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ __all__ = ["RacingEnv", "RacingInfo", "RenderMode"]
 Observation = npt.NDArray[np.float32]
 RenderMode = Literal["rgb_array", "human"]
 
-MAX_ACTION_REPEAT = 50_000  # [-] a timestep every quarter of an hour
+MAX_ACTION_REPEAT = 50_000  # [-] a timestep of 1,000 s
 
 STUCK_SPEED = 5.0 / 3.6  # [m/s] along the road; slower than walking counts as standing
 STUCK_TICKS = 75  # control ticks of standing that end an episode: 1.5 s
@@ -51,12 +51,12 @@ BACKWARDS_ANGLE = 0.5 * math.pi  # [rad] to the road from which the car faces ba
 RANDOM_GRID_SHARE = 0.1
 RANDOM_TRACK_POSITION = 0.6  # [-]
 RANDOM_HEADING_ERROR = 0.25  # [rad]
-RANDOM_SPEED = 40.0  # [m/s] unless somebody sets another
+RANDOM_SPEED = 40.0  # [m/s] default
 RESET_OPTIONS = ("distance", "track_position", "heading_error", "speed")
 
 
 class RacingInfo(TypedDict):
-    """What ``info`` holds, from the reset to the end. What has not happened is 0 or empty."""
+    """The contents of ``info``, in every timestep. Values that do not exist yet are 0 or empty."""
 
     laps: int  # whole laps driven in this episode
     lap_time: float  # [s] of the lap that this timestep has completed, else 0
@@ -66,15 +66,15 @@ class RacingInfo(TypedDict):
     damage: float  # [points]
     reward_terms: dict[str, float]  # they sum to the reward exactly
     car: CarState  # everything else
-    end: str  # why the episode ended; stays empty when a time limit cut it
+    end: str  # why the episode ended; empty if the time limit truncated it
 
 
 class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
     """
-    A car on a track, driven by a few numbers.
+    A car on a track, driven by steering and pedals.
 
     :param backend: the world
-    :param action: which numbers; see :func:`sb3_torcs.actions.action_layout`
+    :param action: which numbers an action has; see :func:`sb3_torcs.actions.action_layout`
     :param reward: a preset, or a mapping from terms to weights; see :mod:`sb3_torcs.rewards`
     :param action_repeat: control ticks of 0.02 s per timestep
     :param start: ``"grid"``, or ``"random"``: anywhere on the track, moving
@@ -128,7 +128,10 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         self._closed = False
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_viewer": None}  # surfaces cannot be pickled; a copy draws anew
+        return {
+            **self.__dict__,
+            "_viewer": None,
+        }  # pygame's surfaces cannot be pickled; a copy makes its own
 
     @property
     def track(self) -> Track:
@@ -137,15 +140,15 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
 
     @property
     def range_finder_angles(self) -> FloatArray:
-        """Where the range finders look [rad], (19,), left negative."""
+        """Angles of the range finders [rad], (19,), left negative."""
         return self.backend.range_finder_angles
 
     def set_reward(self, reward: RewardChoice) -> RewardChoice | None:
         """
-        Value timesteps by another reward from now on.
+        Change the reward from the next timestep on.
 
         :param reward: as in the constructor
-        :return: the reward until now
+        :return: the previous reward
         """
         previous = getattr(self, "_reward_choice", None)
         self._reward = Reward(reward)
@@ -154,10 +157,10 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
 
     def set_start(self, start: StartName) -> StartName | None:
         """
-        Begin episodes elsewhere from the next reset on.
+        Change the start of episodes from the next reset on.
 
         :param start: ``"grid"`` or ``"random"``
-        :return: the start until now
+        :return: the previous start
         """
         previous = getattr(self, "_start", None)
         self._start = checked_start(start)
@@ -165,10 +168,10 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
 
     def set_random_speed(self, speed: float) -> float | None:
         """
-        Let random starts be faster or slower from the next reset on.
+        Change the highest speed of random starts from the next reset on.
 
-        :param speed: that they do not exceed [m/s]
-        :return: the one until now
+        :param speed: highest speed [m/s]
+        :return: the previous one
         """
         previous = getattr(self, "_random_speed", None)
         self._random_speed = checked_start_speed(speed)
@@ -180,8 +183,8 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         """
         Begin an episode.
 
-        :param seed: makes all chance of this and the following episodes repeatable
-        :param options: a place to start from: ``distance`` [m] along the road, ``track_position``
+        :param seed: of the random numbers of this and the following episodes
+        :param options: where to start: ``distance`` [m] along the road, ``track_position``
             [-1 to 1], ``heading_error`` [rad] and ``speed`` [m/s]; what is left out is 0
         :return: the observation and ``info``
         """
@@ -191,7 +194,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         if self._draw_track is not None:
             self._draw_track(self.np_random)
         start = self._place(options) if options else self._draw_start()
-        self.car = None  # if that fails, there is nothing to step
+        self.car = None  # if the reset fails, no step is possible
         self.car = self.backend.reset(self.np_random, start)
         self._controls = Controls(0.0, 0.0, 0.0)
         self._patience = STUCK_TICKS if start is not None and start.speed > 0.0 else GRACE_TICKS
@@ -206,7 +209,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         """
         Hold an action for ``action_repeat`` control ticks.
 
-        :param action: what the layout asks for: ``"pedals"`` steering [-1, 1], throttle [0, 1] and
+        :param action: as the layout says; of ``"pedals"``: steering [-1, 1], throttle [0, 1] and
             brake [0, 1]
         :return: observation, reward, terminated, truncated, info
         :raises InvalidAction: if the action has another shape or is not a number
@@ -216,10 +219,10 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
 
     def begin_step(self, action: npt.NDArray[np.float32]) -> Controls:
         """
-        Do what comes before the world moves: for those who drive several worlds at once.
+        Do the part of ``step`` before the world moves. Used to drive several worlds at once.
 
         :param action: as of ``step``
-        :return: what the backend has to be stepped with
+        :return: the arguments of the backend's ``step``
         """
         if self._closed or self.car is None:
             when = "close" if self._closed else "reset"
@@ -230,14 +233,14 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
 
     @property
     def controls(self) -> Controls:
-        """What the last timestep has asked of the car."""
+        """The controls of the last timestep."""
         return self._controls
 
     def finish_step(
         self, drive: Callable[[], CarState]
     ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """
-        Let the world move, and do what comes after.
+        Do the rest of ``step``: let the world move, and value the result.
 
         :param drive: returns what the backend's ``step`` does
         :return: as ``step``
@@ -248,7 +251,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
             after = drive()
             end = self._end(after)
         except CarLost:
-            # A training of millions of timesteps shall not end with this episode.
+            # End the episode, and not a training of millions of timesteps.
             after, end = before, "lost"
         self.car = after
         terms = self._reward(before, after, self._controls, end)
@@ -270,11 +273,13 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
             gym.logger.warn('render without a mode: gym.make(..., render_mode="rgb_array")')
             return None
         if self._closed:
-            raise EnvClosed("render after close; make a new environment")
+            raise EnvClosed("render after close; make a new environment with gym.make")
         if self.car is None:
             raise EnvClosed("render before reset; call reset first")
         if self._viewer is None:
-            from sb3_torcs.rendering.viewer import Viewer  # graphics load only when somebody looks
+            from sb3_torcs.rendering.viewer import (
+                Viewer,
+            )  # imported here because graphics take long to load
 
             self._viewer = Viewer(mode=self.render_mode, fps=self.metadata["render_fps"])
         angles = self.backend.range_finder_angles
@@ -284,7 +289,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         return frame if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:
-        """Give back the window and the world. Calling it twice does no harm."""
+        """Close the window and the world. A second call does nothing."""
         if self._closed:
             return
         self._closed = True
@@ -293,7 +298,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         self.backend.close()
 
     def _end(self, car: CarState) -> str | None:
-        """Say why the episode is over, if it is."""
+        """Return why the episode ends, or ``None`` if it goes on."""
         if self.laps is not None and car.laps >= self.laps:
             return "laps"
         if car.off_track:

@@ -35,19 +35,19 @@ BACKENDS, PICTURES = get_args(BackendName), get_args(PictureName)
 
 class TorcsEnv(RacingEnv):
     """
-    A car of the real TORCS, alone or among its robots, in this process or in one of its own.
+    A car in the real TORCS, alone or against robots, in this process or in one of its own.
 
     Action space, observation space, rewards, starting states and the end of an episode are those
-    of :class:`~sb3_torcs.envs.torcs_lite.TorcsLiteEnv`. What differs is the world: the game's own
-    physics with fuel, damage, walls and slopes, and its rules; laps with a cut corner or a touched
+    of :class:`~sb3_torcs.envs.torcs_lite.TorcsLiteEnv`. The world is different: the game's own
+    physics with fuel, damage, walls and slopes, and its rules. Laps with a cut corner or a touched
     wall do not count as ``best_lap_time``.
 
     With ``opponents`` the race is the game's "quick race". A start elsewhere than on the grid
     moves the whole field along the road, at the agent's speed.
 
-    With ``backend="scr"`` the game runs in a process of its own and tells what its sensors read by
-    the protocol of the Simulated Car Racing championship: the same drive, in six digits, and
-    slower. With ``host`` it is a game that somebody else has started.
+    With ``backend="scr"`` the game runs in a process of its own and sends its sensors by the
+    protocol of the Simulated Car Racing championship. The drive is the same, with sensors of six
+    digits, and slower. With ``host`` the game is one that runs already.
 
     Units are SI and radians; left is positive.
 
@@ -81,7 +81,7 @@ class TorcsEnv(RacingEnv):
         the grid. With ``None``, ``"scr"`` starts a game of its own
     :param port: of the driver there; ``None`` is 3001, the first one
     :raises BackendUnavailable: if the game or the extension is missing, or not as expected
-    :raises SceneryMissing: if the game shall draw a track, and cannot
+    :raises SceneryMissing: if the game cannot draw the track
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012
@@ -160,8 +160,8 @@ class TorcsEnv(RacingEnv):
 
         :return: (height, width, 3) of red, green and blue; ``None`` in the mode ``"human"``
         :raises DisplayUnavailable: if the game has no display to draw at
-        :raises GameFailed: if the game that draws has ended; the next picture starts another
-        :raises GameTimeout: if it hangs; the same holds
+        :raises GameFailed: if the game that draws has ended; the next picture starts it again
+        :raises GameTimeout: if that game hangs; the next picture starts it again
         """
         if self.picture != "game" or self.render_mode is None:
             return super().render()
@@ -171,12 +171,14 @@ class TorcsEnv(RacingEnv):
         assert isinstance(self.backend, NativeBackend), "the constructor refuses others"
         appearance = self.backend.engine.appearance()
         if self._viewer is None:
-            from sb3_torcs.rendering.game_camera import GameView  # loaded only when somebody looks
+            from sb3_torcs.rendering.game_camera import (
+                GameView,
+            )  # imported here because graphics take long to load
 
             self._viewer = GameView(find_game(), self.backend.race_setup(), self._window)
         try:
             frame: npt.NDArray[np.uint8] = self._viewer.frame(appearance)
-        except BaseException:  # also Ctrl-C: the picture that was asked for may still come
+        except BaseException:  # also Ctrl-C: the picture that was requested may still arrive
             self._viewer.close()
             self._viewer = None
             raise
@@ -192,7 +194,7 @@ def _world(
     **options: Any,
 ) -> Backend:
     """
-    Make the world that was chosen.
+    Make the backend.
 
     :param backend: as of :class:`TorcsEnv`
     :param track: as there
@@ -215,14 +217,16 @@ def _world(
         return ScrBackend(track, **options, **address)
     for name, value in address.items():
         if value is not None:
-            raise InvalidOption(f"{name} is {value!r}, for no server; add backend='scr'")
+            raise InvalidOption(
+                f"{name} is {value!r}, which is for an SCR server; add backend='scr'"
+            )
     make: Callable[[Any], Backend] = partial(NativeBackend, **options, sensor_noise=sensor_noise)
     return SeveralTracks(map(make, track)) if is_several(track) else make(track)
 
 
 def _picture(picture: PictureName, render_mode: GameRenderMode | None) -> PictureName:
     """
-    Check what shall be drawn.
+    Check the choice of a picture.
 
     :param picture: as of :class:`TorcsEnv`
     :param render_mode: as there
@@ -242,14 +246,14 @@ def _picture(picture: PictureName, render_mode: GameRenderMode | None) -> Pictur
 
 def _window(size: Any, view: Any, boards: Any, picture: str) -> Window:
     """
-    Check how the game's picture shall look.
+    Check the options of the game's picture.
 
     :param size: width and height [pixels]
     :param view: where the camera is
     :param boards: whether lap times and such are drawn over the picture
     :param picture: that is drawn
     :return: the window that the game would show
-    :raises InvalidOption: if the game cannot draw this, or is not asked to
+    :raises InvalidOption: if the game cannot draw this, or another picture is chosen
     """
     if isinstance(size, str) or np.shape(size) != (2,) or not all(map(is_count, size)):
         raise InvalidOption(

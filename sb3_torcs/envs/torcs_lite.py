@@ -42,7 +42,7 @@ class TorcsLiteEnv(RacingEnv):
         ``Box([-1, 0, 0], [1, 1, 1], (3,), float32)``: steering (1 is full lock to the left),
         throttle, brake. With ``action="pedal"``, ``Box(-1, 1, (2,), float32)``: steering, and one
         pedal that is throttle above 0 and brake below. With ``action="manual"`` gear and clutch
-        come after the first three. What lies outside is clipped; NaN is an error.
+        come after the first three. Values outside their range are clipped; NaN is an error.
 
     Observation space
         ``Box(29,), float32``: the 29 numbers of the original post, scaled as there;
@@ -53,7 +53,7 @@ class TorcsLiteEnv(RacingEnv):
 
     Starting state
         ``"grid"``: standing in the first grid slot. ``"random"``: anywhere, moving.
-        ``reset(options={"distance": 100.0, "speed": 20.0})`` puts the car where one wants it.
+        ``reset(options={"distance": 100.0, "speed": 20.0})`` starts at a given point.
 
     Episode end
         Terminated: ``"off_track"`` (the mass centre leaves the road), ``"backwards"`` (more than
@@ -101,7 +101,7 @@ class TorcsLiteEnv(RacingEnv):
         for name, choice in drawn.items():
             if choice == "game":
                 raise InvalidOption(
-                    f"{name} is 'game', which the installed game draws: that is for Torcs-v0; "
+                    f"{name} is 'game', which needs the installed game, so it is for Torcs-v0; "
                     "TorcsLite-v0 has render_mode 'rgb_array' or 'human' with picture 'above'"
                 )
         if picture != "above":
@@ -123,7 +123,7 @@ class TorcsLiteEnv(RacingEnv):
 
 def _refuse(options: Mapping[str, Any]) -> None:
     """
-    Say why options cannot be had.
+    Refuse unknown options.
 
     :param options: that this world does not have
     :raises InvalidOption: if one of them is for the real game
@@ -133,6 +133,6 @@ def _refuse(options: Mapping[str, Any]) -> None:
         if name not in OF_THE_GAME:
             raise TypeError(f"TorcsLiteEnv.__init__() got an unexpected keyword argument {name!r}")
         raise InvalidOption(
-            f"{name} is {value!r}, which needs the installed game: that is for Torcs-v0; leave it "
+            f"{name} is {value!r}, which needs the installed game, so it is for Torcs-v0; leave it "
             "out for TorcsLite-v0"
         )

@@ -1,4 +1,4 @@
-"""Many ``Torcs-v0`` in one process, driven on threads: what ``gym.make_vec`` makes."""
+"""Many ``Torcs-v0`` in one process, driven on threads, as ``gym.make_vec`` makes them."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class TorcsVectorEnv(SyncVectorEnv):
     Several races of the real TORCS, driven at once by threads of this process.
 
     It does what :class:`gymnasium.vector.SyncVectorEnv` over ``Torcs-v0`` does, to the bit, in less
-    time: while cars drive, the rewards and observations of those that have arrived are made.
+    time: rewards and observations of races that are ready are computed while others still drive.
 
     :param num_envs: races
     :param threads: that share the work, at least 1; ``None`` is one per core, and one per race at

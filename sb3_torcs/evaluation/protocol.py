@@ -97,7 +97,7 @@ def merit(races: Sequence[Episode]) -> Merit:
 
 
 class World(NamedTuple):
-    """An environment, and why it was chosen."""
+    """An environment and the reason for its choice."""
 
     env_id: str
     reason: str
@@ -105,7 +105,7 @@ class World(NamedTuple):
 
 def choose_world(driver: str, trained_on: str | None, track: Any = None) -> World:
     """
-    Choose where to drive: where the driver was trained, or else in the game if that can be.
+    Choose the environment: that of the training, or else the game if it runs here.
 
     :param driver: what it is called, for the reason
     :param trained_on: the environment of its training, if that is known
@@ -142,7 +142,7 @@ def time_limit(kwargs: Mapping[str, Any]) -> int:
 
     track = kwargs.get("track", "aalborg")
     length = LONGEST_TRACK if track == RANDOM_TRACK else load_track(track).length
-    # One lap more than asked for: the way from the grid to the line, and some patience.
+    # One lap more than asked for: for the way from the grid to the line, and as a margin.
     seconds = (kwargs["laps"] + 1) * length / STUCK_SPEED
     return math.ceil(seconds / (kwargs.get("action_repeat", 5) * CONTROL_TICK))
 
@@ -163,7 +163,7 @@ def race_environment(
     :param track: instead of the training's
     :param hyperparameters: of the training, whose wrappers are put around the environment
     :param trust: as of :func:`~sb3_torcs.agents.wrapping.wrapped`
-    :return: the environment, which nothing but the race ends
+    :return: the environment, whose time limit never ends a race
     """
     from sb3_torcs.agents.wrapping import wrapped
 
@@ -183,7 +183,7 @@ def evaluate(
     :param driver: chooses the actions, deterministically
     :param episodes: how many
     :param seed: of the first reset; the next episodes go on from it
-    :return: what happened in each
+    :return: the results of each
     """
     results = []
     for number in range(episodes):

@@ -1,4 +1,4 @@
-"""Races that people look at: agents and robots in the game's window, or in a video of it."""
+"""Races of agents and robots in the game's window, or in a video of it."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ SCR_DRIVER = (SCR_SERVER, 0)
 @dataclass
 class Show:
     """
-    A race, and who is looked at in it.
+    A race, and the driver whom the camera follows.
 
     :param game: the installation
     :param track: as of :class:`~sb3_torcs.torcs.race_setup.RaceSetup`
-    :param robot: name and index of the one who is looked at; ``None`` for an agent
+    :param robot: name and index of the robot that the camera follows; ``None`` for an agent
     :param model: of the agent: what :func:`~sb3_torcs.agents.models.load_driver` loads
     :param settings: of the agent's environment: ``car``, ``action_repeat`` and so on
-    :param opponents: robots' names and indices, who start behind
+    :param opponents: names and indices of robots, which start behind
     :param laps: to drive
     :param trust: run what is pickled in the model
     """
@@ -64,21 +64,21 @@ class Show:
 
     @property
     def race(self) -> RaceSetup:
-        """As the game is told."""
+        """The set-up of the race."""
         drivers = [self.robot or SCR_DRIVER, *self.opponents]
         car = self.settings.get("car", DEFAULT_CAR)
         return RaceSetup(self.track, drivers, self.laps, session_for(drivers), car)
 
     @property
     def driver_name(self) -> str:
-        """As the game shows it."""
+        """The driver's name, as the game shows it."""
         if self.robot is not None:
             return self.game.find_robot(*self.robot).name
         return plain_name(driver_name(self.model))
 
     def start(self, window: Window) -> GameProcess:
         """
-        Start the game, and bring the agent to its car.
+        Start the game, and connect the agent to its car.
 
         :param window: of the game
         :return: the game
@@ -102,7 +102,7 @@ class Show:
 
     def finish(self, process: GameProcess) -> None:
         """
-        Read the results, if the race has come to its end.
+        Read the results, if the race has ended.
 
         :param process: of the game
         """
@@ -148,10 +148,10 @@ def record_shows(
     :param size: width and height of the whole picture [pixels]
     :param view: one of :data:`sb3_torcs.torcs.window.VIEWS`
     :param fps: frames per second of simulated time
-    :raises InvalidOption: if the picture cannot be divided so
+    :raises InvalidOption: if the picture cannot be divided among the races
     :raises DisplayUnavailable: if there is no virtual display
     :raises OutputNotWritable: if the file cannot be written; no part of it is left behind
-    :raises GameFailed: if a game ends too early; the same holds
+    :raises GameFailed: if a game ends too early; no part of the file is left behind
     """
     part = (size[0] // len(shows), size[1])
     if len(shows) > 1 and size[0] % (2 * len(shows)):
@@ -183,7 +183,7 @@ def record_shows(
 
 def _begin(show: Show, video: GameVideo) -> threading.Thread:
     """
-    Let an agent drive beside the camera.
+    Start the agent's drive on a thread.
 
     :param show: with the agent
     :param video: of it
@@ -196,10 +196,10 @@ def _begin(show: Show, video: GameVideo) -> threading.Thread:
         try:
             show.agent.drive(AFTERMATH)
         except BaseException as error:
-            # A game that ended by itself knows better why.
+            # If the game ended by itself, its own error is more precise.
             if not isinstance(error, ServerLost) or video.game.poll() is None:
                 show.agent.error = error
-            video.game.stop()  # which otherwise waits for an answer
+            video.game.stop()  # the game would wait for an answer
 
     thread = threading.Thread(target=drive, name="agent")
     thread.start()
