@@ -101,7 +101,7 @@ class GameIncomplete(BackendUnavailable):
 
 
 class LayoutMismatch(BackendUnavailable):
-    """The memory layout of the installed game is not that of the supported version."""
+    """The structures of the installed game are not those of the supported version."""
 
 
 class RobotUnavailable(BackendUnavailable):

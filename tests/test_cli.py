@@ -839,7 +839,7 @@ def test_the_bench_needs_time(capsys):
     [
         (["--env", "NoSuch-v0"], "no environment 'NoSuch-v0' is registered; ours: Torcs-v0"),
         (["--env", "TorcsLit-v0"], "did you mean 'TorcsLite-v0'?"),
-        (["--env", "CartPole-v1"], "CartPole-v1 is no racing environment"),
+        (["--env", "CartPole-v1"], "CartPole-v1 is not a racing environment"),
     ],
 )
 def test_evaluate_refuses_what_is_no_racing_environment(capsys, words, message):

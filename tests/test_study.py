@@ -253,7 +253,7 @@ def test_what_the_file_names_no_more_stays_in_the_table(begun, tmp_path):
 
 def test_a_worker_that_is_behind_is_not_needed(begun):
     study, store = begun
-    with pytest.raises(StudyError, match="small-nets-seed0 has come farther elsewhere"):
+    with pytest.raises(StudyError, match="another worker has taken small-nets-seed0 farther"):
         store.put(study.trials[0], {}, [evaluated(study.trials[0])])
 
 

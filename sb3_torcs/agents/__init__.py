@@ -1,4 +1,4 @@
-"""What drives: saved models, the scripted driver, robots; beside them the shipped agents."""
+"""Drivers: saved models, the scripted driver and robots. The folders hold the shipped agents."""
 
 from sb3_torcs.agents.models import load_driver, shipped_agents
 from sb3_torcs.agents.scripted import ScriptedDriver

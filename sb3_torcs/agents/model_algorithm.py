@@ -1,4 +1,4 @@
-"""Which algorithm a saved model is of, and the class that loads it."""
+"""The algorithm of a saved model, and the class that loads it."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from sb3_torcs.errors import InvalidOption, ModelMismatch, PackageMissing, near_
 
 __all__ = ["algorithm_of", "check_same", "is_sbx", "told_algorithm"]
 
-SAVED_AS = {"ddpg": "td3"}  # a model of one does not tell that it is not of the other
+SAVED_AS = {"ddpg": "td3"}  # models of the two cannot be told apart
 
-# What only one family of algorithms saves; the first that is there names it. DDPG saves what TD3
-# does, and either class drives the other's models.
+# Attributes that only one family of algorithms saves; the first one found names it. DDPG saves the
+# same as TD3, and each of the two classes can drive the other's models.
 TELLING_KEYS = (
     ("top_quantiles_to_drop_per_net", "tqc"),
     ("line_search_shrinking_factor", "trpo"),
@@ -28,10 +28,10 @@ TELLING_KEYS = (
 
 def told_algorithm(data: dict[str, Any]) -> str | None:
     """
-    Find out the algorithm of a model by what it saved.
+    Infer the algorithm of a model from its saved attributes.
 
     :param data: of :func:`~sb3_torcs.agents.model_file.saved_data`
-    :return: as the zoo calls it; ``None`` if that cannot be told
+    :return: the zoo's name of it; ``None`` if it cannot be inferred
     """
     from rl_zoo3.utils import ALGOS
 
@@ -47,11 +47,11 @@ def algorithm_of(name: str | None, data: dict[str, Any], model: Path) -> tuple[s
     """
     Find the algorithm of a saved model.
 
-    :param name: as the zoo calls it; ``None`` finds out
+    :param name: the zoo's name of it; ``None`` infers it
     :param data: of :func:`~sb3_torcs.agents.model_file.saved_data`
     :param model: the file, for messages
     :return: its name and its class
-    :raises ModelMismatch: if that cannot be found out
+    :raises ModelMismatch: if it cannot be inferred
     :raises InvalidOption: if there is no such algorithm
     :raises PackageMissing: if it is one of SBX, and that is not installed
     """
@@ -59,7 +59,7 @@ def algorithm_of(name: str | None, data: dict[str, Any], model: Path) -> tuple[s
 
     name = name or told_algorithm(data)
     if name is None:
-        raise ModelMismatch(f"'{model}' does not tell its algorithm; say it: --algo ddpg")
+        raise ModelMismatch(f"'{model}' does not say its algorithm; give it, e.g. --algo ddpg")
     if name not in ALGOS:
         advice = f"it has: {', '.join(sorted(ALGOS))}"
         raise InvalidOption(f"the RL Zoo has no algorithm '{name}'{near_miss(name, ALGOS, advice)}")
@@ -68,7 +68,7 @@ def algorithm_of(name: str | None, data: dict[str, Any], model: Path) -> tuple[s
 
 def is_sbx(data: dict[str, Any]) -> bool:
     """
-    Tell whether a model is of SBX, which has SB3's algorithms in JAX.
+    Check whether a model is of SBX, which has SB3's algorithms in JAX.
 
     :param data: of :func:`~sb3_torcs.agents.model_file.saved_data`
     :return: whether it is
@@ -77,7 +77,7 @@ def is_sbx(data: dict[str, Any]) -> bool:
 
 
 def _sbx_algorithm(name: str, model: Path) -> Any:
-    """Find an algorithm of SBX, which is there only if somebody has installed it."""
+    """Find an algorithm of SBX, which is an optional package."""
     try:
         sbx = importlib.import_module("sbx")
     except ImportError as error:

@@ -1,7 +1,7 @@
-"""The file of a model: what Stable-Baselines3 zipped, read as plain data, so that nothing runs.
+"""The file of a model, read as plain data, so that no code of it runs.
 
-A part of such a file is pickled, and a pickle can run anything. Here only its JSON and its weights
-are read, and neither can fill the computer's memory.
+Stable-Baselines3 pickles a part of the file, and a pickle can run any code. This module only reads
+its JSON and its weights, and limits the RAM that they take.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ MAX_DATA = 16 * MIB  # of JSON; a policy's own is some 25 kB
 MAX_WEIGHTS = 256 * MIB
 MAX_INDEX = MIB  # of the names and shapes of all weights
 MAX_PARTS = 10_000
-MAX_WORDS = 400  # of what a library says [characters]
+MAX_WORDS = 400  # [characters] shown of the message of a library
 COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 PLAIN_GLOBALS = ("torch._utils _rebuild_tensor_v2", "collections OrderedDict")
@@ -50,9 +50,9 @@ BROKEN = (
 @contextmanager
 def as_mismatch(what: str, hint: str) -> Iterator[None]:
     """
-    Tell a file that is not what it should be: SB3 and pickle raise whatever comes of it.
+    Turn the errors that SB3 and pickle raise for a broken file into one class.
 
-    :param what: it is not
+    :param what: the beginning of the message
     :param hint: what to do; "a model that is whole" follows
     """
     try:
@@ -72,7 +72,7 @@ def saved_data(model: Path) -> dict[str, Any]:
 
     :param model: the file
     :return: the algorithm's attributes; those that SB3 pickled are still texts
-    :raises ModelMismatch: if the file is no model
+    :raises ModelMismatch: if the file is not a model
     """
     try:
         with zipfile.ZipFile(model) as archive:
@@ -93,7 +93,7 @@ def saved_weights(model: Path) -> dict[str, th.Tensor]:
 
     :param model: the file
     :return: tensors by name, on the CPU
-    :raises ModelMismatch: if they cannot be read, or if one that drives is not finite
+    :raises ModelMismatch: if they cannot be read, or if a weight of the actor is not finite
     """
     import torch as th
 
@@ -112,11 +112,11 @@ def saved_weights(model: Path) -> dict[str, th.Tensor]:
 
 def check_finite(model: Path, weights: dict[str, th.Tensor]) -> None:
     """
-    Make sure that what drives is made of numbers.
+    Make sure that the weights of a policy are finite.
 
     :param model: the file, for the message
     :param weights: tensors by name
-    :raises ModelMismatch: if a network that drives has NaN or an infinity
+    :raises ModelMismatch: if a network that chooses actions has NaN or an infinity
     """
     import torch as th
 
@@ -130,7 +130,7 @@ def check_finite(model: Path, weights: dict[str, th.Tensor]) -> None:
 
 def referenced_class(item: Any) -> str:
     """
-    Read which class a pickle stands for, without unpickling it.
+    Read the class that a pickle refers to, without unpickling it.
 
     :param item: of :func:`saved_data`
     :return: its dotted path; empty if the pickle is more than a name
@@ -148,7 +148,7 @@ def referenced_class(item: Any) -> str:
 
 
 def _part(archive: zipfile.ZipFile, name: str, limit: int) -> bytes:
-    """Unpack a part of a zip, if it is not too large for that."""
+    """Unpack a part of a zip, unless it is too large."""
     if len(archive.infolist()) > MAX_PARTS:
         raise ValueError(f"{len(archive.infolist())} parts")
     info = archive.getinfo(name)
@@ -159,7 +159,7 @@ def _part(archive: zipfile.ZipFile, name: str, limit: int) -> bytes:
 
 def _check_weights(content: bytes) -> None:
     """
-    Make sure that weights are what ``torch.save`` makes of tensors by name.
+    Make sure that weights are a file of ``torch.save`` with tensors by name.
 
     :param content: a zip of its own
     :raises ValueError: if they are more than that
@@ -169,7 +169,7 @@ def _check_weights(content: bytes) -> None:
         names = [info.filename for info in parts]
         if len(parts) > MAX_PARTS or len(set(names)) < len(names):
             raise ValueError("too many parts")
-        # PyTorch stores, so what is there is no larger than the file.
+        # PyTorch does not compress, so the content is no larger than the file.
         if any(info.compress_type != zipfile.ZIP_STORED for info in parts):
             raise ValueError("compressed weights within the zip")
         (index,) = [name for name in names if name.endswith("data.pkl")]
@@ -183,7 +183,7 @@ def _check_weights(content: bytes) -> None:
 
 
 def _words(error: BaseException) -> str:
-    """Say what went wrong, also where Python has no words for it."""
+    """Return the message of an error, or its class if the message is empty."""
     if isinstance(error, RecursionError):
         return "its data nests too deep"
     return str(error) or type(error).__name__

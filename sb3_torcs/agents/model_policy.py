@@ -1,4 +1,4 @@
-"""The policy of a saved model as plain data, and back: what drives, without a pickle."""
+"""The policy of a saved model as plain data, and back, without a pickle."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ FOR_LEARNING = ("optimizer_class", "optimizer_kwargs")
 """Arguments of a policy that a driver has no use for."""
 
 COUNTS = ("n_critics", "n_lstm_layers")
-MAX_NUMBERS = 2**28  # of the largest network that is built without asking
+MAX_NUMBERS = 2**28  # of the largest network that is built without --trust
 MAX_SPACE = 2**24  # numbers in an observation
 
 Spaces = tuple[spaces.Space[Any], spaces.Space[Any]]
@@ -60,7 +60,7 @@ Spaces = tuple[spaces.Space[Any], spaces.Space[Any]]
 
 def plain(value: Any) -> Any:
     """
-    Turn a value into what JSON has.
+    Turn a value into JSON's types.
 
     :param value: of numbers, words, lists, mappings and classes
     :return: the same; a class becomes ``{"class": its dotted path}``
@@ -84,7 +84,7 @@ def plain_policy(model: Any) -> dict[str, Any]:
     Describe the policy of a model.
 
     :param model: an algorithm of Stable-Baselines3
-    :return: its class and its arguments as plain data, or why that cannot be
+    :return: its class and its arguments as plain data, or why that is impossible
     """
     kwargs = {key: item for key, item in model.policy_kwargs.items() if key not in FOR_LEARNING}
     if getattr(model, "use_sde", False):
@@ -100,7 +100,7 @@ def plain_space(space: spaces.Space[Any]) -> dict[str, Any]:
     Describe a space.
 
     :param space: of observations or actions
-    :return: its kind and its numbers, or nothing if its kind is not known here
+    :return: its kind and its numbers; empty if its kind is not known here
     """
     if isinstance(space, spaces.Box):
         bounds = {name: _bound(getattr(space, name)) for name in ("low", "high")}
@@ -122,7 +122,7 @@ def restored_space(said: Any) -> spaces.Space[Any] | None:
 
     :param said: by :func:`plain_space`
     :return: the space; ``None`` if it was not described
-    :raises ValueError: if the description is none
+    :raises ValueError: if the description is wrong
     """
     if not said:
         return None
@@ -138,10 +138,10 @@ def restored_space(said: Any) -> spaces.Space[Any] | None:
 
 def readable_space(item: Any) -> spaces.Space[Any] | None:
     """
-    Build a space from what SB3 writes beside its pickle for human readers.
+    Build a space from the text that SB3 writes beside its pickle for human readers.
 
     :param item: of :func:`~sb3_torcs.agents.model_file.saved_data`
-    :return: the space; ``None`` if what is written is not all of it
+    :return: the space; ``None`` if the text is incomplete
     """
     kind = re.fullmatch(r"<class 'gymnasium\.spaces\.\w+\.(\w+)'>", str(item.get(":type:")))
     try:

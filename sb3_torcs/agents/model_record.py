@@ -1,4 +1,4 @@
-"""How a model was trained: told by its own file, or by what the RL Zoo laid beside it.
+"""The record of a model's training: in its own file, or beside it as the RL Zoo writes it.
 
 The record is one more attribute of the model, which SB3 saves as JSON with the others: stock SB3
 loads such a file as before, and a file that is copied or renamed keeps its record.
@@ -34,7 +34,7 @@ CHECKPOINT = "rl_model_"  # as the zoo calls them
 @dataclass(frozen=True)
 class Statistics:
     """
-    What ``VecNormalize`` has found out about the observations.
+    The statistics of ``VecNormalize`` about the observations.
 
     :param mean: of each number
     :param var: of each number
@@ -53,7 +53,7 @@ class Statistics:
 
     def normalize_obs(self, observation: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         """
-        Do what ``VecNormalize`` does, to the bit.
+        Normalize as ``VecNormalize`` does, to the bit.
 
         :param observation: (…, n) as the environment gives it
         :return: the same shape
@@ -65,7 +65,7 @@ class Statistics:
 
 @dataclass(frozen=True)
 class TrainingRecord:
-    """What is known about the training of a model; empty where nothing is."""
+    """The record of a model's training. Unknown parts are empty."""
 
     algo: str | None = None
     env_id: str | None = None
@@ -77,16 +77,16 @@ class TrainingRecord:
     )
     statistics: Statistics | None = None  # of VecNormalize
     statistics_file: Path | None = None  # the same, pickled by the zoo
-    driver_only: bool = False  # whether what only learning needs was left out
+    driver_only: bool = False  # whether the parts that only learning needs were left out
 
     @property
     def known(self) -> bool:
-        """Whether anything tells how the model was trained."""
+        """Whether any part is known."""
         return self != TrainingRecord()
 
     def kept(self, names: Iterable[str]) -> dict[str, Any]:
         """
-        Pick what another environment shall have in common with that of the training.
+        Select keyword arguments of the training's environment.
 
         :param names: of keyword arguments
         :return: those that the training's environment was given
@@ -100,7 +100,7 @@ def record_within(model: Path, data: Mapping[str, Any]) -> TrainingRecord | None
 
     :param model: the file, for messages
     :param data: of :func:`~sb3_torcs.agents.model_file.saved_data`
-    :return: what it tells; ``None`` if there is none, or if it is of an earlier training
+    :return: the record; ``None`` if there is none, or if it is of an earlier training
     :raises ModelMismatch: if it cannot be read
     """
     said = data.get(RECORD)
@@ -109,7 +109,7 @@ def record_within(model: Path, data: Mapping[str, Any]) -> TrainingRecord | None
     with as_mismatch(f"the record in '{model}' cannot be read", "give"):
         if said["version"] > VERSION:
             raise ValueError(f"it has version {said['version']}; upgrade sb3_torcs")
-        # SB3 takes the attribute along when somebody trains on without writing a new record.
+        # SB3 keeps the attribute when a training resumes without writing a new record.
         if said["start_time"] != data.get("start_time"):
             return None
         seen = tuple(restored_space(said[name]) for name in ("observation_space", "action_space"))
@@ -133,7 +133,7 @@ def _typed(said: Mapping[str, Any], key: str, kind: type) -> Any:
 
 
 def _statistics(said: Mapping[str, Any] | None) -> Statistics | None:
-    """Read statistics, which have to be numbers."""
+    """Read statistics, which have to be finite."""
     if said is None:
         return None
     mean, var = (tuple(float(number) for number in said[name]) for name in ("mean", "var"))
@@ -162,15 +162,15 @@ _PlainLoader.add_multi_constructor("tag:yaml.org,2002:python/", _plain)
 
 def record_beside(model: Path) -> TrainingRecord | None:
     """
-    Read what the zoo laid beside a model: ``config.yml``, ``args.yml``, ``vecnormalize.pkl``.
+    Read the zoo's files beside a model: ``config.yml``, ``args.yml``, ``vecnormalize.pkl``.
 
-    They lie in the model's folder or, as the zoo does it, in one below it with the environment's
-    name, which is there for the models that the zoo saves: ``ENV.zip``, ``best_model.zip`` and
-    ``rl_model_*.zip``. A folder with another name, and another model's, is none of its business.
+    They lie in the model's folder, or in a folder below it with the environment's name. The latter
+    is the zoo's, for the models that it saves: ``ENV.zip``, ``best_model.zip`` and
+    ``rl_model_*.zip``. Folders with other names are not read.
 
     :param model: the file
     :return: what is known; ``None`` if there is nothing
-    :raises ModelMismatch: if something of it cannot be read
+    :raises ModelMismatch: if one of the files cannot be read
     """
     own = _record(model.parent)
     if own is not None:
@@ -188,7 +188,7 @@ def record_beside(model: Path) -> TrainingRecord | None:
 
 
 def _record(folder: Path) -> TrainingRecord | None:
-    """Read what the zoo wrote in a folder."""
+    """Read the zoo's files in a folder."""
     arguments, config = folder / "args.yml", folder / "config.yml"
     statistics = folder / "vecnormalize.pkl"
     if not any(file.is_file() for file in (arguments, config, statistics)):
@@ -214,10 +214,10 @@ def _recorded(file: Path, key: str, kind: type) -> Any:
 
 def _read_plain(file: Path) -> dict[str, Any]:
     """
-    Read one of the zoo's records, if it is there.
+    Read one of the zoo's records, if it exists.
 
-    Without it a model would drive in another environment than the one it learned in, so what is
-    there and cannot be read is an error.
+    A record that cannot be read is an error: without it the model would drive in another
+    environment than in its training.
     """
     if not file.is_file():
         return {}

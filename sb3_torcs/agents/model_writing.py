@@ -1,4 +1,4 @@
-"""Writing down, in a model that learns, how it learns: each file that is saved of it then tells."""
+"""Writing the record of a training into its model, and so into each file saved of it."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def recipe(
     algo: str | None, env_id: str | None, hyperparameters: Mapping[str, Any]
 ) -> dict[str, Any]:
     """
-    Compose what a training was asked for.
+    Compose the first part of a record: the options of a training.
 
     :param algo: as the zoo calls it
     :param env_id: of the environment, if it has one
@@ -58,13 +58,13 @@ def recipe(
 
 class RecordCallback(BaseCallback):
     """
-    Writes down in the model how it learns, so that ``sb3-torcs`` drives it as it has learned.
+    Writes the record into the model, so that ``sb3-torcs`` drives it as in its training.
 
-    ``sb3-torcs train`` and ``study`` do so by themselves; a script of one's own gives the callback
-    to ``learn``, before those that save the model.
+    ``sb3-torcs train`` and ``study`` use it. In your own script, pass it to ``learn``, before the
+    callbacks that save the model.
 
-    :param asked: what the training was asked for, of :func:`recipe`; ``None`` looks at the
-        environment, which knows what ``gym.make`` was given
+    :param asked: options of the training, of :func:`recipe`; ``None`` reads them from the
+        environment, which keeps the arguments of ``gym.make``
     :param verbose: as in ``BaseCallback``
     """
 
@@ -83,10 +83,10 @@ class RecordCallback(BaseCallback):
 
 def write_record(model: BaseAlgorithm, asked: Recipe) -> None:
     """
-    Write down in a model how it learns; whatever saves it from now on saves that, too.
+    Write the record into a model. Files that are saved from now on hold it.
 
     :param model: that learns
-    :param asked: what the training was asked for, of :func:`recipe`
+    :param asked: options of the training, of :func:`recipe`
     """
     record = {
         "version": VERSION,
@@ -109,13 +109,13 @@ def write_record(model: BaseAlgorithm, asked: Recipe) -> None:
 
 def write_driver(model: Path, driver: Path) -> None:
     """
-    Write a small file of what drives of a model, with its record.
+    Write a small file of a model that can drive but not learn, with its record.
 
-    What only learning needs is left out: weights of the critics and of targets are NaN, and the
-    optimizers are empty, which a zip makes small. Stock SB3 still loads the file and predicts the
-    same to the bit; a training that goes on from it fails with the first update.
+    The weights of critics and of targets are NaN, and the optimizers are empty, which compress
+    well. Stock SB3 still loads the file and predicts the same to the bit. A training that resumes
+    from it fails with the first update.
 
-    :param model: the file of the whole
+    :param model: the complete file
     :param driver: the file to write
     :raises ModelMismatch: if the model cannot be read
     """
@@ -146,7 +146,7 @@ def _torch_file(value: Any) -> bytes:
 
 
 def _record_in(model: Path, data: Mapping[str, Any]) -> Recipe:
-    """Take the record of a saved model, or compose it from what lies beside the model."""
+    """Take the record of a saved model, or compose it from the files beside it."""
     if record_within(model, data) is not None:
         written: Recipe = data[RECORD]
         return written
@@ -166,7 +166,7 @@ def _record_in(model: Path, data: Mapping[str, Any]) -> Recipe:
 
 
 def _recipe_of_environment(model: BaseAlgorithm) -> Recipe:
-    """Find out what a script has made: ``gym.make`` keeps what it was given."""
+    """Compose the recipe of a script's training from the arguments of ``gym.make``."""
     env = model.get_env()
     assert env is not None
     (spec,) = env.get_attr("spec", 0)
@@ -179,7 +179,7 @@ def _recipe_of_environment(model: BaseAlgorithm) -> Recipe:
 
 
 def _plain_part(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Leave out what is no plain data."""
+    """Leave out everything that is not plain data."""
     found = {}
     for name, value in values.items():
         with contextlib.suppress(TypeError):

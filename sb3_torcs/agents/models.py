@@ -1,4 +1,4 @@
-"""Loading a saved model: which algorithm it is, how it was trained, whether it fits."""
+"""Find and load saved models, and check that they fit the environment."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ UNTRUSTED = (
 
 class Driver:
     """
-    A saved model at the wheel, with the statistics of the observations that it learned with.
+    A saved model that drives, with the statistics of its training's observations.
 
     :param model: an algorithm or a policy of Stable-Baselines3
     :param statistics: something with VecNormalize's ``normalize_obs``; ``None`` if the model
@@ -89,7 +89,7 @@ class Driver:
         :param state: as the call before returned it; ``None`` begins
         :param episode_start: (1,) whether an episode begins here
         :param deterministic: whether to leave out chance
-        :return: the action, and what is to be remembered
+        :return: the action, and the state for the next call
         """
         if self.statistics is not None:
             observation = self.statistics.normalize_obs(observation)
@@ -163,7 +163,7 @@ def shipped_agents() -> list[str]:
 
 def training_record(model: Path) -> TrainingRecord:
     """
-    Find out how a model was trained: by its own file, or by what the zoo laid beside it.
+    Read the record of a model's training, from its own file or from the zoo's beside it.
 
     :param model: the file
     :return: what is known
@@ -188,7 +188,7 @@ def driver_record(driver: str | Path) -> TrainingRecord:
 
 def driver_name(driver: str | Path) -> str:
     """
-    Name what is to drive, for boards and tables.
+    Return a driver's name for boards and tables.
 
     :param driver: as in :func:`find_model`, or ``"scripted"``
     :return: a shipped agent's name, e.g. ``"ddpg-aalborg"``, else that of the file; of its folder
@@ -202,7 +202,7 @@ def driver_name(driver: str | Path) -> str:
 
 def one_track(track: Any) -> Any:
     """
-    Make sure that a drive has one track, where a training may have had several.
+    Make sure that there is one track: a training may have had several.
 
     :param track: of the record, or what was given instead
     :return: the same

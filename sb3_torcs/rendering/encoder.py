@@ -1,4 +1,4 @@
-"""Frames to a video file that every player opens."""
+"""Encode frames as a video file that every player opens."""
 
 from __future__ import annotations
 
@@ -57,16 +57,17 @@ def write_video(
     """
     Write frames to an mp4 file (H.264, yuv420p).
 
-    On a terminal, standard error shows how much is done and how long the rest takes.
+    On a terminal, standard error shows the progress and the time left.
 
-    The file appears whole or not at all: it grows beside its place and is moved there at the end.
+    The file appears complete or not at all: it is written under another name and renamed at the
+    end.
 
     :param path: of the file, ending in ``.mp4``; its folder is made if it is missing
     :param frames: (height, width, 3) each, all of one size
     :param fps: frames per second
     :param total: number of frames, for the progress bar, if known
     :param encoding: that of this module: for figures, or :data:`PHOTOGRAPHIC`
-    :param share: says how much of the video is done, 0 to 1, where ``total`` is not known
+    :param share: returns the share of the video that is done, 0 to 1, if ``total`` is not known
     :return: the path
     :raises InvalidOption: if the name does not end in ``.mp4``, or there are no frames
     :raises OutputNotWritable: if the file cannot be written; no part of it is left behind
@@ -87,7 +88,7 @@ def write_video(
 
 
 def _claim(path: Path, part: Path) -> None:
-    """Make the folder and an empty file in it, so that what cannot be written is known at once."""
+    """Make the folder and an empty file in it, so that an error comes before any work."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.is_dir():
@@ -105,7 +106,7 @@ def _progress(
     name: str, total: int | None, share: Callable[[], float] | None
 ) -> Iterator[Callable[[], None]]:
     """
-    Show on a terminal how much of a video is done, and how long the rest takes.
+    Show the progress of a video and the time left, on a terminal.
 
     :param name: of the video
     :param total: number of frames, if known
@@ -155,7 +156,7 @@ def _encode(
             'of an environment made with render_mode="rgb_array"'
         )
     size = (first.shape[1], first.shape[0])
-    # imageio's own writer stays open, and its ffmpeg alive, when a frame raises; this one closes.
+    # If a frame raises, imageio's own writer leaves ffmpeg running; this one closes it.
     with closing(imageio_ffmpeg.write_frames(part, size, fps=fps, **encoding)) as ffmpeg:
         ffmpeg.send(None)
         for frame in chain([first], remaining):
@@ -175,7 +176,7 @@ def _encode(
 
 def _is_whole(part: Path) -> bool:
     """
-    Look for the index that ffmpeg writes last, to the beginning: it tells nobody if it cannot.
+    Check that the file begins with its index, which ffmpeg writes last and without an error.
 
     :param part: the file
     """
@@ -184,5 +185,5 @@ def _is_whole(part: Path) -> bool:
 
 
 def _out_of_room(path: Path) -> OutputNotWritable:
-    """Say that ffmpeg gave up; its own words went to stderr."""
+    """Make the error of an ffmpeg that ended early; its own message went to standard error."""
     return OutputNotWritable(f"ffmpeg stopped writing '{path}'; is there room on the disk?")

@@ -1,8 +1,8 @@
 """The game's own picture of a race that is driven elsewhere.
 
-A hidden game draws up the same field on the same track. Nothing of it drives: for each picture it
-is told how the race looks at that moment. So a picture shows the simulated time, however long the
-machine draws, and two pictures of one moment are equal.
+A hidden game shows the same cars on the same track, but drives none of them: for each picture it
+receives the appearance of the race at that moment. So a picture belongs to the simulated time,
+however long the drawing takes, and two pictures of one moment are equal.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from sb3_torcs.tracks.trial import check_track
 
 __all__ = ["GameView"]
 
-AGENT = f"{SCR_SERVER} 0"  # as the game shows its name
-GRACE = 5.0  # [s] for a game that hung up to be gone
+AGENT = f"{SCR_SERVER} 0"  # the agent's name in the game
+GRACE = 5.0  # [s] for a game to end after it closed the connection
 
 
 class GameView:
@@ -39,7 +39,7 @@ class GameView:
     :param window: that the game would show: its size, its view, and whether it has boards
     :raises DisplayUnavailable: if there is no virtual display
     :raises GameIncomplete: if the game lacks its program, or a file that it needs for this
-    :raises BackendUnavailable: if our libraries for the inside of the game were not built
+    :raises BackendUnavailable: if our libraries that the game loads were not built
     """
 
     def __init__(self, game: Game, race: RaceSetup, window: Window) -> None:
@@ -50,7 +50,7 @@ class GameView:
             with end:
                 window = replace(
                     window, driver=AGENT, display=display.name, frames=end.fileno(),
-                    traces=False,  # moments before need not have been drawn, or were another race
+                    traces=False,  # the moments before were not drawn, or were of another race
                 )  # fmt: skip
                 arguments = window_arguments(game, window)
                 arguments["environment"] |= {
@@ -83,10 +83,10 @@ class GameView:
         except ConnectionError:
             frame = None
         if frame is None:
-            self._game.wait(GRACE)  # it knows better how the game ended
+            self._game.wait(GRACE)  # its error is more precise
             raise GameFailed(self._game.epitaph())
         return frame.picture
 
     def close(self) -> None:
-        """End the game and its display. Calling it twice does no harm."""
+        """End the game and its display. A second call does nothing."""
         self._end()

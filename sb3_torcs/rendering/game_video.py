@@ -1,6 +1,6 @@
 """Videos of the game: every frame is drawn, however long it takes, and none is drawn twice.
 
-Between two frames the game goes on by exactly one frame's time. A video begins one second before
+Between two frames the game advances by exactly one frame's time. A video begins one second before
 the start and ends one second after the race.
 """
 
@@ -64,7 +64,7 @@ class GameVideo:
     :param size: width and height [pixels], both even
     :param view: one of :data:`sb3_torcs.torcs.window.VIEWS`
     :param fps: frames per second of simulated time
-    :param driver: the name of the one who is looked at; ``None`` for the first on the grid
+    :param driver: name of the driver whom the camera follows; ``None`` is the first on the grid
     :raises InvalidOption: if there is no such view, or the game cannot draw this
     :raises DisplayUnavailable: if there is no virtual display
     """
@@ -86,7 +86,7 @@ class GameVideo:
             self.display = stack.enter_context(VirtualDisplay(size))
             self._frames, written = os.pipe()
             stack.callback(os.close, self._frames)
-            with suppress(OSError):  # it is faster, not needed
+            with suppress(OSError):  # only faster
                 fcntl.fcntl(written, fcntl.F_SETPIPE_SZ, PIPE_SIZE)
             try:
                 self.game = start(replace(window, display=self.display.name, frames=written))
@@ -102,7 +102,7 @@ class GameVideo:
         self.close()
 
     def close(self) -> None:
-        """End the game and its display. Calling it twice does no harm."""
+        """End the game and its display. A second call does nothing."""
         self._stack.close()
 
     def frames(self) -> Iterator[Frame]:
@@ -117,7 +117,7 @@ class GameVideo:
             frame = following
             yield frame
         self.game.wait(GRACE)
-        if frame is None:  # it ends like that if it cannot load a driver
+        if frame is None:  # the game ends like that if it cannot load a driver
             raise GameFailed(self.game.epitaph())
 
     def pictures(self) -> Iterator[npt.NDArray[np.uint8]]:
@@ -139,15 +139,15 @@ class GameVideo:
         :return: the path
         :raises InvalidOption: if the name does not end in ``.mp4``
         :raises OutputNotWritable: if the file cannot be written; no part of it is left behind
-        :raises GameFailed: if the game ends too early; the same holds
-        :raises GameTimeout: if it hangs; the same holds
+        :raises GameFailed: if the game ends too early; no part of the file is left behind
+        :raises GameTimeout: if it hangs; no part of the file is left behind
         """
         return write_video(path, self.pictures(), self.fps, total, PHOTOGRAPHIC)
 
 
 def side_by_side(*videos: Iterator[npt.NDArray[np.uint8]]) -> Iterator[npt.NDArray[np.uint8]]:
     """
-    Join videos of one height. Of one that ends before the others the last picture stays.
+    Join videos of one height. A video that ends before the others keeps its last picture.
 
     :param videos: pictures of each, from left to right
     :return: joint pictures
@@ -167,8 +167,8 @@ def read_frame(file: int, game: GameProcess) -> Frame | None:
     :param file: the open file
     :param game: that sends it
     :return: the frame; ``None`` if the game has sent its last one
-    :raises GameFailed: if it ends within one
-    :raises GameTimeout: if none comes
+    :raises GameFailed: if the game ends within a frame
+    :raises GameTimeout: if no frame comes
     """
     header = bytearray(HEADER.size)
     got = _fill(file, memoryview(header), game)
@@ -185,12 +185,12 @@ def read_frame(file: int, game: GameProcess) -> Frame | None:
 
 def _fill(file: int, buffer: memoryview, game: GameProcess) -> int:
     """
-    Read as much as there is room for.
+    Read until the buffer is full.
 
     :param file: the open file
     :param buffer: to fill
     :param game: that sends
-    :return: how much was read: less only at the end
+    :return: number of bytes read; fewer only at the end
     """
     got = 0
     while got < len(buffer):

@@ -1,4 +1,4 @@
-"""A track and its car as highway-env knows them: a road network, and a vehicle on it.
+"""A track and its car in the classes of highway-env: a road network, and a vehicle on it.
 
 Importing this module loads highway-env, and with it pygame, matplotlib and pandas. Only
 :mod:`sb3_torcs.rendering.viewer` needs it, and that is loaded by the first ``render()``.
@@ -24,9 +24,11 @@ from sb3_torcs.tracks.track import Segment, Track
 
 @contextmanager
 def _unchanged_environment() -> Iterator[None]:
-    """Take back what pygame and highway-env write into ``os.environ`` when they are imported."""
+    """Undo the changes of ``os.environ`` that importing pygame and highway-env makes."""
     before = dict(os.environ)
-    os.environ["PYGAME_HIDE_SUPPORT_PROMPT"] = "1"  # it would go to standard output, beside --json
+    os.environ["PYGAME_HIDE_SUPPORT_PROMPT"] = (
+        "1"  # pygame's greeting would spoil the output of --json
+    )
     try:
         yield
     finally:
@@ -82,7 +84,7 @@ class _Tapering:
 
     def width_at(self, longitudinal: float) -> float:
         """
-        Width of the lane at a place.
+        Return the width of the lane at a distance along it.
 
         :param longitudinal: along the lane [m]
         :return: the width [m]
@@ -180,7 +182,7 @@ class RaceCar(Vehicle):
 
     def pose(self, state: CarState) -> None:
         """
-        Put the car where its world says that it is.
+        Move the car to the position of its state.
 
         :param state: as the backend returned it
         """
@@ -200,9 +202,9 @@ class RaceCar(Vehicle):
 
     def step(self, dt: float) -> None:
         """
-        Do nothing: the backend has moved the car already, with tyres that slide.
+        Do nothing, since the backend moves the car.
 
-        The base class would move it a second time, on highway-env's kinematic model.
+        The base class would move it a second time, by highway-env's kinematic model.
 
         :param dt: not used [s]
         """

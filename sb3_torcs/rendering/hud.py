@@ -29,13 +29,13 @@ CHARACTERS = string.ascii_letters + string.digits + " .:-/"
 
 KMH = 3.6  # km/h per m/s
 REVS_SHOWN = 10000.0  # [rpm] at the bar's end
-NO_TIME = "-:--.--"  # before there is a whole lap
+NO_TIME = "-:--.--"  # shown before the first whole lap
 GEARS = {-1: "R", 0: "N"}
 
 
 def lap_clock(seconds: float) -> str:
     """
-    Write a lap time as a timekeeper does.
+    Format a lap time, e.g. ``1:23.456``.
 
     :param seconds: the time [s]
     """
@@ -45,10 +45,9 @@ def lap_clock(seconds: float) -> str:
 
 class _Typeface:
     """
-    Letters of one size, rendered once.
+    Letters of one size, rendered once, which is faster.
 
-    pygame's fonts die with ``pygame.quit()``, which highway-env's own viewer calls when it
-    closes; these live on, and are faster.
+    They also survive ``pygame.quit()``, which highway-env's own viewer calls when it closes.
 
     :param size: height [px]
     """
@@ -77,7 +76,7 @@ class _Typeface:
         """
         Write a line.
 
-        :param target: what to write on
+        :param target: the picture
         :param text: made of ``CHARACTERS``
         :param place: left and top [px]
         :param colour: of the letters
@@ -114,7 +113,7 @@ class Dashboard:
 
         :param picture: of the size given to the constructor
         :param car: its state
-        :param controls: what it was told
+        :param controls: its controls
         """
         margin = MARGIN * self._unit
         self._draw_laps(picture, (margin, margin), car)
@@ -259,7 +258,7 @@ class _Map:
         self._line(places[0].heading, pixels[0])
 
     def _pixel(self, point: FloatArray) -> tuple[float, float]:
-        """Where a point of highway-env's frame [m] is on the map [px]."""
+        """Turn a point of highway-env's frame [m] into one of the map [px]."""
         x, y = (point - self._centre) * self._scaling + 0.5 * self.side
         return float(x), float(y)
 

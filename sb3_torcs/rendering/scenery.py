@@ -23,7 +23,7 @@ PAVED: Colour = (114, 115, 118)  # beside the road: lighter, so that the road st
 WALL: Colour = (190, 188, 182)
 WHITE: Colour = (240, 240, 240)
 BLACK: Colour = (24, 24, 24)
-COLOURS: dict[str, Colour] = {  # by a word in the name that TORCS gives to a surface
+COLOURS: dict[str, Colour] = {  # by a word in TORCS's name of a surface
     "grass": GRASS,
     "sand": (198, 176, 128),
     "gravel": (160, 150, 132),
@@ -57,7 +57,7 @@ class Chunk(NamedTuple):
 
 class Scenery:
     """
-    What lies in the plane of a track, in highway-env's frame.
+    The drawn surfaces of a track, in highway-env's frame.
 
     :param track: any circuit
     """
@@ -72,10 +72,10 @@ class Scenery:
 
     def near(self, position: FloatArray, distance: float) -> tuple[list[Chunk], list[Chunk]]:
         """
-        Select what may be seen from a place.
+        Select the surfaces that may be visible from a position.
 
         :param position: (2,) of the place [m]
-        :param distance: how far one sees [m]
+        :param distance: range of sight [m]
         :return: chunks of road and its sides, and bands, which shade the sides only
         """
         return (
@@ -200,7 +200,7 @@ def _chunks(track: Track) -> list[Chunk]:
 
 
 def _bands(track: Track) -> list[Chunk]:
-    """Shade the sides in even steps: they show how fast the ground passes."""
+    """Shade the sides at even intervals, so that the picture shows the speed."""
     bands = []
     count = int(track.length / (2.0 * BAND))
     for number in range(count):

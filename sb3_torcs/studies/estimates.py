@@ -42,7 +42,7 @@ def iqm(scores: Array) -> Array:
 
 def share(scores: Array) -> Array:
     """
-    Average all seeds: what share of them is 1.
+    Average all seeds: the share of ones.
 
     :param scores: (seeds, 1, points)
     :return: (points,)
@@ -61,7 +61,7 @@ def estimate(scores: Array, function: Callable[[Array], Array] = iqm) -> Estimat
     from rliable.library import StratifiedBootstrap
 
     class Seeded(StratifiedBootstrap):
-        """Draws from its own generator; rliable's draws from that of the whole process."""
+        """Uses a generator of its own; rliable's uses the global one."""
 
         def update_indices(self) -> tuple[Any, ...]:
             drawn = self.generator.choice(self._num_items, self._args_shape, replace=True)
@@ -70,6 +70,6 @@ def estimate(scores: Array, function: Callable[[Array], Array] = iqm) -> Estimat
     stacked = scores[:, None, :]
     drawn = Seeded(stacked, seed=0).apply(function, reps=REPETITIONS)
     tail = 0.5 * (1.0 - LEVEL)
-    # Without interpolation, which would make nonsense of a lap that was never driven.
+    # Without interpolation, which is undefined for laps that were never driven (infinity).
     low, high = np.quantile(drawn, [tail, 1.0 - tail], axis=0, method="inverted_cdf")
     return Estimate(function(stacked), low, high)

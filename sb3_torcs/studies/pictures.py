@@ -13,8 +13,8 @@ from sb3_torcs.studies.results import Results
 
 __all__ = ["NO_LAP", "draw_together", "draw_variant"]
 
-MANY = 10  # variants, for whom there are colours of their own
-NO_LAP = np.inf  # [s] worse than any, so that whoever has none is not forgotten
+MANY = 10  # variants that can have colours of their own
+NO_LAP = np.inf  # [s] stands for no lap: worse than any lap time
 PANELS = (("distance", "distance of three laps [m]"), ("lap", "best flying lap so far [s]"))
 
 

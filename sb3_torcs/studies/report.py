@@ -21,17 +21,17 @@ from sb3_torcs.studies.storage import RECIPE, RESULTS, ROWS, write_whole
 
 __all__ = ["read_results", "write_report"]
 
-FEWEST = 3  # seeds that have an interval
+FEWEST = 3  # fewest seeds for an interval
 TOGETHER = "learning.png"  # the picture of all variants
 
 
 def read_results(folder: Path) -> list[Results]:
     """
-    Read what a study has come to.
+    Read the results of a study.
 
     :param folder: of the study
     :return: its trials, in the order of the file
-    :raises StudyError: if there is nothing to report
+    :raises StudyError: if there are no results
     """
     file = folder / RESULTS
     try:
@@ -53,7 +53,7 @@ def read_results(folder: Path) -> list[Results]:
 
 
 def _trials(rows: Sequence[dict[str, Any]]) -> list[Results]:
-    """Sort rows into trials, and make sure that each has what the report builds on."""
+    """Sort rows into trials, and make sure that each has the rows that the report needs."""
     trials = []
     for (variant, seed), group in itertools.groupby(rows, lambda r: (r["variant"], r["seed"])):
         own = list(group)
@@ -123,14 +123,14 @@ def write_report(folder: Path, output: Path) -> Path:
 
 
 def _waiting(folder: Path) -> list[str]:
-    """Name the agents that no figure can speak of, so that whoever failed early is not left out."""
+    """List the agents without figures, such as those that failed early."""
     recipes = sorted(folder.glob(f"*/{RECIPE}"))
     waiting = [file.parent.name for file in recipes if not (file.parent / ROWS).is_file()]
     return [f"Not evaluated yet, and in no figure: {', '.join(waiting)}.", ""] if waiting else []
 
 
 def _homes(trials: Sequence[Results]) -> str:
-    """Name the track that chose the models, the first if there are several."""
+    """Return the track whose evaluations chose the models; the first if there are several."""
     names = {trial.train[0]["track"] for trial in trials}
     if len(names) > 1:
         return "each on the first track that chose its model"
@@ -186,7 +186,7 @@ def _summary(trials: Sequence[Results]) -> list[str]:
 
 
 def _completing(homes: Sequence[dict[str, Any]], seeds: int) -> str:
-    """Count the seeds that complete, and say how many are not counted."""
+    """Count the seeds that complete all laps, and those without a result."""
     counted = f"{sum(row['completes'] for row in homes)} of {len(homes)}"
     return counted if len(homes) == seeds else f"{counted}, {seeds - len(homes)} not measured"
 

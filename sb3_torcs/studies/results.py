@@ -1,4 +1,4 @@
-"""The rows of a study, put together by trial."""
+"""The rows of a study's results, grouped by trial."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Studies: every variant with every seed, as trials of Ray Tune on the local cores or a cluster.
 
-Whatever a trial has come to goes to the study's folder, an actor beside the driver. A trial that is
-begun again, because its worker was lost or the whole study was killed, asks the folder what there
-is and goes on from there; workers need no disk of their own.
+Each trial stores its state in the study's folder, which is a Ray actor on the machine that runs the
+command. A trial that is begun again, because its worker was lost or the study was killed, continues
+from that state. Workers need no shared disk.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from sb3_torcs.studies.storage import Files, StudyFolder
 
 __all__ = ["Progress", "require_ray", "run_study", "run_trial"]
 
-RETRIES = 3  # of a trial whose worker was lost or whose code failed, per run of the command
+RETRIES = 3  # retries of a trial whose worker was lost or whose code failed, per run of the command
 SESSION = ".session"  # where a killed run's temporary files are
-SCRATCH = "st-"  # what folders with temporary files are called: short, since sockets lie in them
-MARK = ".of-a-study"  # a file that says so
-PRIVATE = "sb3_torcs_study"  # a resource by which a study's own Ray is known to others
-FAILED = "failed"  # the phase of a row that tells of a mistake instead of a race
+SCRATCH = "st-"  # prefix of folders for temporary files; short, since paths of sockets are limited
+MARK = ".of-a-study"  # a file that names the folder for temporary files
+PRIVATE = "sb3_torcs_study"  # a resource that marks a Ray that was started by a study
+FAILED = "failed"  # the phase of a row with an error instead of a race
 
 Progress = Callable[[Trial, dict[str, Any]], None]
 """Called with a trial and the last of its rows, or with ``{"state": …}``."""
@@ -50,11 +50,11 @@ IMPATIENT = {"RAY_NUM_REDIS_GET_RETRIES": "1"}
 
 def run_trial(trial: Trial, store: Any, report: Callable[[dict[str, Any]], None]) -> None:
     """
-    Train and measure one agent, or go on with it.
+    Train and measure one agent, or continue it.
 
     :param trial: which one
-    :param store: a :class:`~sb3_torcs.studies.storage.StudyFolder`, or what stands for one on
-        another machine
+    :param store: a :class:`~sb3_torcs.studies.storage.StudyFolder`, or its proxy on another
+        machine
     :param report: called with the newest row
     """
     from sb3_torcs.studies.trial import Training, final_row
@@ -87,7 +87,7 @@ def run_trial(trial: Trial, store: Any, report: Callable[[dict[str, Any]], None]
 
 @contextlib.contextmanager
 def _unpacked(files: Files | None) -> Iterator[Path | None]:
-    """Put files into a folder for a while."""
+    """Write files to a temporary folder."""
     if files is None:
         yield None
         return
@@ -106,13 +106,13 @@ def run_study(
     progress: Progress | None = None,
 ) -> Path:
     """
-    Run what is left of a study.
+    Run a study, or continue it.
 
     :param study: what is to be run
-    :param folder: of the study; what is there of it is not done again
+    :param folder: of the study; results in it are not computed again
     :param jobs: trials at a time on this machine; by default one per core
     :param address: of a Ray cluster that this machine belongs to; ``None`` uses this machine alone
-    :param progress: called when a trial has something new
+    :param progress: called with each new result of a trial
     :return: the table of the results
     :raises RayUnavailable: if Ray is missing, or the cluster does not answer
     :raises StudyError: if the folder is of another study, or in use, or if a variant cannot be
@@ -142,7 +142,7 @@ def run_study(
 
 
 def _check_buildable(trial: Trial) -> None:
-    """Build the agent of a trial, so that a wrong value is told before anything is trained."""
+    """Build the agent of a trial, so that wrong values are reported before any training."""
     from sb3_torcs.studies.trial import Training
 
     try:
@@ -153,10 +153,10 @@ def _check_buildable(trial: Trial) -> None:
 
 def require_ray(address: str | None = None) -> None:
     """
-    Make sure that Ray can be imported, and that it will be quiet.
+    Make sure that Ray can be imported, and silence it.
 
     :param address: of a cluster that is to be joined
-    :raises RayUnavailable: if it is not installed, or the address is none of a cluster
+    :raises RayUnavailable: if it is not installed, or the address is not one of a cluster
     """
     if address is not None and address.startswith("ray://"):
         raise RayUnavailable(
@@ -208,7 +208,7 @@ def _ray(store: StudyFolder, jobs: int | None, address: str | None) -> Iterator[
                 f"the Ray at '{address}' belongs to another study, and ends with it; leave "
                 "--address out, or start a cluster with `ray start --head`"
             )
-        # Tune knows Ctrl-C; SIGTERM Ray would take for a crash.
+        # Tune handles Ctrl-C; Ray would treat SIGTERM as a crash.
         with answered(lambda *_: signal.raise_signal(signal.SIGINT), signal.SIGTERM):
             yield scratch
     finally:
@@ -218,7 +218,7 @@ def _ray(store: StudyFolder, jobs: int | None, address: str | None) -> Iterator[
 
 
 def _remove_scratch(session: Path) -> None:
-    """Remove a run's temporary files, and nothing else, whatever the file that names them says."""
+    """Remove the temporary files of a run. The file that names them may be damaged."""
     if not session.is_file():
         return
     with contextlib.suppress(OSError, ValueError):  # damaged, or naming what cannot be
@@ -246,7 +246,7 @@ def _tune(trials: list[Trial], store: StudyFolder, scratch: Path, progress: Prog
     here_only = _HereOnly(progress)
 
     class Watch(tune.Callback):
-        """Hands what Tune hears on to whoever watches."""
+        """Passes the reports of Ray Tune to the progress function."""
 
         def on_trial_start(self, **heard: Any) -> None:
             here_only.call(trials[heard["trial"].config["trial"]], {"state": "running"})
@@ -270,7 +270,7 @@ def _tune(trials: list[Trial], store: StudyFolder, scratch: Path, progress: Prog
             failure_config=tune.FailureConfig(max_failures=RETRIES),
         ),
     ).fit()
-    # One that Ctrl-C found waiting for its turn has no config.
+    # A trial that was still waiting at Ctrl-C has no config.
     found = [results[number] for number in range(len(results))]
     errors = {result.config["trial"]: _error(result) for result in found if result.config}
     for number, trial in enumerate(trials):
@@ -283,7 +283,7 @@ def _tune(trials: list[Trial], store: StudyFolder, scratch: Path, progress: Prog
 
 
 def _run_or_tell(trial: Trial, store: Any, report: Callable[[dict[str, Any]], None]) -> None:
-    """Run a trial; what another worker would fail of, too, is a last row and no error to Tune."""
+    """Run a trial. An error that would recur is reported as a row, so that Tune does not retry."""
     try:
         run_trial(trial, store, report)
     except (StudyError, OutputNotWritable) as error:
@@ -296,7 +296,7 @@ def _nobody(trial: Trial, row: dict[str, Any]) -> None:
 
 
 def _error(result: Any) -> str | None:
-    """Say why a trial has failed: in its own words, or in the last of a worker's traceback."""
+    """Return why a trial failed: its own message, or the last line of a worker's traceback."""
     if result.error is not None:
         return _last_line(result.error)
     said: str | None = (result.metrics or {}).get("error")
@@ -319,7 +319,7 @@ class _HereOnly:
 
 
 class _Remote:
-    """An actor that is called like the object that it is."""
+    """A Ray actor whose methods are called like those of a local object."""
 
     def __init__(self, actor: Any) -> None:
         self._actor = actor

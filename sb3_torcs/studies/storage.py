@@ -1,4 +1,4 @@
-"""The folder of a study: what there is of each trial, written so that a kill breaks nothing.
+"""The folder of a study, with the state of each trial. A kill at any time leaves it valid.
 
 ::
 
@@ -44,7 +44,7 @@ FOR_DRIVERS = (BEST_MODEL, "vecnormalize.pkl", "config.yml", "args.yml")
 
 class StudyFolder:
     """
-    What a study has come to.
+    The folder of a study.
 
     :param path: of the folder; it is made
     :param study: that is run in it
@@ -62,7 +62,7 @@ class StudyFolder:
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
-        """Keep others out; a killed process lets go of the lock by itself."""
+        """Lock the folder against other processes. A killed process releases the lock."""
         with (self.path / LOCK).open("w") as file:
             try:
                 # What filelock does, in as few lines.
@@ -132,7 +132,7 @@ class StudyFolder:
 
     def trained(self, trial: Trial) -> bool:
         """
-        Say whether the training of a trial is over.
+        Check whether the training of a trial is complete.
 
         :param trial: of the study
         :return: whether all its timesteps were learned from
@@ -152,7 +152,7 @@ class StudyFolder:
 
     def ended(self, trial: Trial) -> bool:
         """
-        Say whether there is nothing left to do for a trial.
+        Check whether a trial is complete.
 
         :param trial: of the study
         :return: whether it is trained and measured
@@ -161,7 +161,7 @@ class StudyFolder:
 
     def checkpoint(self, trial: Trial) -> Path | None:
         """
-        Find what a trial goes on from.
+        Find the checkpoint that a trial continues from.
 
         :param trial: of the study
         :return: a folder; ``None`` if the trial has not come so far
@@ -170,7 +170,7 @@ class StudyFolder:
 
     def state(self, trial: Trial) -> tuple[Files | None, bool, list[str]]:
         """
-        Tell what there is of a trial.
+        Return the state of a trial.
 
         :param trial: of the study
         :return: the files to go on from, if any; whether the training is over; tracks on which the
@@ -185,16 +185,16 @@ class StudyFolder:
 
     def put(self, trial: Trial, files: Mapping[str, bytes], rows: list[dict[str, Any]]) -> None:
         """
-        Write the newest state of a trial, and take the one before away.
+        Write the newest state of a trial, and remove the previous one.
 
         :param trial: of the study
         :param files: of its checkpoint
         :param rows: of its evaluations so far
         :raises StudyError: if the trial is already as far: two workers drive it
-        :raises OutputNotWritable: if there is no room; the state before is still there
+        :raises OutputNotWritable: if there is no room; the previous state is kept
         """
         if len(rows) <= len(self.rows(trial)):
-            raise StudyError(f"{trial.name} has come farther elsewhere; this worker is not needed")
+            raise StudyError(f"another worker has taken {trial.name} farther; this one stops")
         folder = self.of(trial)
         over = rows[-1]["decisions"] >= trial.budget
         before = [*folder.glob(f"{CHECKPOINT}*"), *folder.glob(f".{CHECKPOINT}*")]
@@ -206,7 +206,7 @@ class StudyFolder:
                     write_whole(aside / file, content)
                 aside.rename(folder / f"{CHECKPOINT}{len(rows):06d}")
             except OSError:
-                shutil.rmtree(aside, ignore_errors=True)  # it may be what fills the disk
+                shutil.rmtree(aside, ignore_errors=True)  # it may fill the disk
                 raise
         for file in FOR_DRIVERS:
             if file in files:
@@ -233,7 +233,7 @@ class StudyFolder:
         """
         Write all rows into one table, in the order of the study file.
 
-        Those of trials that the file names no more come last.
+        Rows of trials that are no longer in the file come last.
         """
         named = [self.of(trial) / ROWS for trial in self.study.trials]
         others = sorted(set(self.path.glob(f"*/{ROWS}")).difference(named))
@@ -287,7 +287,7 @@ def _recipe(text: str) -> dict[str, Any]:
 
 
 def _difference(before: Any, after: Any) -> str:
-    """Name the keys in which two recipes differ, as deep as they are mappings."""
+    """List the keys in which two recipes differ, at any depth."""
     if not isinstance(before, dict) or not isinstance(after, dict):
         return f"(it was {before!r})"
     changed = []
@@ -302,7 +302,7 @@ def _difference(before: Any, after: Any) -> str:
 
 
 def _cell(value: Any) -> Any:
-    """Write lists of lap times with spaces, truth as 1 and 0, and nothing as nothing."""
+    """Format a cell: lap times with spaces between, booleans as 1 and 0, ``None`` as empty."""
     if isinstance(value, list):
         return " ".join(str(item) for item in value)
     return int(value) if isinstance(value, bool) else value
@@ -322,11 +322,11 @@ def _parsed(file: Path, parse: Callable[[str], Any]) -> Any:
 
 def write_whole(file: Path, content: bytes) -> None:
     """
-    Write a file that is there whole, or not at all, after a power cut too.
+    Write a file completely or not at all, also if the power fails.
 
     :param file: to be written, in a folder that is made
     :param content: of it
-    :raises OutputNotWritable: if that cannot be; what was there before is still there
+    :raises OutputNotWritable: if it cannot be written; the previous file is kept
     """
     aside = file.with_name(f".{file.name}")
     try:

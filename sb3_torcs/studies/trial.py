@@ -1,8 +1,8 @@
-"""One trial of a study: stock SB3 learns in slices, and can be killed and go on as if nothing was.
+"""One trial of a study: stock SB3 learns in slices, so that a killed training can continue exactly.
 
-A slice is what is learned between two evaluations. At its beginning all chance is seeded by the
-trial's seed and the slice's number, and the cars are put to their start, in an undisturbed training
-too: so what a slice learns depends on nothing but what is in the checkpoint before it.
+A slice is the training between two evaluations. At its beginning all random generators are seeded
+by the trial's seed and the slice's number, and the environments are reset, also in a training that
+is never killed. So a slice depends on nothing but the checkpoint before it.
 """
 
 from __future__ import annotations
@@ -49,7 +49,9 @@ class Training:
     """
 
     def __init__(self, trial: Trial, checkpoint: Path | None = None) -> None:
-        th.set_num_threads(1)  # trials run side by side: torch's threads would get in the way
+        th.set_num_threads(
+            1
+        )  # trials run side by side, so more threads of torch would slow them down
         self.trial = trial
         self.rows: list[Row] = []
         self.episodes = 0  # that have ended, in all training environments together
@@ -72,7 +74,7 @@ class Training:
 
     @property
     def slices(self) -> int:
-        """How many slices have been learned from and evaluated."""
+        """Number of slices that are complete."""
         return len(self.rows) // len(self.trial.eval_tracks)
 
     @property
@@ -86,19 +88,19 @@ class Training:
         Learn to the end of the budget.
 
         :param after_slice: called after each evaluation; may call :meth:`save`
-        :raises StudyError: if a callback stops the training before
+        :raises StudyError: if a callback stops the training early
         """
         remaining = self.trial.budget - self.model.num_timesteps
         self._clock = _clocks()
         slices = _Slices(self, after_slice)
         if remaining > 0:
             env = self.model.get_env()
-            # Anything but None: SB3 shall not reset the environments, a slice does.
+            # Not None, so that SB3 does not reset the environments: a slice does.
             self.model._last_obs = np.zeros((env.num_envs, *env.observation_space.shape))
             self.model.set_logger(Logger(None, []))  # SB3's own leaves an empty folder behind
-            # Slices come last: what others change for a rollout is changed back when one ends.
+            # Slices come last, after other callbacks have undone their changes of a rollout.
             callbacks = [*self.callbacks, slices]
-            # As one learn() to the end, so that schedules fall over the whole budget.
+            # One learn() for all slices, so that schedules span the whole budget.
             self.model.learn(remaining, callback=callbacks, reset_num_timesteps=False)
             if self.model.num_timesteps < self.trial.budget:
                 raise StudyError(
@@ -109,7 +111,7 @@ class Training:
             slices.end()
 
     def begin_slice(self) -> None:
-        """Make what follows depend on the seed and the slice's number alone."""
+        """Seed all generators by the trial's seed and the slice's number; reset the cars."""
         model, env = self.model, self.model.get_env()
         sequence = np.random.SeedSequence((self.trial.seed, self.slices))
         model.set_random_seed(int(sequence.generate_state(1)[0]))
@@ -119,7 +121,7 @@ class Training:
             model._last_original_obs = self.normalizer.get_original_obs()
         if getattr(model, "action_noise", None) is not None:
             model.action_noise.reset()
-        if model.use_sde:  # SB3 has drawn it before it called back
+        if model.use_sde:  # SB3 drew it before this callback
             getattr(model.policy, "actor", model.policy).reset_noise(env.num_envs)
 
     def end_slice(self, running: np.ndarray) -> None:
@@ -147,7 +149,7 @@ class Training:
 
     def save(self, folder: Path) -> None:
         """
-        Write down all that the rest of the training depends on, and the best model.
+        Save everything that the rest of the training depends on, and the best model.
 
         :param folder: an empty one
         """
@@ -168,7 +170,7 @@ class Training:
         (folder / STATE).write_text(json.dumps(state), encoding="utf-8")
 
     def close(self) -> None:
-        """Give the environments back."""
+        """Close the environments."""
         self.model.get_env().close()
         for env in self._races.values():
             env.close()
@@ -264,7 +266,7 @@ def final_row(trial: Trial, model: Path, track: str, progress: Row) -> Row:
 
 
 def _with_statistics(env: Any, file: Path) -> Any:
-    """Put saved statistics where new ones are, which may be below stacked frames."""
+    """Replace new statistics by saved ones; they may be below VecFrameStack."""
     if isinstance(env, VecNormalize):
         return VecNormalize.load(str(file), env.venv)
     env.venv = _with_statistics(env.venv, file)
@@ -279,7 +281,7 @@ def _race_environment(trial: Trial, track: str) -> Any:
 
 
 def _row(trial: Trial, phase: str, track: str, race: Episode, more: Row) -> Row:
-    """Write one race down."""
+    """Make the row of one race."""
     name = track_name(track)
     row = {
         "study": trial.study,
@@ -308,7 +310,7 @@ def _clocks() -> np.ndarray:
 
 def _cut_episodes(model: Any, running: np.ndarray) -> None:
     """
-    Let the replay buffer know that these episodes end here, as by a time limit.
+    Mark the ends of these episodes in the replay buffer, as those by a time limit.
 
     Otherwise returns over several timesteps would reach into the next episode.
     """
@@ -328,14 +330,14 @@ def _rings(buffer: Any) -> dict[str, np.ndarray]:
 
 
 def _buffer_arrays(buffer: Any) -> dict[str, np.ndarray]:
-    """Return what a replay buffer holds; the rows that it never filled are left out."""
+    """Return the arrays of a replay buffer, without the rows that were never filled."""
     rows = buffer.size()
     rings = {name: ring[:rows] for name, ring in _rings(buffer).items()}
     return {**rings, "pos": np.array(buffer.pos), "full": np.array(buffer.full)}
 
 
 def _refill(buffer: Any, arrays: Any) -> None:
-    """Fill a new replay buffer with what another one held."""
+    """Fill a new replay buffer with saved arrays."""
     for name, ring in _rings(buffer).items():
         ring[: len(arrays[name])] = arrays[name]
     buffer.pos, buffer.full = int(arrays["pos"]), bool(arrays["full"])

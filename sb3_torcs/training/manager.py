@@ -1,7 +1,7 @@
 """The one place that starts the RL Zoo.
 
-:func:`train` runs its own training, with files that are there whole or not at all. :func:`build`
-has it make an algorithm and its environments, for those who learn in another way.
+:func:`train` runs the zoo's training and writes files completely or not at all. :func:`build` lets
+the zoo make an algorithm and its environments only, for studies.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ RECORDS = ("config.yml", "args.yml")  # of a run: evaluate and watch read them
 
 
 class Built(NamedTuple):
-    """What the zoo makes of an entry."""
+    """The algorithm and the callbacks that the zoo makes of an entry."""
 
     model: Any  # of any algorithm; its environments are ``model.get_env()``
     callbacks: list[BaseCallback]
@@ -48,7 +48,7 @@ class Built(NamedTuple):
 
 def build(algo: str, env_id: str, entry: Mapping[str, Any], *, seed: int = 0) -> Built:
     """
-    Let the zoo build an algorithm, its environments and its callbacks; it leaves no files behind.
+    Let the zoo build an algorithm, its environments and its callbacks, without writing files.
 
     :param algo: as the zoo calls it
     :param env_id: of a registered environment
@@ -78,7 +78,7 @@ def train(
     :param algo: as the zoo calls it
     :param env_id: of a registered environment
     :param entry: of a hyperparameter file
-    :param words: further ones of the zoo's command line
+    :param words: further arguments of the zoo's command line
     :param managers: gets the manager of the training, once there is one
     """
 
@@ -90,7 +90,7 @@ def train(
         conf_file = _write_entry(Path(scratch), env_id, entry)
         first = ["--gym-packages", "sb3_torcs", "--algo", algo, "--env", env_id]
         first += ["--conf-file", str(conf_file)]
-        # The zoo's function, with our manager and our words in the places of its own.
+        # The zoo's function, with our manager and our arguments instead of its own.
         names = {**vars(rl_zoo3.train), "ExperimentManager": manager}
         names["argparse"] = types.SimpleNamespace(ArgumentParser=_parser_of([*first, *words]))
         zoo_train = types.FunctionType(rl_zoo3.train.train.__code__, names)
@@ -99,7 +99,7 @@ def train(
 
 
 def _parser_of(words: list[str]) -> type[argparse.ArgumentParser]:
-    """Make the class of a parser that reads these words, not those of the process."""
+    """Make the class of a parser that reads these arguments, not those of the process."""
 
     class Parser(argparse.ArgumentParser):
         def __init__(self) -> None:
@@ -120,7 +120,7 @@ def _write_entry(folder: Path, env_id: str, entry: Mapping[str, Any]) -> Path:
 
 class Manager(ExperimentManager):
     """
-    The zoo's manager of one training, which keeps what was learned at each evaluation.
+    The zoo's manager of one training. It saves the model at each evaluation.
 
     :param arguments: of the zoo's own
     :param keywords: of the zoo's own
@@ -129,17 +129,17 @@ class Manager(ExperimentManager):
     def __init__(self, *arguments: Any, **keywords: Any) -> None:
         log_folder = arguments[3]
         with _alone(Path(log_folder) / arguments[1]):
-            # The zoo numbers a run by the folders that it finds: two that began at once would
+            # The zoo numbers a run by the folders that exist: two that begin at the same time would
             # write into one.
             super().__init__(*arguments, **keywords)
             self.create_log_folder()
         self.files = WholeFiles(Path(self.save_path))
         if self.optimize_hyperparameters:
-            self.tensorboard_log = None  # a search writes none, and would warn of it
+            self.tensorboard_log = None  # a search writes no such files, and would warn
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """
-        Read what the training is asked for, and keep it for the model's record.
+        Read the hyperparameters, and keep them for the model's record.
 
         :return: the same twice, the first to be changed
         """
@@ -149,10 +149,10 @@ class Manager(ExperimentManager):
 
     def create_callbacks(self) -> None:
         """
-        Let the zoo's callbacks write aside, between the two of ours.
+        Put the zoo's callbacks between two of ours, and let them write to temporary names.
 
-        One writes the model's record, before anything saves the model; the other keeps what was
-        learned.
+        Our first callback writes the model's record before any other saves the model. Our last one
+        moves complete files to their names.
         """
         asked = {**self._asked, "env_kwargs": self.env_kwargs, "n_timesteps": self.n_timesteps}
         self.callbacks.append(RecordCallback(recipe(self.algo, self.env_name.gym_id, asked)))
@@ -171,7 +171,7 @@ class Manager(ExperimentManager):
         self.callbacks.append(self.keeper)
 
     def _write_aside(self, callback: EvalCallback) -> None:
-        """Change the places of an evaluation's files, if they are those of the run."""
+        """Let an evaluation of the run write to temporary names."""
         if callback.best_model_save_path != self.save_path:
             return
         callback.best_model_save_path = str(self.files.aside)
@@ -181,7 +181,7 @@ class Manager(ExperimentManager):
 
     def learn(self, model: BaseAlgorithm) -> None:
         """
-        Train; if an error ends it, keep what can be kept.
+        Train; if an error ends the training, save the model.
 
         :param model: to be trained
         """
@@ -223,13 +223,12 @@ class Manager(ExperimentManager):
             if "No trials are completed" not in str(error):
                 raise
             raise InvalidOption(
-                "no trial of the search has come to its end; let it run longer, or give it more "
-                "--n-trials"
+                "no trial of the search has ended; let it run longer, or give it more --n-trials"
             ) from error
 
     @contextlib.contextmanager
     def _named_errors(self) -> Iterator[None]:
-        """Let the error of a file that cannot be written name it; SB3's do not."""
+        """Add the file's name to the error of a file that cannot be written."""
         try:
             yield
         except OSError as error:
@@ -242,7 +241,7 @@ class Manager(ExperimentManager):
 @contextlib.contextmanager
 def _alone(folder: Path) -> Iterator[None]:
     """
-    Let others wait.
+    Hold a lock, so that other trainings wait.
 
     :param folder: of all runs of an algorithm; is made
     """
@@ -258,7 +257,7 @@ def _alone(folder: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _command_as_text() -> Iterator[None]:
-    """Let the zoo write the process's command line into a file, also if a path in it is no text."""
+    """Let the zoo write the command line to a file, also if a path in it is not valid text."""
     before = sys.orig_argv
     encoding = locale.getpreferredencoding(False)
     sys.orig_argv = [word.encode(encoding, "backslashreplace").decode(encoding) for word in before]

@@ -1,4 +1,4 @@
-"""Training with the RL Zoo: what is asked for, checked, run and kept."""
+"""Training with the RL Zoo: options, checks, the run, and its result."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ OURS = ("--algo", "--env", "--n-timesteps", "-n", "--log-folder", "-f", "--conf-
 @dataclasses.dataclass(frozen=True)
 class TrainOptions:
     """
-    What to train, and where to put it.
+    The options of a training.
 
     :param algo: as the RL Zoo calls it
     :param env: a registered environment
@@ -48,10 +48,10 @@ class TrainOptions:
     :param eval_freq: timesteps between evaluations; ``None`` is a fortieth of the
         training, and at least 1000 where it has as many
     :param eval_episodes: per evaluation
-    :param resume: a saved model (.zip) or a run's folder to go on from
-    :param trust: go on from a model without a record; evaluate strings of the hyperparameter file
+    :param resume: a saved model (.zip) or a run's folder to continue from
+    :param trust: accept a model without a record, and evaluate strings of the hyperparameter file
     :param progress: show a progress bar
-    :param zoo_args: further words for the RL Zoo; they win
+    :param zoo_args: further arguments for the RL Zoo, which override the options
     """
 
     algo: str = "ddpg"
@@ -73,13 +73,13 @@ class TrainOptions:
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """What came of a training."""
+    """The result of a training."""
 
     folder: Path
     timesteps: int  # that it learned from
     wanted: int  # timesteps that were asked for
     interrupted: bool
-    last_model: Path | None  # None: the zoo has searched hyperparameters, as its words asked for
+    last_model: Path | None  # None after a search of hyperparameters
     track: Any  # a name, or a list of them
 
     @property
@@ -101,12 +101,12 @@ def train(options: TrainOptions) -> Path:
 
 def train_run(options: TrainOptions) -> Run:
     """
-    Train, and say how far it came.
+    Train, and return the result.
 
     :param options: what to train, and where to put it
-    :return: what came of it
+    :return: the result
     :raises ZooConfigError: if the hyperparameters have something that nothing would read
-    :raises InvalidOption: if the words for the zoo cannot be read, or would hide the model
+    :raises InvalidOption: if the arguments for the zoo cannot be read, or would move the model
     :raises OutputNotWritable: if a folder cannot be written
     """
     import gymnasium as gym
@@ -117,11 +117,11 @@ def train_run(options: TrainOptions) -> Run:
     for word in options.zoo_args:
         if word.partition("=")[0] in OURS:
             raise InvalidOption(
-                f"'{word}' after -- would hide from sb3-torcs where the model is; before -- there "
-                "are --algo, --env, --timesteps, --folder and --conf-file"
+                f"'{word}' after -- is refused: sb3-torcs would not find the model; before -- "
+                "there are --algo, --env, --timesteps, --folder and --conf-file"
             )
     entry, changed = _entry(options)
-    # Made once, so that what is wrong with it is told before anything starts.
+    # Made once, so that a mistake is reported before anything starts.
     with contextlib.closing(gym.make(options.env, **changed["env_kwargs"])) as env:
         resume = _resumed(options, entry, wrapped(env, changed, trust=True), changed)
     folder = writable_folder(options.folder)
@@ -140,7 +140,7 @@ def train_run(options: TrainOptions) -> Run:
 
 
 def _for_tensorboard(folder: str | Path) -> Path:
-    """Make a folder that TensorBoard can write to, whose own code takes UTF-8 only."""
+    """Make a folder for TensorBoard, whose code accepts only UTF-8 names."""
     path = writable_folder(folder)
     try:
         str(path.absolute()).encode()
@@ -157,7 +157,7 @@ def _entry(options: TrainOptions) -> tuple[dict[str, Any], dict[str, Any]]:
     Read and check the hyperparameters.
 
     :param options: what to train
-    :return: the entry, and what the zoo will make of it by its own words
+    :return: the entry, before and after the changes of the zoo's arguments
     """
     from sb3_torcs.training import zoo
 
@@ -173,7 +173,7 @@ def _entry(options: TrainOptions) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def _changes(zoo_args: Sequence[str]) -> dict[str, Any]:
-    """Find what the zoo will change of an entry, without a check of its own."""
+    """Read the changes that the zoo will make to an entry by its arguments."""
     from rl_zoo3.utils import StoreDict
 
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
@@ -195,12 +195,12 @@ def _resumed(
     options: TrainOptions, entry: dict[str, Any], env: Any, changed: Mapping[str, Any]
 ) -> Path | None:
     """
-    Find and check the model to go on from; with its replay buffer it needs no new warm-up.
+    Find and check the model to resume. With its replay buffer it needs no new warm-up.
 
     :param options: what to train
     :param entry: of the hyperparameter file; is adapted
     :param env: one of those to train in
-    :param changed: what the zoo will make of the entry
+    :param changed: the entry after the changes of the zoo's arguments
     :return: the model's file; ``None`` begins anew
     """
     if options.resume is None:
@@ -229,7 +229,7 @@ def _zoo_words(options: TrainOptions, wanted: int, env_kwargs: dict[str, Any]) -
     words = ["--n-timesteps", str(wanted), "--seed", str(options.seed)]
     words += ["--eval-freq", str(eval_freq), "--eval-episodes", str(options.eval_episodes)]
     words += ["--num-threads", "1", "--device", "cpu", "--verbose", "0", "--save-replay-buffer"]
-    # An evaluation is from the grid and long enough, wherever and how long the training drives.
+    # Evaluations start on the grid and have time for a whole race, unlike the training's episodes.
     mine = ("start", zoo.TIME_LIMIT)
     evaluation = {name: value for name, value in env_kwargs.items() if name not in mine}
     if evaluation:
@@ -265,7 +265,7 @@ def _run_zoo(
     from sb3_torcs.training import manager as zoo_training
 
     managers: list[Manager] = []
-    # Whoever reads may leave, e.g. `tee` at Ctrl-C, before the zoo says that it saves the model.
+    # `tee` may end at Ctrl-C, before the zoo prints that it saves the model.
     out, err = Unbroken(sys.stdout), Unbroken(sys.stderr)
     redirected = contextlib.redirect_stdout(out), contextlib.redirect_stderr(err)
     try:
@@ -279,7 +279,7 @@ def _run_zoo(
 
 
 def _result(manager: Manager, wanted: int, track: Any, interrupted: bool) -> Run:
-    """Find out what came of a training."""
+    """Read the result of a training from its folder."""
     from sb3_torcs.agents.models import saved_timesteps
 
     if manager.optimize_hyperparameters:
@@ -291,7 +291,7 @@ def _result(manager: Manager, wanted: int, track: Any, interrupted: bool) -> Run
 
 
 def _told(error: OSError | WorkerLost, result: Run, options: TrainOptions) -> Exception:
-    """Say what has ended a training, what is kept of it, and what to type."""
+    """Compose a message: why a training ended, what is saved, and what to type."""
     if result.timesteps > 0:
         kept = f"kept: '{result.last_model}', {result.timesteps} of {result.wanted} timesteps"
         more = f"go on with: {_going_on(options, result)}"
@@ -306,9 +306,9 @@ def _told(error: OSError | WorkerLost, result: Run, options: TrainOptions) -> Ex
 @contextlib.contextmanager
 def _noted_interrupts() -> Iterator[list[int]]:
     """
-    Note Ctrl-C, which the zoo takes as the end of the training and swallows; a polite kill, too.
+    Note Ctrl-C and SIGTERM. The zoo ends the training at Ctrl-C, but does not report it.
 
-    A second one, while the model is being saved, must not break the file: only a third does.
+    A second Ctrl-C is ignored, so that the model can be saved; only a third one aborts that.
     """
     seen: list[int] = []
 
@@ -325,13 +325,13 @@ def _noted_interrupts() -> Iterator[list[int]]:
 
 
 def _going_on(options: TrainOptions, result: Run) -> str:
-    """Compose the command line that learns what is left."""
+    """Compose the command that continues the training."""
     left = result.wanted - result.timesteps
     return _command(dataclasses.replace(options, resume=result.last_model, timesteps=left))
 
 
 def _command(options: TrainOptions) -> str:
-    """Compose the command line that means these options."""
+    """Compose the command with these options."""
     words = ["sb3-torcs", "train"]
     for field in dataclasses.fields(options):
         value = getattr(options, field.name)

@@ -1,7 +1,7 @@
-"""Hyperparameter files: finding them, and reading them before anything starts.
+"""Hyperparameter files: find them, and check them before anything starts.
 
-The RL Zoo hands whatever it does not know to the algorithm, hours later for some keys. Here an
-entry is read by the same rules, and what nothing would read is an error that names it.
+The RL Zoo passes unknown keys to the algorithm, for some keys hours later. This module reads an
+entry by the same rules, and reports a key that nothing would read.
 """
 
 from __future__ import annotations
@@ -67,9 +67,9 @@ OURS = ("Torcs-v0", "TorcsLite-v0")
 
 class UninterruptedWorker(gym.Wrapper[Any, Any, Any, Any]):
     """
-    Leaves Ctrl-C to the training, if the environment is in a worker process of it.
+    Ignores Ctrl-C in a worker process, so that the training handles it.
 
-    The terminal interrupts all processes. A worker that ends takes the model with it.
+    The terminal interrupts all processes; if a worker ended, the training could not save its model.
 
     :param env: any
     """
@@ -81,7 +81,7 @@ class UninterruptedWorker(gym.Wrapper[Any, Any, Any, Any]):
 
 
 class Place(NamedTuple):
-    """Where in which file an entry stands, for messages."""
+    """The file and the name of an entry, for messages."""
 
     file: Path
     entry: str
@@ -150,7 +150,7 @@ def read_config(path: Path) -> dict[str, Entry]:
 
 def read_entry(path: Path, name: str) -> Entry:
     """
-    Read one entry; changing it changes nothing else.
+    Read one entry, as a copy.
 
     :param path: of a YAML file
     :param name: of the entry: an environment's id, or what the file calls it
@@ -168,14 +168,14 @@ def read_entry(path: Path, name: str) -> Entry:
 
 def check_entry(entry: Entry, algo: str, env_id: str, place: Place, *, trust: bool = False) -> None:
     """
-    Make sure that everything in an entry will be read by something.
+    Make sure that every key of an entry is used.
 
     :param entry: as read from the file
     :param algo: as the zoo calls it
     :param env_id: a registered environment
     :param place: where the entry stands
     :param trust: let the zoo evaluate strings as Python
-    :raises ZooConfigError: for the first thing that nothing would read
+    :raises ZooConfigError: for the first mistake
     """
     from rl_zoo3.utils import ALGOS
 
@@ -203,7 +203,7 @@ def check_entry(entry: Entry, algo: str, env_id: str, place: Place, *, trust: bo
 
 
 def _check_symmetric(entry: Entry, place: Place) -> None:
-    """Make sure that a policy that drives its mirror image, too, sees something that has one."""
+    """Make sure that observations have a mirror image, if the policy is symmetric."""
     policy_kwargs = entry.get("policy_kwargs")
     if not isinstance(policy_kwargs, Mapping) or not policy_kwargs.get("symmetric"):
         return
@@ -244,7 +244,9 @@ def _check_wrappers(entry: Entry, place: Place) -> None:
     _check_call("monitor_kwargs", Monitor, keywords, place, ("self", "env", "filename"))
     if isinstance(keywords, Mapping):
         kinds = {type(keywords.get(key, ())) for key in ("info_keywords", "reset_keywords")}
-        if len(kinds) > 1:  # Monitor adds the two, and a tuple is its default
+        if (
+            len(kinds) > 1
+        ):  # Monitor adds the two, which have to be of one type; its default is a tuple
             raise ZooConfigError(
                 f"{place}: monitor_kwargs needs both info_keywords and reset_keywords as lists; "
                 "add the other one as []"
@@ -276,12 +278,12 @@ def check_racing(env_id: str) -> None:
     check_registered(env_id)
     built = _env_class(env_id)
     if not (isinstance(built, type) and issubclass(built, (RacingEnv, TorcsEnv))):
-        raise ZooConfigError(f"{env_id} is no racing environment; ours: {', '.join(OURS)}")
+        raise ZooConfigError(f"{env_id} is not a racing environment; ours: {', '.join(OURS)}")
 
 
 def timesteps(entry: Entry) -> int:
     """
-    Read how many timesteps an entry asks for; YAML takes ``1e5`` for a word.
+    Read the number of timesteps of an entry. YAML reads ``1e5`` as a string.
 
     :param entry: that :func:`check_entry` has seen
     :return: its ``n_timesteps``
@@ -334,7 +336,7 @@ NUMBERS: tuple[tuple[tuple[str, ...], Callable[[Any], bool], str], ...] = (
 
 
 def _check_numbers(entry: Entry, place: Place) -> None:
-    """Make sure that numbers are such that one can train with them."""
+    """Make sure that numbers have values with which a training can run."""
     for keys, good, words in NUMBERS:
         for key in keys:
             if key in entry and not good(entry[key]):
@@ -370,7 +372,7 @@ def _policy(name: Any, algorithm: Any, place: Place) -> Callable[..., Any]:
 
 def _items(value: Any, key: str, place: Place) -> list[tuple[str, Mapping[str, Any]]]:
     """
-    Read what the zoo takes for callbacks and wrappers.
+    Read a list of callbacks or wrappers in any of the zoo's forms.
 
     :param value: a dotted path, ``{path: {argument: value}}``, a list of those, or ``None``
     :param key: its key
@@ -410,7 +412,7 @@ def _imported(path: str, key: str, place: Place) -> Callable[..., Any]:
 
 def _arguments(function: Callable[..., Any]) -> set[str] | None:
     """
-    Return the names of the arguments that a constructor takes, also those it hands to its bases.
+    Return the names of a constructor's arguments, with those that it passes to its bases.
 
     :param function: a class, or a function that builds one
     :return: the names; ``None`` if it takes any
@@ -436,7 +438,7 @@ def _check_call(
     place: Place,
     given: Iterable[str] = ("self",),
 ) -> None:
-    """Make sure that a constructor has all these arguments; strings are the zoo's to evaluate."""
+    """Make sure that a constructor has these arguments; the zoo evaluates strings itself."""
     known = _arguments(function)
     if isinstance(arguments, Mapping) and known is not None:
         _check_keys(arguments, known - set(given), f"{what}: argument", place)

@@ -1,4 +1,4 @@
-"""Hyperparameter files as data: nothing in one is evaluated, nor called if it is not of a kind."""
+"""Hyperparameter files as plain data: no string is evaluated, classes are of known kinds."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ TOO_MUCH = (RecursionError, MemoryError, SyntaxError, TypeError)
 
 def as_data(entry: Mapping[str, Any]) -> dict[str, Any]:
     """
-    Turn the strings that the zoo would evaluate into what they stand for, where that is plain.
+    Replace strings that the zoo would evaluate by their values, if these are plain data.
 
     :param entry: of a hyperparameter file
-    :return: a copy; strings that are more than data are still there
+    :return: a copy; strings that are more than data are unchanged
     """
     result = copy.deepcopy(dict(entry))
     for key in EVALUATED:
@@ -40,7 +40,7 @@ def as_data(entry: Mapping[str, Any]) -> dict[str, Any]:
 
 def check_data(entry: Mapping[str, Any], place: str) -> None:
     """
-    Make sure that the zoo will evaluate nothing of an entry.
+    Make sure that the zoo evaluates no string of an entry.
 
     :param entry: of :func:`as_data`
     :param place: where it stands, for the message
@@ -56,7 +56,7 @@ def check_data(entry: Mapping[str, Any], place: str) -> None:
 
 def check_class(found: Callable[..., Any], path: str, key: str, place: str) -> None:
     """
-    Make sure that a dotted path stands for what its key needs, so that not just anything is called.
+    Make sure that a dotted path names a class of the kind that its key needs.
 
     :param found: what was imported
     :param path: its dotted path
@@ -88,12 +88,12 @@ def plain_python(text: str) -> Any:
 
     :param text: of literals, in ``{}``, ``[]`` and calls of ``dict``
     :return: their value; tuples become lists
-    :raises ValueError: if it is anything else: it would have to be evaluated
+    :raises ValueError: if it is anything else
     """
     try:
         return _value(ast.parse(text.strip(), mode="eval").body)
     except TOO_MUCH as error:
-        raise ValueError(f"{text!r:.80} is no plain data") from error
+        raise ValueError(f"{text!r:.80} is not plain data") from error
 
 
 def _value(node: ast.expr) -> Any:
