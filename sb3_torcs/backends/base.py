@@ -1,4 +1,4 @@
-"""What a world behind a racing environment has to be.
+"""The interface of a world behind a racing environment.
 
 :class:`~sb3_torcs.envs.racing.RacingEnv` drives any object of this shape. To add a world,
 write these three methods and three attributes, and run the contract suite over it.
@@ -38,7 +38,7 @@ class Backend(Protocol):
         """
         Begin an episode. Called by ``RacingEnv.reset``.
 
-        :param rng: the environment's generator: the only source of chance that may be used
+        :param rng: the environment's generator, the only one that may be used
         :param start: where to begin; ``None`` is the grid, standing
         :return: the car before the first timestep
         """
@@ -54,4 +54,4 @@ class Backend(Protocol):
         """
 
     def close(self) -> None:
-        """Give everything back. Called once by ``RacingEnv.close``."""
+        """Free all resources. Called once by ``RacingEnv.close``."""

@@ -84,7 +84,7 @@ def make_engine(
         if (name, index) != AGENT:
             game.find_robot(name, index)
     path = find_track(track, game).path
-    load_track(path)  # a broken file is told here, before the game's own loader stumbles on it
+    load_track(path)  # reports a broken file before the game's own loader reads it
     race = engine_arguments(game, path, entries, car=car, session=session, laps=laps)
     try_race(path, race)
     angles = range_finder_angles("scr") if angles is None else angles
@@ -156,7 +156,7 @@ class NativeBackend:
         self.gears = self.engine.gears(self._agent)
         self._noise = sensor_noise
         self._align()
-        self._drive: list[Any] = []  # since the reset, so that a copy can follow
+        self._drive: list[Any] = []  # steps since the reset, for copies
 
     def race_setup(self) -> RaceSetup:
         """
@@ -204,7 +204,7 @@ class NativeBackend:
 
     def arrive(self, controls: Controls, ticks: int, state: CarState) -> None:
         """
-        Note a step that is done: the engine may have been driven by a :class:`Fleet`.
+        Take the result of a step. The engine may have been driven by a :class:`Fleet`.
 
         :param controls: as of ``step``
         :param ticks: as of ``step``
@@ -232,7 +232,7 @@ class NativeBackend:
 
     def restore(self, moment: Any) -> CarState:
         """
-        Go back; what follows equals what followed the first time, to the bit.
+        Go back to a moment. The same controls then give the same drive, to the bit.
 
         :param moment: from :meth:`save`
         :return: the agent's car then
@@ -243,11 +243,11 @@ class NativeBackend:
         return self._state
 
     def close(self) -> None:
-        """Give the race back to the pool of those that can be loaded again."""
+        """Return the race to the pool of loaded races."""
         self.engine.close()
 
     def __getstate__(self) -> dict[str, Any]:
-        # A race is full of addresses; but it is also deterministic, so that what was done says all.
+        # A race holds addresses, so it cannot be pickled; its controls determine it.
         return {"settings": self._settings, "drive": self._drive}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -275,7 +275,7 @@ class Fleet:
 
     def begin(self, index: int, controls: Controls, ticks: int) -> None:
         """
-        Begin a step of one of them, and return at once. It must not be used until it is waited for.
+        Begin a step of one world and return at once. Call :meth:`wait` before using that world.
 
         :param index: of the backend
         :param controls: as of ``step``
@@ -287,7 +287,7 @@ class Fleet:
 
     def wait(self, index: int) -> CarState:
         """
-        Drive until the step of one of them is done.
+        Drive until the step of one world is done.
 
         :param index: of the backend
         :return: as of ``step``
@@ -304,7 +304,7 @@ class Fleet:
 @lru_cache
 def check_layout(game: Game) -> str:
     """
-    Hold the installed game to what the engine expects, with a car standing on a track.
+    Check that the installed game has the structures that the engine expects.
 
     :param game: the installation
     :return: what was compared

@@ -46,8 +46,8 @@ class ScrBackend:
     """
     One agent in the stock game with our driver module, or on any SCR server.
 
-    The server's sensors have six digits. What it does not say is worked out: the place by the
-    track, the yaw rate by what was turned during a step, laps and times by its lap clock. The best
+    The server's sensors have six digits. Values that it does not send are computed: the position by
+    the track, the yaw rate by the turn during a step, laps and times by the lap clock. The best
     lap time is that of any whole lap, also with a cut corner or a touched wall.
 
     :param track: ``"aalborg"``, ``"road/aalborg"``, or the path of a TORCS XML file; that of the
@@ -96,14 +96,16 @@ class ScrBackend:
         self.track: Track = load_track(find_track(track, game).path)
         entries = starting_list(game, opponents, grid_place)
         if self._own:
-            compiled_library("_scr_server")  # what is not built is told now, not at a reset
+            compiled_library(
+                "_scr_server"
+            )  # reports libraries that are not built now, not at a reset
         if not self._own and (len(entries) > 1 or grid_place is not None):
             raise InvalidOption(
                 f"opponents and grid_place are those of the race at {host}; name them there, e.g. "
                 "`sb3-torcs serve --robots inferno`, or leave out host"
             )
         if self._own and port is not None:
-            raise InvalidOption(f"port is {port!r}, of no host; add host='localhost'")
+            raise InvalidOption(f"port is {port!r}, but there is no host; add host='localhost'")
         if not is_count(self._address[1]) or self._address[1] > MAX_PORT:
             raise InvalidOption(f"port is {port!r}; expected 1 to {MAX_PORT}")
         self._race = RaceSetup(
@@ -117,7 +119,7 @@ class ScrBackend:
         self._client: ScrClient | Rehearsal | None = None
         self._stand_in: Rehearsal | None = None
         self._reader = CarReader(self.track)
-        self._lost_before = 0  # of a client that has hung up
+        self._lost_before = 0  # of a client that has left
         self.driver_name = ""
         """What our own server shows and writes down; empty for the address."""
         self.latencies = array("d")
@@ -129,7 +131,7 @@ class ScrBackend:
 
     def reset(self, rng: np.random.Generator, start: Start | None) -> CarState:
         """Begin an episode; see :class:`~sb3_torcs.backends.base.Backend`."""
-        del rng  # there is no chance in the game
+        del rng  # the game is deterministic
         if start is not None and not self._own:
             raise InvalidOption(
                 "a race at a host of its own begins on the grid; use start='grid' and no options "
@@ -152,7 +154,7 @@ class ScrBackend:
         self._check_owner()
         client = self._client
         if client is None:
-            raise ServerLost("the game is not there; call reset, which begins anew")
+            raise ServerLost("the game has ended; call reset, which starts it again")
         self._drive.append((controls, ticks))
         try:
             driven = self._hold(client, controls, ticks)
@@ -171,12 +173,12 @@ class ScrBackend:
 
     @property
     def over(self) -> bool:
-        """Whether the race has ended, or has not begun; a car in it stands then."""
+        """Whether the race has ended or has not begun; its cars stand still then."""
         return self._client is None or self._client.over
 
     @property
     def restarted(self) -> bool:
-        """Whether the race has ended to begin anew, with whoever is back by then."""
+        """Whether the race ended because another client restarts it."""
         return self._client is not None and self._client.restarted
 
     @property
@@ -187,8 +189,8 @@ class ScrBackend:
     @contextmanager
     def rehearsal(self) -> Iterator[None]:
         """
-        Drive against a stand-in for the server, so that nothing is done for the first time in a
-        race that does not wait: compiled code, for one, is loaded by its first call.
+        Drive against a stand-in for the server. In a race that does not wait, first calls would be
+        too slow, e.g. because they load compiled code.
         """
         self._stand_in = Rehearsal()
         try:
@@ -208,7 +210,7 @@ class ScrBackend:
                 f"a race at {self._settings['host']} cannot be driven twice; make another "
                 "environment, with another port"
             )
-        # A game of our own is deterministic, so that what was done says all.
+        # A game of our own is deterministic, so its controls determine it.
         return {"settings": self._settings, "drive": self._drive}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -221,14 +223,14 @@ class ScrBackend:
             self.step(controls, ticks)
 
     def _rehearse(self) -> None:
-        """Do what an environment does with this world."""
+        """Call everything that an environment calls."""
         with self.rehearsal():
             encode(self.reset(np.random.default_rng(), None))
             encode(self.step(controls_from_action(np.zeros(3, np.float32)), 5))
 
     def _connect(self, start: Start | None) -> None:
         """
-        Bring the race to where it begins: by a restart where there is one, else by a new game.
+        Begin the race: by a restart if a game runs, else with a new game.
 
         :param start: as of ``reset``
         """
@@ -273,7 +275,7 @@ class ScrBackend:
             raise GameFailed(f"{self._process.epitaph()}; call reset to begin anew")
 
     def _failure(self, error: ServerLost) -> Exception:
-        """Say what has happened to a server that is lost."""
+        """Make the error of a lost server."""
         if self._process is None:
             return error
         with suppress(GameTimeout, GameFailed):
@@ -282,14 +284,14 @@ class ScrBackend:
 
     def _first_state(self, start: Start | None) -> bytes:
         """
-        Wait on the brake until the race begins.
+        Brake until the race begins.
 
         :param start: as of ``reset``; there is no countdown but on the grid
         """
         client = self._client
         assert client is not None, "_connect makes it"
         while (message := client.receive()) is not None or client.restarted:
-            if message is None:  # another client has the race begin anew
+            if message is None:  # another client restarts the race
                 client.identify(start)
                 continue
             lap_time = parse_motor(message).lap_time
@@ -336,7 +338,7 @@ class ScrBackend:
             self._process = None
 
     def _check_owner(self) -> None:
-        """Raise in a child process, which would talk in between."""
+        """Raise in a child process, whose messages would disturb the parent's."""
         if os.getpid() != self._owner:
             raise EngineForked(
                 "this game belongs to the parent process; make the environment after the fork"

@@ -1,4 +1,4 @@
-"""Several worlds that take turns, one episode each: an agent that shall drive anywhere."""
+"""Several worlds that take turns, one episode each, for agents that learn many tracks."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["SeveralTracks", "is_several"]
 
 def is_several(track: Any) -> TypeGuard[Sequence[Any]]:
     """
-    Tell several tracks from one.
+    Check whether several tracks are given.
 
     :param track: what was given
     :raises InvalidOption: if it is an empty list
@@ -62,6 +62,6 @@ class SeveralTracks:
         return self._world.step(controls, ticks)
 
     def close(self) -> None:
-        """Give all worlds back."""
+        """Close all worlds."""
         for world in self._worlds:
             world.close()

@@ -1,4 +1,4 @@
-"""How fast things are: each figure in processor time, on one core, the compared ones in turns."""
+"""Speed of environments, in processor time on one core; compared ones are measured in turns."""
 
 from __future__ import annotations
 
@@ -47,10 +47,10 @@ def environments(seconds: float) -> Figures:
 
 def _drive(env: gym.Env[Any, Any], actions: list[Any]) -> float:
     """
-    Do actions from a reset on, and begin again where an episode ends.
+    Do actions after a reset, and reset again when an episode ends.
 
-    ``gymnasium.utils.performance`` does random actions, by the wall clock and with the resets: on a
-    busy machine, and with a car that leaves the road at once, it measures something else.
+    ``gymnasium.utils.performance`` does random actions, and measures the wall clock with resets,
+    which is something else on a busy machine, and with a car that leaves the road at once.
 
     :param env: any environment
     :param actions: to do

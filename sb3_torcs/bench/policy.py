@@ -1,4 +1,4 @@
-"""How many updates per second the policy makes, beside the plain form of the same networks."""
+"""Updates per second of the policy, compared with plain networks of the same form."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ TRANSITIONS = 2000
 
 class PlainHeads(nn.Module):
     """
-    The actor's network as one would write it first.
+    The actor's network, written plainly.
 
     :param features_dim: size of the input
     :param kwargs: as in :class:`~sb3_torcs.policies.networks.SplitHeads`, two hidden layers
@@ -55,7 +55,7 @@ class PlainHeads(nn.Module):
 
     def forward(self, features: th.Tensor) -> th.Tensor:
         """
-        Decide.
+        Compute actions.
 
         :param features: (batch, features_dim)
         :return: (batch, actuators) in [-1, 1]
@@ -65,7 +65,7 @@ class PlainHeads(nn.Module):
 
 class PlainQ(nn.Module):
     """
-    A value function as one would write it first.
+    A value function, written plainly.
 
     :param features_dim: size of the state's features
     :param action_dim: number of actuators
@@ -83,7 +83,7 @@ class PlainQ(nn.Module):
 
     def forward(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """
-        Value the actions.
+        Compute the values of actions.
 
         :param features: (batch, features_dim)
         :param actions: (batch, action_dim) in [-1, 1]
@@ -135,7 +135,7 @@ class PlainCritic(ContinuousCritic):
 
 class PlainSplitHeadPolicy(SplitHeadPolicy):
     """
-    The same networks without any of the shortcuts: what the fast ones must equal.
+    The same networks without optimizations, which the fast ones have to equal.
 
     :param args: as in ``SplitHeadPolicy``
     :param kwargs: as in ``SplitHeadPolicy``; the optimizer stays as PyTorch makes it
@@ -223,7 +223,7 @@ def measure(batch_size: int = 64, seconds: float = 10.0) -> dict[str, float | No
     :param batch_size: transitions per update
     :param seconds: [s] processor time to spend in all, at least
     :return: ``policy_updates_per_s``, ``policy_plain_updates_per_s`` and
-        ``policy_fast_updates_per_s`` (``fast_matmul=True``; ``None`` where its probe says no)
+        ``policy_fast_updates_per_s`` (``fast_matmul=True``; ``None`` where it is not supported)
     """
     threads = th.get_num_threads()
     th.set_num_threads(1)

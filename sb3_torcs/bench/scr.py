@@ -1,6 +1,6 @@
-"""How fast the game is in a process of its own: behind the SCR protocol, and drawing pictures.
+"""Speed of the game in a process of its own: over the SCR protocol, and of its pictures.
 
-By the wall clock, since two processes take turns.
+Measured by the wall clock, since two processes take turns.
 """
 
 from __future__ import annotations

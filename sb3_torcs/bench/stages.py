@@ -63,7 +63,7 @@ def stages(seconds: float) -> dict[str, Callable[[], Figures]]:
 
 
 def _where_it_is(measure: Callable[[], Figures]) -> Callable[[], Figures]:
-    """Leave figures of the game empty where it cannot be driven."""
+    """Return ``None`` for figures of the game where it cannot be driven."""
 
     def measured() -> Figures:
         try:

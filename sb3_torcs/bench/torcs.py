@@ -1,4 +1,4 @@
-"""How fast the real game is in this process: against its bare physics, and on two threads."""
+"""Speed of the real game in this process, compared with its bare physics, and on two threads."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def _limit(engine: Any, controls: FloatArray) -> float:
     for first in range(0, len(controls), STRETCH):
         engine.replay(controls[first : first + STRETCH], False)
         place = engine.save()
-        engine.update_physics(PHYSICS_STEPS)  # so that what is timed finds its memory at hand
+        engine.update_physics(PHYSICS_STEPS)  # fills the processor's caches before the measurement
         begin = time.process_time()
         engine.update_physics(PHYSICS_STEPS * (HELD - 1))
         spent += time.process_time() - begin
@@ -136,7 +136,7 @@ def loads() -> Figures:
 
     :return: ``torcs_load_ms``
     """
-    others = [gym.make(TORCS)]  # what follows finds no closed race to take over
+    others = [gym.make(TORCS)]  # so that the next race cannot reuse a closed one
     spent = []
     for _ in range(LOADS):
         begin = time.process_time()

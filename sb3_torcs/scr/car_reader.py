@@ -1,4 +1,4 @@
-"""From what an SCR server tells to what a car knows: places, laps and times."""
+"""Turn the states of an SCR server into states of the car: position, laps and times."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sb3_torcs.tracks.track import WIDTH_END, WIDTH_START, Track
 
 __all__ = ["CarReader"]
 
-MARGIN = 1.0  # [m] by which a track's length, added up in another way, may differ
+MARGIN = 1.0  # [m] tolerance between two sums of a track's length
 
 
 class CarReader:
@@ -32,7 +32,7 @@ class CarReader:
 
         :param state: the server's
         :return: the car
-        :raises InvalidOption: if the car is where the track is not
+        :raises InvalidOption: if the car is not on the track
         """
         self._before = state
         self._time = state.lap_time
@@ -41,8 +41,8 @@ class CarReader:
         self._tick = CONTROL_TICK
         self._yaw: float | None = None
         self._raced = state.distance_raced
-        # The way since the start has six digits of an ever larger number. The place on the lap is
-        # finer; so the other one only says how many laps have to be added to it.
+        # The distance since the start grows but has six digits. The distance on the lap is more
+        # precise, so the first only gives the number of laps to add.
         self._lap_began = state.distance_raced - state.distance_from_start
         return self._car(state, 0.0)
 
@@ -108,7 +108,7 @@ class CarReader:
 
 
 def _read_only(numbers: tuple[float, ...]) -> FloatArray:
-    """Make an array that nobody can change."""
+    """Make an array read-only."""
     array = np.array(numbers)
     array.flags.writeable = False
     return array

@@ -1,8 +1,8 @@
-"""One driver's conversation with an SCR server, over UDP.
+"""The connection of one driver to an SCR server, over UDP.
 
-Datagrams get lost, doubled and late. A state that comes twice is taken once; of several that wait,
-the newest is taken; and when nothing comes for a while, the last word is said again, which our own
-server recognises (see :attr:`sb3_torcs.scr.protocol.ScrAction.lap_time`).
+Datagrams may be lost, doubled or late. A state that arrives twice is taken once; of several states
+in the queue, the newest is taken; if nothing arrives for a while, the last message is sent again,
+which our own server recognises (see :attr:`sb3_torcs.scr.protocol.ScrAction.lap_time`).
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ from sb3_torcs.scr.protocol import (
 __all__ = ["ScrClient"]
 
 LONGEST = 65535  # [bytes] of a datagram; some servers send pictures
-LOOKS = 50  # for an answer before this process sleeps: some 100 microseconds
+LOOKS = 50  # polls for an answer before this process sleeps: some 100 microseconds
 # A wait begins by polling. Polls that find an answer add 1 to a score of at most FULL_LUCK, others
 # take 2 off; when it is used up, the next -NO_LUCK waits sleep at once.
 FULL_LUCK = 8
 NO_LUCK = -200
-FIRST_PAUSE = 1.0  # [s] before the first message is said again; servers take their time to load
-PAUSE = 1.0  # [s] before an action is said again
-LONGEST_PAUSE = 5.0  # [s] until it is noticed that a port was closed
-PATIENCE = 10.0  # [s] without a word after which a server is given up
+FIRST_PAUSE = 1.0  # [s] before the first message is sent again; servers load for a while
+PAUSE = 1.0  # [s] before an action is sent again
+LONGEST_PAUSE = 5.0  # [s] until a closed port is noticed
+PATIENCE = 10.0  # [s] without a datagram after which a server counts as lost
 
 
 class ScrClient:
@@ -93,7 +93,7 @@ class ScrClient:
         self._patience = patience
         self._pause = pause
         self._watch = watch
-        self._said = b""  # the last word, to be said again
+        self._said = b""  # the last message, to be sent again
         self._taken = b""  # the last state
         self._buffer = memoryview(bytearray(LONGEST))
         self._timeout = 0.0
@@ -101,19 +101,19 @@ class ScrClient:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._end = weakref.finalize(self, self._socket.close)
         try:
-            # A connected socket hears no others, and hears of a port that is closed.
+            # A connected socket receives from this server only, and reports a closed port.
             self._socket.connect((host, port))
         except (OSError, OverflowError) as error:
             self.close()
             raise ServerNotFound(
-                f"there is no way to {self.address} ({error}); check --host and --port"
+                f"{self.address} cannot be reached ({error}); check --host and --port"
             ) from error
         here = self._socket.getpeername()[0].startswith("127.")
         self._silence = patience if silence is None else math.inf if here else silence
 
     def identify(self, start: Start | None = None) -> None:
         """
-        Introduce the driver, and wait until the server has taken it in.
+        Identify the driver, and wait for the server's answer.
 
         :param start: where to begin, if not on the grid; only our own server does that
         :raises ServerNotFound: if nothing answers in time
@@ -130,7 +130,7 @@ class ScrClient:
 
     def send(self, message: bytes) -> None:
         """
-        Send an action. It is said again when nothing follows.
+        Send an action. It is sent again if no state follows.
 
         :param message: a datagram
         :raises ServerLost: if the server has ended
@@ -148,8 +148,8 @@ class ScrClient:
         """
         Wait for the next state.
 
-        :return: a datagram; ``None`` when the server has ended the race, or begins it anew
-        :raises ServerLost: if the server has ended, or says nothing any more
+        :return: a datagram; ``None`` when the server has ended the race, or restarts it
+        :raises ServerLost: if the server has ended, or does not answer any more
         """
         if self.over:
             return None
@@ -175,37 +175,37 @@ class ScrClient:
 
     def restart(self, start: Start | None = None) -> None:
         """
-        Have the race begin anew.
+        Restart the race.
 
         :param start: as of :meth:`identify`
-        :raises ServerLost: if the server does not do that in time
-        :raises ServerNotFound: if it does, and is gone then
+        :raises ServerLost: if the server does not restart in time
+        :raises ServerNotFound: if it ends at the restart
         """
         if not self._ask(format_action(ScrAction(restart=True)), RESTART, self._pause):
-            raise self._lost("it does not begin the race anew")
+            raise self._lost("it does not restart the race")
         self.identify(start)
 
     def close(self) -> None:
-        """Close the connection. Calling it twice does no harm."""
+        """Close the connection. A second call does nothing."""
         self.over = True
         self._end()
 
     def _ask(self, question: bytes, answer: bytes, pause: float) -> bool:
         """
-        Say something until there is an answer; whatever else comes is passed over.
+        Send a message until it is answered; other datagrams are ignored.
 
         :param question: a datagram
-        :param answer: with which another one begins
-        :param pause: before it is said again [s]
-        :return: whether it came before the end of patience
+        :param answer: the beginning of the answer
+        :param pause: before the message is sent again [s]
+        :return: whether the answer came in time
         """
         self._said = question
         now = again = perf_counter()
         until = now + self._patience
         while now < until:
             message = None
-            with suppress(OSError):  # it tells of an earlier datagram: the server may be back
-                # By the clock: in real time states come all along, whether it was heard or not.
+            with suppress(OSError):  # the error is of an earlier datagram: the server may be back
+                # By the clock, because states arrive in real time in any case.
                 if now >= again:
                     again = now + pause
                     self._socket.send(question)
@@ -227,7 +227,7 @@ class ScrClient:
         if pause != self._timeout:
             seconds = max(int(pause * 1e6), 1)
             times = struct.pack("ll", seconds // 1_000_000, seconds % 1_000_000)
-            # In Python's own time-out there is one more call of the system for each datagram.
+            # Python's own time-out takes one more system call for each datagram.
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, times)
             self._timeout = pause
         message = self._look()
@@ -239,9 +239,9 @@ class ScrClient:
 
     def _look(self) -> bytes | None:
         """
-        Look for a datagram for a little while: to be woken takes longer than a tick of the game.
+        Poll for a datagram for a short time, since waking up takes longer than a tick of the game.
 
-        Not where that is in vain, as with more processes than processors.
+        Polling stops where it seldom succeeds, as with more processes than processors.
         """
         if self._luck < 0:
             self._luck += 1
@@ -261,16 +261,16 @@ class ScrClient:
         return self._buffer[:size].tobytes()
 
     def _drain(self) -> list[bytes]:
-        """Take all that waits."""
+        """Take all datagrams in the queue."""
         messages = []
         try:
             while True:
                 messages.append(self._take(socket.MSG_DONTWAIT))
-        except OSError:  # nothing is left, or an error that the next call will meet again
+        except OSError:  # the queue is empty, or the next call raises the same error
             return messages
 
     def _is_late(self) -> bool:
-        """Say whether a newer state waits than the one that is answered now."""
+        """Check whether a newer state is in the queue than the one that is answered now."""
         with suppress(OSError):
             following = self._take(socket.MSG_DONTWAIT | socket.MSG_PEEK)
             return following != self._taken and not following.startswith(b"***")
@@ -278,7 +278,7 @@ class ScrClient:
 
     def _newest(self, message: bytes) -> bytes | None:
         """
-        Choose the newest state of those that wait.
+        Take the newest state of those in the queue.
 
         :param message: that came first
         :return: ``None`` if there is none

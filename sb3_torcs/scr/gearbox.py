@@ -1,4 +1,4 @@
-"""The gearboxes for those who drive from outside: the rules of the engine, in Python."""
+"""The gearboxes of clients: the same rules as in the engine, in Python."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from sb3_torcs.torcs.params import Node
 
 __all__ = ["Gearbox", "read_gearbox"]
 
-GEARS = ("1", "2", "3", "4", "5", "6", "7", "8")  # what the game calls them
+GEARS = ("1", "2", "3", "4", "5", "6", "7", "8")  # the game's names
 DIFFERENTIALS = {"FWD": "Front Differential", "4WD": "Central Differential"}
 REAR_DIFFERENTIAL = "Rear Differential"
 
 
 class Gearbox(NamedTuple):
-    """When to shift."""
+    """The gears of a car, and when to shift."""
 
     ratios: FloatArray  # (gears,) [-] of the first gear and up
     shift_up: float  # [rad/s] above which
@@ -79,7 +79,7 @@ def read_gearbox(path: Path, gearbox: str = "automatic") -> Gearbox:
 
 def _rolling(car: Node, path: Path) -> float:
     """
-    Work out how far a motor turns on the way, by a gear of ratio 1: as the game does.
+    Compute the motor's angle per metre in a gear of ratio 1, as the game does.
 
     :param car: the file
     :param path: where it is; its category is beside the cars

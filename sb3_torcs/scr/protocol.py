@@ -1,6 +1,6 @@
-"""The texts of the SCR protocol: what is said over UDP between the game and those who drive in it.
+"""The messages of the SCR protocol between the game and its clients, without sockets.
 
-Bytes in, records out, and back; nothing here knows of sockets. The records are in SI units: the
+Functions turn bytes into records and back. The records are in SI units: the
 protocol's km/h, degrees and "rpm", which are ten times rad/s, stay in this file. After the manual
 of the Simulated Car Racing championship (arXiv:1304.1672) and the messages of its server.
 
@@ -46,18 +46,18 @@ RESTART = b"***restart***"
 SHUTDOWN = b"***shutdown***"
 """The server's last word: the race is over."""
 
-NO_FOCUS = 360.0  # [degrees] a direction that no server looks in
-CLIENT = b"SCR"  # how the first message of a client begins; servers look at no more of it
+NO_FOCUS = 360.0  # [degrees] outside the range of any server
+CLIENT = b"SCR"  # beginning of a client's first message; servers check no more of it
 KMH = 3.6  # km/h per m/s
 RPM = 10.0  # the server's "rpm" per rad/s
 DIGITS = 6  # of the server's numbers
-EXACT_DIGITS = 17  # that tell one double from every other
+EXACT_DIGITS = 17  # that identify a double
 HIGHEST_GEAR = 8  # the game has room for no more
 LONGEST_NAME = 31  # [characters] of a driver, in the game
 
 
 class ScrState(NamedTuple):
-    """What a driver senses; the fields are in the order of the server's message."""
+    """The sensors of a driver, in the order of the server's message."""
 
     heading_error: float = 0.0  # [rad] road direction minus yaw
     lap_time: float = 0.0  # [s] in the current lap; negative during the countdown
@@ -81,7 +81,7 @@ class ScrState(NamedTuple):
 
 
 class ScrAction(NamedTuple):
-    """What a driver wants."""
+    """The action of a driver."""
 
     steering: float = 0.0  # [-] in [-1, 1], left positive
     throttle: float = 0.0  # [-] in [0, 1]
@@ -89,12 +89,12 @@ class ScrAction(NamedTuple):
     gear: int = 1  # [-] -1 reverse, 0 neutral, up to 8
     clutch: float = 0.0  # [-] in [0, 1], 1 is pressed
     focus: float | None = 0.0  # [rad] where to look, left negative; None for nowhere
-    restart: bool = False  # whether the race shall begin anew
+    restart: bool = False  # whether to restart the race
     lap_time: float | None = None  # [s] of the state that it answers; servers but ours ignore it
 
 
 class ScrInit(NamedTuple):
-    """How a client introduces itself."""
+    """The first message of a client."""
 
     angles: tuple[float, ...]  # (19,) [rad] of the range finders, left negative
     start: Start | None = None  # where to begin; servers but ours ignore it
@@ -103,7 +103,7 @@ class ScrInit(NamedTuple):
 
 
 class MotorReading(NamedTuple):
-    """What a gearbox needs of a state."""
+    """The part of a state that a gearbox needs."""
 
     lap_time: float  # [s]
     gear: int
@@ -143,7 +143,7 @@ _TAGS = (
 )
 _BY_NAME = {tag.name: (place, tag) for place, tag in enumerate(_TAGS)}
 
-# Where the words stand in a message that is in the server's order, which needs no search.
+# Positions of the words in a message in the server's order, so that no search is needed.
 _BEGINS = [sum(1 + tag.size for tag in _TAGS[:place]) for place in range(len(_TAGS) + 1)]
 _WORDS = _BEGINS.pop()
 _NAMES: tuple[bytes, ...] = tuple(b"(" + tag.name for tag in _TAGS)
@@ -161,12 +161,12 @@ _ENGINE = (b"(curLapTime ", b"(gear ", b"(rpm ", b"(speedX ")
 
 def parse_state(message: bytes) -> ScrState:
     """
-    Read what the server says of the car.
+    Read a state of the server.
 
     :param message: a datagram
     :return: the state
-    :raises MessageBroken: if it is none: no row of tags, a tag with too few or too many numbers or
-        twice, or something that is no finite number
+    :raises MessageBroken: if it is not a row of tags, if a tag has the wrong number of values or
+        comes twice, or if a value is not a finite number
     """
     text = message.partition(b"\0")[0]
     ordered = _parse_ordered(text)
@@ -182,14 +182,14 @@ def parse_state(message: bytes) -> ScrState:
 
 def parse_motor(message: bytes) -> MotorReading:
     """
-    Read only what a gearbox needs: for the states between two timesteps.
+    Read only the values that a gearbox needs, for the states between two timesteps.
 
     :param message: as of :func:`parse_state`
     :return: a part of the state
     :raises MessageBroken: if one of these numbers is none
     """
     end = message.find(b"\0")
-    with suppress(ValueError):  # which is told by the other way
+    with suppress(ValueError):  # the general way gives the precise error
         words = []
         for opening in _ENGINE:
             begin = message.index(opening, 0, end) + len(opening)
@@ -226,7 +226,7 @@ def format_init(
     name: str = "",
 ) -> bytes:
     """
-    Write the message by which a client introduces itself.
+    Write the first message of a client.
 
     :param angles: (19,) of the range finders [rad], left negative
     :param start: where to begin, if not on the grid; only our own server does that
@@ -243,7 +243,7 @@ def format_init(
 
 def plain_name(name: str) -> str:
     """
-    Write a driver's name with what the game can draw.
+    Write a driver's name with characters that the game can draw.
 
     :param name: any text
     :return: at most 31 letters, digits, spaces and ``-_.:+@``; others become ``_``
@@ -253,10 +253,10 @@ def plain_name(name: str) -> str:
 
 def parse_init(message: bytes) -> ScrInit:
     """
-    Read how a client introduces itself.
+    Read the first message of a client.
 
     :param message: a datagram
-    :return: its wishes; without angles those of the championship, every 10 degrees
+    :return: its options; the default angles are those of the championship, every 10 degrees
     :raises MessageBroken: if it is none, or has numbers that are none
     """
     if not message.startswith(CLIENT):
@@ -278,7 +278,7 @@ def parse_init(message: bytes) -> ScrInit:
 
 def format_action(action: ScrAction) -> bytes:
     """
-    Write what a driver wants, with all digits: the server gets the very numbers.
+    Write an action with all digits, so that the server gets the same numbers.
 
     :param action: finite numbers
     :return: a datagram
@@ -297,7 +297,7 @@ def format_action(action: ScrAction) -> bytes:
 
 def parse_action(message: bytes) -> ScrAction:
     """
-    Read what a driver wants; numbers out of range are clipped.
+    Read an action; numbers out of range are clipped.
 
     Of several numbers in a tag the first one counts, since some clients ask for ``focus`` with a
     list.
@@ -330,10 +330,10 @@ def parse_action(message: bytes) -> ScrAction:
 
 def _parse_ordered(text: bytes) -> ScrState | None:
     """
-    Read a state that is written as the server does, in a fifth of the time that others take.
+    Read a state in the server's own format, in a fifth of the time of the general way.
 
     :param text: without what follows a zero byte
-    :return: the state; ``None`` if it is written otherwise, or broken
+    :return: the state; ``None`` if the format differs, or the message is broken
     """
     words = text[:-1].replace(b")(", b" (").split(b" ")
     if len(words) != _WORDS or _pick_names(words) != _NAMES or b"_" in text:
@@ -358,7 +358,7 @@ def _parse_ordered(text: bytes) -> ScrState | None:
 
 def _groups(text: bytes) -> Iterator[tuple[bytes, list[bytes]]]:
     """
-    Take a message apart.
+    Split a message into tags.
 
     :param text: without what follows a zero byte
     :return: tags, each with its words

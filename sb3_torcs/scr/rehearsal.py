@@ -1,4 +1,4 @@
-"""A stand-in for an SCR server: what a program does slowly the first time is done before a race."""
+"""A stand-in for an SCR server, to warm up a client before a race."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ HALF_TICK = 0.5 * CONTROL_TICK  # [s] the clock of the game is not at 0 when a r
 
 class Rehearsal:
     """
-    In place of an :class:`~sb3_torcs.scr.client.ScrClient`: no network, and a short race in which
-    the same comes back whatever is sent.
+    Replaces an :class:`~sb3_torcs.scr.client.ScrClient` without a network: a short race whose
+    states do not depend on the actions.
     """
 
     address = "nowhere"
@@ -34,7 +34,7 @@ class Rehearsal:
         """
         Begin the race.
 
-        :param start: is passed over
+        :param start: is ignored
         """
         del start
         self._tick = -COUNTDOWN
@@ -43,7 +43,7 @@ class Rehearsal:
         """
         Let the race go on by a tick.
 
-        :param message: is passed over
+        :param message: is ignored
         """
         del message
         self._tick += 1
@@ -63,4 +63,4 @@ class Rehearsal:
         return format_state(state)
 
     def close(self) -> None:
-        """Nothing has to be given back."""
+        """Do nothing."""

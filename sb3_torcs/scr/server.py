@@ -1,7 +1,7 @@
 """The installed game as an SCR server: our driver module in it, on ports that were bound before.
 
-Ports that are taken are told before the game starts; and since the game inherits the sockets, a
-private game can have any free port without a race for it.
+Ports that are taken are reported before the game starts. The game inherits the sockets, so that a
+private game can use any free port.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def open_ports(
     :param port: of the first driver; the others follow. ``None`` takes any that are free
     :param host: the address to listen at
     :return: the sockets; the caller closes them
-    :raises PortTaken: if one cannot be had; none is kept then
+    :raises PortTaken: if one cannot be bound; then all are closed
     """
     sockets: list[socket.socket] = []
     for number in range(drivers):
@@ -77,7 +77,7 @@ def start_server(
     :param deadline: for an answer [s]; ``None`` waits for it, however long it takes
     :param options: of :data:`SCR_OPTIONS`
     :param window: in which the race is shown or recorded; ``None`` runs it without one
-    :return: the game; its clients are awaited now
+    :return: the game, which waits for its clients
     """
     numbers = [bound.fileno() for bound in sockets]
     arguments = WindowArguments(environment={}, descriptors=[], preload=None, files={})

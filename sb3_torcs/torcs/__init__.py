@@ -1,1 +1,1 @@
-"""The installed game: where it is, what it reads and writes, and a process of it."""
+"""The installed game: its folders, its files, and its process."""

@@ -1,4 +1,4 @@
-"""How the engine is built anew, here: what messages about a missing one tell people to type."""
+"""The command that builds the engine, for messages about a missing one."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ ANYWHERE = "."
 
 def build_command() -> str:
     """
-    Say how to build the engine, from the place that the package was installed from.
+    Compose the command that builds the engine from the folder that the package was installed from.
 
     :return: a command line, and what it needs
     """
@@ -29,7 +29,7 @@ def build_command() -> str:
 
 
 def _source() -> tuple[str, bool]:
-    """Find out what the package was installed from, by pip's own record, and whether editable."""
+    """Read from pip's record which folder the package was installed from, and whether editable."""
     try:
         record = json.loads(metadata.distribution("sb3-torcs").read_text("direct_url.json") or "{}")
     except (metadata.PackageNotFoundError, OSError, ValueError):

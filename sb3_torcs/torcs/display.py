@@ -1,4 +1,4 @@
-"""Where the game's window can be: the user's display, or a virtual one that nobody sees."""
+"""Displays for the game's window: the user's, or a virtual one."""
 
 from __future__ import annotations
 
@@ -50,10 +50,9 @@ def find_display(otherwise: str) -> str:
 
 class VirtualDisplay:
     """
-    A display in memory, for a window that nobody needs to see.
+    A virtual display, for a window that is not shown.
 
-    It is gone when it is closed, and also when this process is killed: then nobody is connected to
-    it any more.
+    It ends when it is closed, and also when this process is killed, since it has no client then.
 
     :param size: width and height [pixels]
     :raises DisplayUnavailable: if there is no program for that, or it does not run
@@ -63,8 +62,7 @@ class VirtualDisplay:
         program = shutil.which(PROGRAM)
         if program is None:
             raise DisplayUnavailable(
-                f"there is no {PROGRAM}, the program for a display that nobody sees; "
-                f"type: {INSTALL}"
+                f"there is no {PROGRAM}, the program for a virtual display; type: {INSTALL}"
             )
         with tempfile.TemporaryFile() as words:
             process, number = _start(program, size, words)
@@ -87,7 +85,7 @@ class VirtualDisplay:
         self.close()
 
     def close(self) -> None:
-        """End the display. Calling it twice does no harm."""
+        """End the display. A second call does nothing."""
         self._end()
 
 
@@ -162,9 +160,9 @@ def _connect(name: str) -> socket.socket:
         except OSError:  # not every server listens there
             client.connect(path)
         client.sendall(GREETING)
-        # Any answer tells of a server. One that wants a password gives it to the game, not to us.
+        # Any answer shows that a server is there; the game knows its password, if it needs one.
         if not client.recv(1):
-            raise ConnectionError("it hung up")
+            raise ConnectionError("it closed the connection")
     except BaseException:
         client.close()
         raise
@@ -175,7 +173,7 @@ def _end(
     process: subprocess.Popen[bytes], client: socket.socket | None, name: str, owner: int
 ) -> None:
     """
-    End a server, and what it would leave.
+    End a server, and remove its files.
 
     :param process: of the server
     :param client: our connection to it

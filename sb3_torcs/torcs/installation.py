@@ -1,6 +1,6 @@
-"""The installed game: where it is, what it holds, and what is missing of it.
+"""Find the installed game, list its contents, and report missing parts.
 
-There is one search for all who need a file of TORCS. Nothing is loaded or run here.
+All searches for files of TORCS are here. Nothing is loaded or run.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ LIBRARY_FOLDERS = ("lib/*/torcs", "lib/torcs", "lib64/torcs")  # Debian, source 
 SYSTEM_LIBRARIES = ("/lib", "/usr/lib", "/lib64", "/usr/lib64", "/usr/local/lib")
 LINKER_CACHE = Path("/etc/ld.so.cache")
 
-MODULES = (  # what a race without a window needs, in the folder of libraries
+MODULES = (  # needed by a race without a window, in the folder of libraries
     "lib/libtxml.so",
     "lib/libtgf.so",
     "lib/librobottools.so",
@@ -120,7 +120,7 @@ class Game:
 
     def robot_module(self, name: str) -> Path:
         """
-        Say where the library of a robot has to be.
+        Return the path of a robot's library.
 
         :param name: of the robot
         :return: the path; nothing is checked
@@ -171,7 +171,7 @@ class Game:
         :param index: of the driver
         :return: the driver
         :raises UnknownRobot: if there is none of this name, or none with this index
-        :raises UnknownCar: if the game has not the car that it drives
+        :raises UnknownCar: if the game does not have the robot's car
         """
         robots = self.robots()
         if name not in robots:
@@ -208,13 +208,13 @@ def find_game(home: Path | None = None) -> Game:
     """
     Find a complete installation.
 
-    The first complete one of: ``home`` or else what ``SB3_TORCS_HOME`` names, and nothing but
-    that if either is given; ``/usr``; ``/usr/local``; the user's own folder.
+    If ``home`` or ``SB3_TORCS_HOME`` is given, only that folder is looked at. Otherwise the first
+    complete one of ``/usr``, ``/usr/local`` and the user's own folder is taken.
 
     :param home: a root, such as an unpacked package or ``/usr``, or the folder of data itself
     :return: the installation
-    :raises GameNotFound: if there is nothing
-    :raises GameIncomplete: if there is only a part of it; names all that is missing
+    :raises GameNotFound: if there is none
+    :raises GameIncomplete: if it is incomplete; the message names all missing parts
     """
     lacking = []
     for candidate in _candidates(home):
@@ -235,7 +235,7 @@ def torcs_folders() -> list[Path]:
     """
     Return the folders of TORCS data that exist, the preferred one first.
 
-    Tracks can be read without the rest of the game; that of :func:`find_game` comes first.
+    Tracks can be read without the rest of the game. The folder of :func:`find_game` comes first.
     """
     found = [candidate for candidate in _candidates(None) if candidate.data is not None]
     found.sort(key=lambda candidate: bool(_missing(candidate)))
@@ -271,7 +271,7 @@ def _remedy(home: Path | None) -> str:
 
 def _not_found(home: Path | None) -> str:
     """
-    Say that there is nothing, and what to type.
+    Make the error of a missing game, with what to type.
 
     :param home: as given by the caller
     """
@@ -287,7 +287,7 @@ def _not_found(home: Path | None) -> str:
 
 def _candidates(home: Path | None) -> Iterator[_Candidate]:
     """
-    Yield where something of TORCS is, in the order of preference.
+    Yield the folders with parts of TORCS, in the order of preference.
 
     :param home: where alone to look; ``None`` for everywhere
     """
@@ -331,10 +331,10 @@ def _libraries_beside(data: Path) -> Path | None:
 
 def _missing(candidate: _Candidate) -> list[str]:
     """
-    Look for everything that a race without a window needs.
+    List the missing parts that a race without a window needs.
 
     :param candidate: of the installation
-    :return: what is not there; files with their paths
+    :return: the missing parts; files with their paths
     """
     missing = []
     if candidate.data is None:
@@ -387,7 +387,7 @@ def linker_knows(name: str) -> bool:
 
 def _game(candidate: _Candidate) -> Game:
     """
-    Describe an installation that lacks nothing.
+    Describe a complete installation.
 
     :param candidate: of the installation
     """

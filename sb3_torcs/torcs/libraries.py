@@ -1,4 +1,4 @@
-"""Which shared libraries the game's program would not find."""
+"""Find the shared libraries that the game's program lacks."""
 
 from __future__ import annotations
 

@@ -49,15 +49,15 @@ LARGEST = 1e9  # [-] of a value in SI; the game computes in single precision
 MAX_BYTES = 4 << 20  # of a file; the largest of the game's has 205 kB
 MAX_DEPTH = 16  # of tags in tags; the game's tracks have 6
 MAX_ATTRIBUTES = 16  # of one tag; the game knows five
-MAX_NAME = 100  # letters; the game's loader cuts paths of sections at 255
+MAX_NAME = 100  # characters; the game's loader cuts paths of sections at 255
 SHARED_SURFACES = "surfaces.xml"
 UNREAD_ENTITIES = ("objects.xml",)  # trees and houses
-UNREAD_NAMES = ("default-objects",)  # what the game's tracks call them
+UNREAD_NAMES = ("default-objects",)  # the names in the game's tracks
 
 
 @dataclass
 class Section:
-    """A section of the file, with all that it holds."""
+    """A section of a file, with its contents."""
 
     place: str
     """File and line, for complaints."""
@@ -140,7 +140,7 @@ class _Parser:
         self, name: str, is_parameter: int, value: str | None, base: str | None,
         system_id: str | None, public_id: str | None, notation: str | None,
     ) -> None:  # fmt: skip
-        """Refuse entities with a text of their own: TORCS has none, and they can explode."""
+        """Refuse entities with a text of their own, which TORCS does not use and can explode."""
         del is_parameter, base, system_id, public_id, notation
         if value is not None:
             raise self._fail(f"entity '{name}' has a text of its own; only files are supported")
@@ -148,13 +148,13 @@ class _Parser:
     def _declare_attribute(
         self, tag: str, name: str, kind: str, default: str | None, required: int
     ) -> None:
-        """Refuse attributes that are given to every tag: TORCS has none, and they can explode."""
+        """Refuse default attributes: TORCS does not use them, and they can grow without limit."""
         del kind, default, required
         raise self._fail(f"declares the attribute '{name}' of <{tag}>; write it where it belongs")
 
     def _skip(self, name: str, is_parameter: bool) -> None:
         """
-        Refuse an entity that nothing has declared, unless it would not be read anyway.
+        Refuse an entity that is not declared, unless the game ignores it, too.
 
         The game passes over such entities; one of its own tracks, e-track-4, has one.
 
@@ -168,7 +168,7 @@ class _Parser:
         self, context: str, base: str | None, system_id: str | None, public_id: str | None
     ) -> int:
         """
-        Put another file in the place of an entity: only known ones, only from this machine.
+        Include another file for an entity. Only known files of this machine are included.
 
         :param context: for the parser
         :param base: unused
@@ -226,13 +226,13 @@ class _Parser:
             self._open.append(inside.children[name])
         elif tag in ("attnum", "attstr"):
             name = self._name(tag, attributes)
-            # Of two values with the same name, the game's loader finds the first.
+            # If a name has two values, the game's loader takes the first.
             if name in inside.names:
                 return
             inside.names.add(name)
             if tag == "attnum":
                 inside.numbers[name] = self._number(attributes)
-            elif text := self._attribute(tag, attributes, "val"):  # no text is as if not there
+            elif text := self._attribute(tag, attributes, "val"):  # an empty text counts as missing
                 inside.texts[name] = text
 
     def _end(self, tag: str) -> None:
@@ -243,7 +243,7 @@ class _Parser:
 
     def _name(self, tag: str, attributes: dict[str, str]) -> str:
         """
-        Read a name, by which the game's loader can find what has it.
+        Read a name, and check that the game's loader can find it.
 
         :param tag: that has it
         :param attributes: of the tag
@@ -290,7 +290,7 @@ class _Parser:
 
 def read_bounded(path: Path) -> bytes:
     """
-    Read a file that may be anything, but not endless.
+    Read a file up to a limit of size.
 
     :param path: of the file
     :return: its bytes
@@ -308,7 +308,7 @@ def read_bounded(path: Path) -> bytes:
 
 def digests(path: Path, data: Sequence[Path] = ()) -> tuple[str, ...]:
     """
-    Tell one content of a track's file from another, whatever its times say.
+    Compute digests of a track's file, which identify its content.
 
     :param path: of the file
     :param data: folders of TORCS's data, in which shared surfaces are looked for
@@ -321,7 +321,7 @@ def digests(path: Path, data: Sequence[Path] = ()) -> tuple[str, ...]:
 
 
 def _surface_files(path: Path, data: Sequence[Path]) -> list[Path]:
-    """List where the surfaces may lie that a track includes; the first one that is there counts."""
+    """List the possible paths of the surfaces that a track includes; the first one counts."""
     real = path.resolve()
     folders = [real.parent, *real.parents[3:4], *data]
     shared = [folder / "data" / "tracks" / SHARED_SURFACES for folder in folders]
@@ -390,7 +390,7 @@ class Node:
 
     @property
     def name(self) -> str:
-        """What the section is called."""
+        """The name of the section."""
         return self._element.get("name", "")
 
     def sections(self) -> Iterator[Node]:
@@ -462,12 +462,12 @@ class Node:
 
     def number(self, name: str, default: float = 0.0, real: Callable[[Any], Any] = float) -> float:
         """
-        Read a number in SI units; those that are not known count as such.
+        Read a number in SI units; unknown units count as SI.
 
         :param name: of the value
         :param default: if it is not there
         :param real: what to compute with; the game does with ``numpy.float32``
-        :raises ValueError: if it is none
+        :raises ValueError: if it is not a number
         """
         value = self._value(name)
         if value is None:
@@ -480,7 +480,7 @@ class Node:
 
     def set(self, name: str, value: str | float) -> None:
         """
-        Give a value, and forget the one before.
+        Set a value.
 
         :param name: of the value
         :param value: a text, or a number in SI units

@@ -1,7 +1,7 @@
-"""The installed game as a process of its own, in a private folder that goes with it.
+"""The installed game as a process of its own, in a private folder that is removed with it.
 
-Nothing of the user's own ``~/.torcs`` is read or changed, nothing of the installation is changed,
-and robots that learn begin anew each time.
+The user's own ``~/.torcs`` is not read or changed, and the installation is not changed. Robots that
+learn begin anew each time.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from sb3_torcs.torcs.track_names import TrackFile, find_track
 __all__ = ["GameProcess", "TrackCheck", "compiled_library", "game_environment"]
 
 PREFIX = "sb3-torcs-game-"  # of private folders
-LAST_LINES = 5  # of the game's words, for an error
+LAST_LINES = 5  # [lines] of the game's output, for an error
 OWN_TRACKS = "own"  # the category of a track that is not the game's
-GRACE = 5.0  # [s] for a killed process to be gone, or one that was asked to end
+GRACE = 5.0  # [s] for a process to end after a signal
 LOOK = 0.1  # [s] between two looks at what the game prints
 
 
@@ -47,8 +47,8 @@ class GameProcess:
 
     :param game: the installation
     :param race: who races where
-    :param check: refuses a track that the game cannot drive; it is given, since it stands above
-        this folder: ``sb3_torcs.tracks.trial.check_track``
+    :param check: refuses a track that the game cannot drive. It is an argument, because it is on a
+        higher floor: ``sb3_torcs.tracks.trial.check_track``
     :param environment: variables for our own code inside the game
     :param descriptors: open files that the game inherits
     :param preload: a library of ours that the game's program loads first, instead of text mode
@@ -57,7 +57,7 @@ class GameProcess:
     :raises TrackFileError: if the track's file is broken
     :raises SceneryMissing: if there is a window, and the game cannot draw the track
     :raises UnknownRobot: if the game has no such robot
-    :raises UnknownCar: if the game has not the car of a driver
+    :raises UnknownCar: if the game does not have the car of a driver
     :raises GameIncomplete: if the game lacks its program, or a file that a race needs
     :raises BackendUnavailable: if our driver module is needed and was not built
     :raises GameFailed: if the program does not run
@@ -154,7 +154,7 @@ class GameProcess:
 
     def follow(self, hear: Callable[[str], None]) -> None:
         """
-        Wait for the game to end by itself, and pass on what it prints meanwhile.
+        Wait for the game to end by itself, and pass on its output.
 
         :param hear: called with each line, without its end
         :raises GameFailed: if it ends with an error
@@ -168,10 +168,9 @@ class GameProcess:
 
     def end_race(self) -> None:
         """
-        End the race as if all had come to its end, so that clients are told and results are kept.
+        End the race as if all cars had finished, so that clients are told and results are written.
 
-        Only a game with our driver module does so; any other one is killed, and so is one that
-        somebody has paused.
+        This needs our driver module. A game without it, and a paused game, is killed.
         """
         self._process.terminate()
         try:
@@ -180,7 +179,7 @@ class GameProcess:
             self._process.kill()
 
     def epitaph(self) -> str:
-        """Say how the game ended, and what it said last."""
+        """Make the error of a game that ended, with its last output."""
         status = self._process.poll()
         how = f"exit status {status}"
         if status is not None and status < 0:
@@ -220,13 +219,13 @@ class GameProcess:
             return ""
 
     def stop(self) -> None:
-        """End the game, if it runs, and remove its folder. Calling it twice does no harm."""
+        """End the game, if it runs, and remove its folder. A second call does nothing."""
         self._end()
 
 
 def compiled_library(name: str) -> Path:
     """
-    Find a library that is built for the inside of the game.
+    Find a library of ours that the game loads.
 
     :param name: e.g. ``"_scr_server"``
     :return: its file
@@ -240,7 +239,7 @@ def compiled_library(name: str) -> Path:
 
 def game_environment(game: Game, folder: Path) -> dict[str, str]:
     """
-    Make the environment of a process of the game: its libraries, and nothing of the user's.
+    Make the environment variables of the game: with its libraries, without the user's settings.
 
     :param game: the installation
     :param folder: that stands for the user's home
@@ -280,7 +279,7 @@ def _data(
     _link_all(game.data / "tracks", data / "tracks", besides=category)
     if (game.data / "tracks" / category).is_dir():
         _link_all(game.data / "tracks" / category, own.parent, besides=file.stem)
-    (own / f"{file.stem}.xml").symlink_to(file)  # however its suffix is written
+    (own / f"{file.stem}.xml").symlink_to(file)  # in lower case
     _link_all(file.parent, own, besides=file.name)
     if scenery is not None and scenery.folder != file.parent:
         _link_all(scenery.folder, own, besides=f"{scenery.folder.name}.xml")
@@ -345,6 +344,6 @@ def _end(process: subprocess.Popen[bytes], folder: Path, owner: int) -> None:
     """End the game and remove its folder."""
     if os.getpid() != owner:
         return
-    process.kill()  # it has nothing to save
+    process.kill()  # the game has nothing to save
     process.wait(GRACE)
     shutil.rmtree(folder, ignore_errors=True)

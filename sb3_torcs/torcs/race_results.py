@@ -1,4 +1,4 @@
-"""What comes out of a drive of robots, whoever held the clock: the game or the engine."""
+"""Results of races of robots, in the game or in the engine."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Lap:
 @dataclass(frozen=True)
 class RobotResult:
     """
-    What one robot did.
+    The result of one robot.
 
     :param robot: name of the module
     :param index: of the driver
@@ -53,5 +53,5 @@ class RobotResult:
 
     @property
     def driver(self) -> str:
-        """Who that is, for people."""
+        """The driver's name for tables."""
         return self.client or f"{self.robot} {self.index}"

@@ -1,4 +1,4 @@
-"""What the game reads before a race: its description, and that of the SCR server's drivers."""
+"""The files that the game reads before a race: its set-up, and the SCR server's drivers."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def session_for(drivers: Sequence[tuple[str, int]]) -> Session:
 @dataclass(frozen=True)
 class RaceSetup:
     """
-    Who races where.
+    The set-up of a race.
 
     :param track: ``"aalborg"``, ``"road/aalborg"``, or the path of a TORCS XML file
     :param drivers: modules and indices, the first one at the head of the grid;
@@ -58,7 +58,7 @@ class RaceSetup:
     :param laps: to drive
     :param session: ``"practice"``, for one driver, lap by lap; or ``"race"``
     :param car: of the drivers of ``scr_server``
-    :raises InvalidOption: if the game would not do that, or would do it wrongly
+    :raises InvalidOption: if the game cannot run this race
     """
 
     track: str | os.PathLike[str]
@@ -74,7 +74,7 @@ class RaceSetup:
         drivers = list(self.drivers)
         if self.session == "practice" and len(drivers) != 1:
             raise InvalidOption(
-                f"a practice is for one robot, {len(drivers)} are named; choose session 'race'"
+                f"a practice is for one robot, but {len(drivers)} are named; choose session 'race'"
             )
         if not drivers or len(set(drivers)) < len(drivers):
             named = ", ".join(f"{name}:{index}" for name, index in drivers) or "none"
@@ -87,12 +87,12 @@ class RaceSetup:
 
     @property
     def has_clients(self) -> bool:
-        """Whether some drive by the SCR protocol."""
+        """Whether there are clients of the SCR protocol."""
         return any(name == SCR_SERVER for name, _ in self.drivers)
 
     def cars(self, game: Game) -> list[str]:
         """
-        Say who drives which car.
+        List the drivers' cars.
 
         :param game: the installation
         :return: the cars of the drivers, in their order
@@ -110,7 +110,7 @@ def write_race(game: Game, folder: Path, race: RaceSetup) -> str:
     :param game: the installation
     :param folder: private to the game
     :param race: who races where; its track by ``category/name``
-    :return: the name that the race goes by in the results
+    :return: the name of the race in the results
     :raises GameIncomplete: if the game lacks a file, or has a broken one
     """
     settings = folder / ENGINE_SETTINGS
@@ -166,14 +166,14 @@ def _write_scr_drivers(folder: Path, car: str) -> None:
 
 def _forbid_learning(folder: Path, race: RaceSetup) -> None:
     """
-    Keep robots from writing down what they learned: after a restart they would drive otherwise.
+    Keep robots from saving what they learn: after a restart they would drive differently.
 
     :param folder: private to the game
     :param race: who races where
     """
     for module, _ in race.drivers:
         if module != SCR_SERVER:
-            (folder / "drivers" / module).touch()  # where they would make a folder
+            (folder / "drivers" / module).touch()  # the file is where they would make a folder
 
 
 def _needed(game: Game, file: str) -> None:

@@ -1,4 +1,4 @@
-"""What the game writes down after a race."""
+"""The results that the game writes after a race."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def _results(process: GameProcess) -> Node:
                 f"the results that the game wrote are cut off ({error}); is there room in "
                 f"'{process.folder.parent}'?"
             ) from error
-        # The section of the track goes by the name that its author gave it: any will do.
+        # The section has the name that the track's author gave, which is not needed.
         for section in root.sections():
             with suppress(LookupError):
                 return section.find("Results", race_name)
@@ -100,7 +100,7 @@ def _race_results(
     last_seen = [r.total_time - row.number("penaltytime")
                  for r, row in zip(results, ranked, strict=True)]  # fmt: skip
     finished = [t for r, t in zip(results, last_seen, strict=True) if r.laps_completed == laps]
-    # Who was lapped ends at the line after the winner; who is out never came there.
+    # Lapped drivers end at the line after the winner; those who are out do not reach it.
     over = min(finished, default=math.inf)
     return [
         replace(result, out=result.laps_completed < laps and seen < over)

@@ -1,4 +1,4 @@
-"""What the game's window draws of a track: files besides the track's own, which it has to find.
+"""The scenery of a track: files besides the track's own, which the game's window draws.
 
 The game looks for them in the folder that the header of the track's file names, wherever the file
 itself is, and crashes if the 3D description is not there.
@@ -15,7 +15,7 @@ from sb3_torcs.torcs.params import Section, read_params
 
 __all__ = ["Scenery", "find_scenery"]
 
-USUAL_CATEGORY = "road"  # as the game takes a track whose header has none
+USUAL_CATEGORY = "road"  # the game's default for a track without a category
 USUAL_DESCRIPTION = "track.ac"
 USUAL_BACKGROUND, USUAL_REFLECTION = "background.png", "env.png"
 WITH_BACKGROUND = (0, 2, 4)  # types of background
@@ -106,9 +106,9 @@ def _folder(game: Game, file: Path, root: Section) -> Path:
 
 def _pictures(graphic: Section) -> list[str]:
     """
-    Name the pictures without which the game crashes.
+    List the pictures without which the game crashes.
 
-    :param graphic: what the track's file says of its looks
+    :param graphic: the section of the track's file on its appearance
     """
     names = []
     if graphic.numbers.get("background type", 0) in WITH_BACKGROUND:
@@ -122,7 +122,7 @@ def _pictures(graphic: Section) -> list[str]:
 
 def _equal(one: Section, other: Section) -> bool:
     """
-    Say whether two files describe the same road, whatever it is made of.
+    Check whether two files describe the same road, apart from its surfaces.
 
     :param one: a section of the one file
     :param other: the same section of the other file

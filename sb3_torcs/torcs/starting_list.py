@@ -1,4 +1,4 @@
-"""Who starts where: the agent among the game's robots."""
+"""The starting list: the agent among the game's robots."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def starting_list(
     game: Game, opponents: Sequence[str], grid_place: int | None
 ) -> list[tuple[str, int]]:
     """
-    Say who starts where.
+    Make the starting list.
 
     :param game: the installation
     :param opponents: robots, e.g. ``("inferno", "berniw:3")``

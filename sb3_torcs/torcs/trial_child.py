@@ -18,10 +18,10 @@ from sb3_torcs.errors import Sb3TorcsError
 
 __all__ = ["ANSWER", "REFUSED", "encoded", "main"]
 
-SPEED = 20.0  # [m/s] of a car that is put down
-TICKS = 10  # that it then drives
+SPEED = 20.0  # [m/s] of the car at each start
+TICKS = 10  # [s] of driving after each start
 REFUSED = 3  # exit status: the engine has raised an error, which is printed
-ANSWER = b"\nsb3-torcs:"  # comes before it: some Pythons print when they start
+ANSWER = b"\nsb3-torcs:"  # comes before the answer, since some Pythons print when they start
 PR_SET_PDEATHSIG = 1  # of Linux's prctl
 
 
@@ -52,7 +52,7 @@ def encoded(race: dict[str, Any]) -> dict[str, Any]:
 
 
 def _answer(status: int, answer: bytes) -> None:
-    """Hand over the answer and end, before any more of the game's code runs."""
+    """Print the answer and end at once, before more of the game's code runs."""
     sys.stdout.flush()
     sys.stdout.buffer.write(ANSWER + answer)
     sys.stdout.buffer.flush()
@@ -60,7 +60,7 @@ def _answer(status: int, answer: bytes) -> None:
 
 
 def _look_around(engine: Any, places: int) -> None:
-    """Put the car on the road here and there, and drive: a few heights or widths may be absurd."""
+    """Start at several points of the road and drive: single heights or widths may be absurd."""
     length = engine.track_summary()["length"]
     for place in range(places):
         with contextlib.suppress(Sb3TorcsError):  # who starts there is told so
@@ -73,7 +73,7 @@ def _limit(owner: int, seconds: int) -> None:
     End with the owner, after some seconds of computing, and without a core file.
 
     :param owner: the process that waits for this one
-    :param seconds: of computing: a busy machine changes no verdict
+    :param seconds: of processor time, so that a busy machine does not change the result
     """
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != owner:

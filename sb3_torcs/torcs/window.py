@@ -1,4 +1,4 @@
-"""What the game's window shows: its size, the camera, the boards; and what a video takes of it."""
+"""Options of the game's window: size, camera, boards, and frames of a video."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ BOARDS = {
 }
 TRACES = ("smoke value", "skid value")
 NO_BOARDS = {**dict.fromkeys(BOARDS, 0), "map mode": 1}
-USER_VARIABLES = (  # that a program with a window and sound needs; the rest stays outside
+USER_VARIABLES = (  # that a program with a window and sound needs; others are not passed on
     "XAUTHORITY",
     "XDG_RUNTIME_DIR",
     "PULSE_SERVER",
@@ -68,9 +68,9 @@ class Window:
         ``"scr_server 0"``; ``None`` for the first on the grid
     :param frames: an open file for pictures, see :mod:`sb3_torcs.rendering.game_video`;
         ``None`` shows the race in real time
-    :param fps: pictures per second of simulated time; ``None`` if it stands still
+    :param fps: frames per second of simulated time; ``None`` for single pictures
     :param boards: whether lap times, instruments and a map are drawn over the picture
-    :param traces: whether smoke and skid marks are drawn, which tell of moments before
+    :param traces: whether smoke and skid marks are drawn, which depend on earlier moments
     :raises InvalidOption: if there is no such view, or the game cannot draw this
     """
 
@@ -97,7 +97,7 @@ class Window:
 
 
 class WindowArguments(TypedDict):
-    """What :class:`~sb3_torcs.torcs.process.GameProcess` has to know of a window."""
+    """Arguments of :class:`~sb3_torcs.torcs.process.GameProcess` for a window."""
 
     environment: dict[str, str]
     descriptors: list[int]
@@ -130,7 +130,7 @@ def _environment(window: Window) -> dict[str, str]:
     :param window: of the game
     """
     variables = {name: os.environ[name] for name in USER_VARIABLES if name in os.environ}
-    # The game has another home, where this would not be found.
+    # The game has another home folder, in which this file does not exist.
     cookies = Path.home() / ".Xauthority"
     if "XAUTHORITY" not in variables and cookies.is_file():
         variables["XAUTHORITY"] = str(cookies)
@@ -144,7 +144,7 @@ def _environment(window: Window) -> dict[str, str]:
 
 def window_files(game: Game, window: Window) -> dict[str, str]:
     """
-    Write what the game reads about its window.
+    Write the files that the game reads about its window.
 
     :param game: the installation
     :param window: of the game

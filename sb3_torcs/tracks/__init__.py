@@ -1,4 +1,4 @@
-"""Tracks: straights and arcs, where they come from, and how they are drawn."""
+"""Tracks of straights and arcs: find, read, generate and draw them."""
 
 from sb3_torcs.tracks.catalogue import available_tracks, load_track
 from sb3_torcs.tracks.track import Grid, Segment, Surface, Track

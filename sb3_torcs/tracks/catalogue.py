@@ -1,4 +1,4 @@
-"""Where tracks come from: a name or a path becomes a :class:`~sb3_torcs.tracks.track.Track`."""
+"""Find a track by name or path, and read it as a :class:`~sb3_torcs.tracks.track.Track`."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def load_track(
     track: str | os.PathLike[str] | Track, rng: np.random.Generator | None = None
 ) -> Track:
     """
-    Find a track by name or path. What was read once is kept.
+    Find a track by name or path. Files that were read are cached.
 
     :param track: ``"aalborg"``, ``"road/aalborg"``, a path to a ``.xml`` (TORCS) or ``.csv``
         file, ``"random"``, or a track, which comes back as it is
@@ -60,7 +60,7 @@ def available_tracks() -> list[TrackSummary]:
 
 
 def _read(file: TrackFile) -> Track:
-    """Read a track file of either kind, once per content: times may stay as they are."""
+    """Read a track file of either kind, once per content."""
     content = digests(file.path, torcs_folders())
     return _read_once(file.path.resolve(), file.source, content)
 

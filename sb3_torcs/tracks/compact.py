@@ -35,7 +35,7 @@ MAGIC = ["sb3-torcs track", "1"]
 NUMBERS_PER_SEGMENT = 8
 MAX_SEGMENTS = 20_000
 LARGEST = 1e9  # [-] of any number
-LONGEST = 40  # letters of a number, for complaints
+LONGEST = 40  # [characters] of a number that a message shows
 MIN_CURVATURE = 1e-9  # [1/m] a radius of a million kilometres
 FIELDS = {
     "name": 1,
@@ -48,7 +48,7 @@ FIELDS = {
 
 
 class _Reader:
-    """What has been read of one file so far; knows the line for its complaints."""
+    """Reads one file line by line, and names the line in its errors."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -132,7 +132,9 @@ class _Reader:
             raise self.fail(f"'{keyword}' has {len(values)} fields, expected {FIELDS[keyword]}")
         if keyword == "segment":
             if len(self.segments) == MAX_SEGMENTS:
-                raise self.fail(f"there are more than {MAX_SEGMENTS} segments, which no road has")
+                raise self.fail(
+                    f"there are more than {MAX_SEGMENTS} segments, more than any road needs"
+                )
             self.segments.append(self.segment(values))
         elif keyword == "surface":
             name, *texts = values

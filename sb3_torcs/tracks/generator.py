@@ -2,7 +2,7 @@
 
 The corners lie at increasing angles around a centre, so the polygon cannot cross itself; where
 its distance from the centre falls and rises again, the road bends the other way. Rounding keeps
-the road's direction continuous and the lap closed by construction. What comes too near to
+the road's direction continuous and the lap closed by construction. A road that comes too near to
 itself, or has no room for a drivable bend, is drawn again.
 """
 
@@ -41,9 +41,9 @@ BARRIER = Surface("barrier", 0.0, 0.001, 0.5, 10.0)
 
 def random_track(rng: np.random.Generator) -> Track:
     """
-    Draw a circuit: closed, drivable, apart from itself.
+    Draw a circuit that is closed, drivable and does not touch itself.
 
-    :param rng: the only source of chance; the same state gives the same track
+    :param rng: random generator; the same state gives the same track
     :return: the track
     """
     for _ in range(ATTEMPTS):
@@ -152,7 +152,7 @@ def _apart(segments: list[Segment], clearance: float) -> bool:
     n = math.ceil(track.length / SAMPLE)
     places: FloatArray = np.arange(n, dtype=np.float64) * (track.length / n)
     axis = _axis(track, places)
-    # Along the road anything may be near; half a turn of the tightest bend ends that.
+    # Points close to each other along the road may be near; beyond half a turn they may not.
     apart = np.abs(places[:, None] - places[None, :])
     apart = np.minimum(apart, track.length - apart)
     return not bool(

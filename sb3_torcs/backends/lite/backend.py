@@ -90,17 +90,17 @@ class LiteBackend:
         physics.advance(self._state, self._table, asked, ticks, self._flying)
         if not math.isfinite(self._state[physics.X] + self._state[physics.VX]):
             raise CarLost(
-                f"the physics has come to no number on {self.track.name}, the car is nowhere; see "
+                f"the physics has given NaN on {self.track.name}, so the car has no position; see "
                 "the surfaces of that track, and call reset to go on"
             )
         return self._read()
 
     def close(self) -> None:
-        """Nothing to give back: the world is two arrays."""
+        """Do nothing: the world holds only arrays."""
 
     def _read(self) -> CarState:
         scalars, wheels, beams = np.empty(physics.SCALARS), np.empty(4), np.empty(19)
-        opponents = np.full(36, RANGE)  # nobody else is here
+        opponents = np.full(36, RANGE)  # there are no other cars
         physics.read(
             self._state, self._table, *self._edges, self.range_finder_angles, scalars, wheels, beams
         )

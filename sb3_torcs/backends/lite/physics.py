@@ -59,7 +59,7 @@ def _count_laps(state: Floats, track: Floats, previous: float, flying: bool) -> 
         moved += length
         state[CROSSINGS] += 1.0
         if state[CROSSINGS] == 1.0 and flying:
-            state[LAP_START] = state[STEPS]  # the way to the line was not a lap
+            state[LAP_START] = state[STEPS]  # the drive from the grid to the line is not a lap
         elif state[CROSSINGS] > state[LAPS] + 1.0:
             lap = (state[STEPS] - state[LAP_START]) / STEPS_PER_SECOND
             state[LAPS] += 1.0
@@ -331,7 +331,7 @@ def advance(
 
 def place(x: float, y: float, yaw: float, speed: float, segment: int, track: Floats) -> Floats:
     """
-    Put the car somewhere, rolling freely in the gear that suits its speed.
+    Return the state of a car that rolls freely, in the gear for its speed.
 
     :param x: [m]
     :param y: [m]

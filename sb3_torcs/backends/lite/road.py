@@ -1,4 +1,4 @@
-"""Where a point is on a road, and what lies there; compiled, for the fallback world."""
+"""Find a point's position on a road, its width and ground. Compiled, for the fallback world."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def ground(track: Floats, segment: int, along: float, lateral: float) -> tuple[f
 @njit(cache=True)
 def project(track: Floats, segment: int, x: float, y: float) -> tuple[int, float, float, float]:
     """
-    Find a point's place on the road, walking on from a segment near it.
+    Find a point's position on the road, starting from a segment near it.
 
     :param track: ``Track.table``
     :param segment: where to begin to look
@@ -89,7 +89,7 @@ def project(track: Floats, segment: int, x: float, y: float) -> tuple[int, float
             segment = (segment + 1) % n
         else:
             break
-        # Between two segments the rounding of both may deny the place: take the border.
+        # By rounding, a point between two segments may be in neither: take the border.
         along = min(max(along, 0.0), track[segment, column.LENGTH])
     tangent = track[segment, column.HEADING] + track[segment, column.CURVATURE] * along
     return segment, along, offset, tangent
