@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 
+#include "gearbox.h"
 #include "sensors.h"
 
 namespace torcs {

@@ -15,10 +15,6 @@ struct Start {
     double speed;           // [m/s] of all cars
 };
 
-// Shift up beyond this share of the engine's limit: of the SCR car, 8500 rpm of the 9152 at which
-// its limiter cuts in.
-constexpr float SHIFT_UP = 8500.0f / 9152.0f;
-
 // The cars of a race, and what it takes to move them.
 struct Field {
     CarElement* cars;

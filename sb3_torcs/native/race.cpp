@@ -9,6 +9,7 @@
 
 #include "checks.h"
 #include "errors.h"
+#include "gearbox.h"
 
 namespace torcs {
 
@@ -21,13 +22,6 @@ constexpr float PIT_LENGTH = 15.0f, SHORTEST_PIT = 1.0f;  // [m] by default; lon
 constexpr double COUNTDOWN = -2.0;                        // [s]
 constexpr int SETTLING_STEPS = 500;  // of standing on the brake, so that the springs come to rest
 constexpr int MANY_LAPS = 1 << 30;
-
-// Beside SHIFT_UP: of the SCR car 7500 rpm.
-constexpr float SHIFT_DOWN = 7500.0f / 9152.0f;
-// Of a standing car. The game's clutch passes all torque up to two thirds, and less from there on.
-constexpr float LAUNCH_CLUTCH = 0.8f;
-// So that a client who reads the speed in six digits presses the very same.
-constexpr float CLUTCH_STEPS = 128.0f;
 
 const char* const SKILLS[] = {"rookie", "amateur", "semi-pro", "pro"};
 constexpr int SEMI_PROFESSIONAL = 2;  // what the game takes for drivers that do not say
