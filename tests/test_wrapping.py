@@ -158,7 +158,7 @@ def test_a_wrapper_from_elsewhere_is_imported_only_if_it_is_trusted(tmp_path, mo
 @pytest.mark.parametrize(("path", "error", "says"), [
     ("nowhere.Wrapper", PackageMissing, "install the package that it is in"),
     ("gymnasium.wrappers.Nothing", PackageMissing, "does not import"),
-    ("gymnasium.spaces.Box", ModelMismatch, "is no gymnasium.Wrapper"),
+    ("gymnasium.spaces.Box", ModelMismatch, "is not a gymnasium.Wrapper"),
     ("gymnasium.wrappers.RescaleAction", ModelMismatch, "does not go around the car"),
     (3, ModelMismatch, "env_wrapper of a training has 3; expected a dotted path"),
 ])  # fmt: skip

@@ -88,7 +88,7 @@ class Driver:
         :param observation: as the environment gives it
         :param state: as the call before returned it; ``None`` begins
         :param episode_start: (1,) whether an episode begins here
-        :param deterministic: whether to leave out chance
+        :param deterministic: whether to choose without randomness
         :return: the action, and the state for the next call
         """
         if self.statistics is not None:
@@ -228,7 +228,7 @@ def saved_timesteps(model: Path) -> int:
 
 def saved_spaces(model: Path, *, trust: bool = False) -> Spaces:
     """
-    Return what a model sees and does.
+    Return the spaces of a model.
 
     :param model: the file
     :param trust: unpickle it, if it cannot be read otherwise
@@ -262,7 +262,7 @@ def check_spaces(
     Make sure that a model fits an environment.
 
     :param model: the file, for the message
-    :param saved: what the model sees and does
+    :param saved: the spaces of the model
     :param env: that it is to drive
     :param frames: observations that the model is to see at once
     :raises ModelMismatch: if the layouts differ
@@ -291,17 +291,17 @@ def check_resumable(
     trust: bool = False,
 ) -> bool:
     """
-    Make sure that a training can go on from a model.
+    Make sure that a training can resume from a model.
 
     :param model: the file; its replay buffer and its record lie beside it
     :param env: that the training is to go on in
     :param algo: that is to learn, as the zoo calls it
     :param n_envs: number of environments in which it is to learn
     :param frames: observations that it is to see at once
-    :param trust: whether the model need not tell how it was trained
-    :return: whether there is a replay buffer to go on with
+    :param trust: accept a model without a record
+    :return: whether there is a replay buffer to resume with
     :raises ModelMismatch: if they do not belong together
-    :raises ModelNotTrusted: if nothing tells that a training made it
+    :raises ModelNotTrusted: if it has no record of a training
     """
     from stable_baselines3.common.save_util import load_from_pkl
 
@@ -339,7 +339,7 @@ def check_resumable(
 
 
 def _layout(space: spaces.Space[Any]) -> str:
-    """Say in a few words what a space is."""
+    """Describe a space in a few words."""
     if isinstance(space, spaces.Box):
         low, high = float(np.min(space.low)), float(np.max(space.high))
         return f"{space.shape} {space.dtype} within [{low:g}, {high:g}]"
@@ -350,16 +350,16 @@ def load_driver(
     path: str | Path, env: gym.Env[Any, Any], algo: str | None = None, trust: bool = False
 ) -> Any:
     """
-    Load what is to drive. Nothing that the file holds is run, unless it is trusted.
+    Load a driver. No code of the file runs, unless it is trusted.
 
     :param path: of a saved model or its run's folder, or ``"scripted"``
     :param env: that it is to drive, with the wrappers of the training
     :param algo: as the zoo calls it; ``None`` finds out
-    :param trust: load the model as SB3 does, which runs whatever is pickled in it
+    :param trust: load the model as SB3 does, which runs code that is pickled in it
     :return: something with SB3's ``predict``
     :raises InvalidOption: if there is no such file or algorithm
-    :raises ModelMismatch: if the file is no model, or one for another environment
-    :raises ModelNotTrusted: if the model takes more than plain data and known classes
+    :raises ModelMismatch: if the file is not a model, or is one for another environment
+    :raises ModelNotTrusted: if the model needs more than plain data and known classes
     """
     if str(path) == SCRIPTED:
         return _scripted(env)
@@ -395,12 +395,11 @@ def _policy(file: Path, record: TrainingRecord, algo: str | None, seen: Spaces) 
 
 
 def _as_sb3_does(file: Path, algo: str | None) -> Any:
-    """Load a model with all that is pickled in it."""
+    """Load a model with everything that is pickled in it."""
     name, algorithm = algorithm_of(algo, saved_data(file), file)
-    # On the CPU: for one timestep at a time it is the fastest, and it is always there. The
-    # schedules are of no use to a driver, and the saved ones may be from another version.
-    # Nor is a replay buffer: SB3 warns of the class that it chose itself for returns over several
-    # timesteps.
+    # On the CPU, which is always available, and the fastest for single timesteps. A driver does not
+    # need the schedules, which may be from another version, nor a replay buffer, about whose class
+    # SB3 would warn after a training with returns over several timesteps.
     kwargs = {"device": "cpu", "buffer_size": 1, "replay_buffer_class": None}
     with as_mismatch(f"'{file}' does not load as {name}", "give an --algo that fits, or"):
         model = algorithm.load(io.BytesIO(file.read_bytes()), **kwargs)
@@ -409,7 +408,7 @@ def _as_sb3_does(file: Path, algo: str | None) -> Any:
 
 
 def _statistics(file: Path, record: TrainingRecord, trust: bool) -> Any:
-    """Find the statistics that a model learned with, if it learned from normalized observations."""
+    """Find the statistics of a model that learned from normalized observations."""
     from stable_baselines3.common.vec_env import VecNormalize
 
     if record.statistics is not None:
@@ -439,7 +438,7 @@ def _normalized(normalize: Any) -> bool:
 
 
 def _scripted(env: gym.Env[Any, Any]) -> Any:
-    """Let the driver without a network see what it is made for."""
+    """Make the scripted driver, and check that its range finders are those of SCR."""
     angles = env.get_wrapper_attr("range_finder_angles")
     if not np.allclose(angles, range_finder_angles("scr")):
         raise InvalidOption(

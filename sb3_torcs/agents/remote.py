@@ -1,4 +1,4 @@
-"""An agent that drives in the game itself, behind the SCR protocol, outside of any training."""
+"""An agent that drives in the game itself, over the SCR protocol."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ __all__ = ["Agent"]
 
 class Agent:
     """
-    A saved model at the wheel.
+    A saved model that drives over the SCR protocol.
 
     :param model: what :func:`~sb3_torcs.agents.models.load_driver` loads
     :param settings: of ``Torcs-v0`` with ``backend="scr"``: ``host``, ``port``, ``track`` and so on
-    :param algo: of the model, if that cannot be found out
-    :param trust: run what is pickled in the model
+    :param algo: of the model, if it cannot be inferred
+    :param trust: run code that is pickled in the model
     :param name: of the driver, for the game's boards and results
     :raises ModelMismatch: if the model does not fit
     :raises ModelNotTrusted: if it takes more than plain data
@@ -42,7 +42,7 @@ class Agent:
         self.backend.driver_name = name
         self.error: BaseException | None = None
         """What went wrong, where the agent drives in a thread."""
-        with self.backend.rehearsal():  # a race has no time for what is done for the first time
+        with self.backend.rehearsal():  # first calls are too slow for a race
             self._race(None)
         self._forget()
 
@@ -53,7 +53,7 @@ class Agent:
 
     def drive(self, aftermath: float | None = None) -> None:
         """
-        Drive to the end of the race; if it begins anew, also in that.
+        Drive to the end of the race, and also in its restarts.
 
         :param aftermath: drive on for so long after leaving the road, standing and so on, and then
             stop [s]; ``None`` drives on whatever happens
@@ -67,7 +67,7 @@ class Agent:
             self.env.close()
 
     def _forget(self) -> None:
-        """Begin to count anew."""
+        """Reset the counts."""
         self.lap_times: list[float] = []
         """[s] of each whole lap."""
         self.distance = 0.0
@@ -86,7 +86,7 @@ class Agent:
 
     def _note(self, info: dict[str, Any], terminated: bool) -> None:
         """
-        Keep what is told afterwards.
+        Record the results of a timestep.
 
         :param info: of a timestep
         :param terminated: whether an episode would be over

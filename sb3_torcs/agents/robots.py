@@ -41,7 +41,7 @@ def race(
     """
     if not robots or len(robots) > MAX_ROBOTS:
         raise InvalidOption(f"{len(robots)} robots; expected 1 to {MAX_ROBOTS}")
-    RaceSetup(track, robots, laps, session)  # refuses what the game itself would not drive
+    RaceSetup(track, robots, laps, session)  # refuses races that the game itself cannot run
     engine = make_engine(find_game(), track, robots, session=session, laps=laps)
     try:
         engine.start()
@@ -77,7 +77,7 @@ def _result(
 
 
 def _rows(engine: Any, robots: Sequence[tuple[str, int]]) -> Iterator[tuple[Any, ...]]:
-    """Drive to the end, a call of drivers at a time."""
+    """Drive to the end of the race, and yield the rows of each control tick."""
     while not engine.ended:
         engine.advance(1)
         for car, robot in enumerate(robots):

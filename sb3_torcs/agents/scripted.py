@@ -1,4 +1,4 @@
-"""A driver without a network: the yardstick that a learned one has to beat."""
+"""A driver without a network, as a yardstick for trained agents."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ class ScriptedDriver:
     """
     Drives by the range finders: towards the longest beam, as fast as it can still stop.
 
-    Grip is felt, not known. Wheels that spin and a car that slides cost throttle, a tail that
-    swings is caught by the steering; so the same driver laps asphalt and dirt. It has the signature
+    It does not know the grip. It lifts the throttle when wheels spin or the car slides, and steers
+    against a swinging tail, so the same driver laps asphalt and dirt. It has the signature
     of a model, ``predict(observation) -> (action, state)``, and needs the ``"scr"`` range finders.
 
     :param action: layout of its actions, ``"pedals"`` or ``"pedal"``
@@ -71,7 +71,7 @@ class ScriptedDriver:
         Decide.
 
         :param observation: (29,) or (n, 29)
-        :param state: unused; the driver remembers nothing
+        :param state: unused; the driver has no state
         :param episode_start: unused
         :param deterministic: unused; it always is
         :return: the action or actions, and no state
@@ -85,7 +85,7 @@ class ScriptedDriver:
         return np.stack([self._drive(row) for row in rows]), None
 
     def _drive(self, observation: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
-        """Decide on one observation, (29,)."""
+        """Choose the action of one observation, (29,)."""
 
         def read(name: str) -> npt.NDArray[np.float64]:
             return observation[_WHERE[name]] / _SCALE[name]

@@ -1,4 +1,4 @@
-"""What stands between a world and a model, put there again as in the training.
+"""Rebuild the wrappers of a training around an environment.
 
 The RL Zoo's order is: ``env_wrapper``, ``vec_env_wrapper``, ``normalize``, ``frame_stack``. The
 first changes the environment, and is put around it here. The last two change what a model sees, so
@@ -37,15 +37,15 @@ def wrapped(
 
     :param env: the bare one
     :param hyperparameters: of the training, as the RL Zoo reads them
-    :param trust: import wrappers from wherever they are
+    :param trust: import wrappers of any package
     :return: the environment that the model knows; the bare one if there are no wrappers
     :raises ModelNotTrusted: if a wrapper is neither of this package nor of those it is made from
     :raises PackageMissing: if a wrapper cannot be imported
-    :raises ModelMismatch: if it is no wrapper, or does not go around this environment
+    :raises ModelMismatch: if it is not a wrapper, or does not fit this environment
     """
     items = list(_items(hyperparameters, "env_wrapper"))
     if items:
-        # Where a training has SB3's Monitor: some wrappers look at what they are put around.
+        # In a training SB3's Monitor is here; some wrappers inspect the environment below them.
         env = gym.Wrapper(env)
     for path, kwargs in items:
         if path.rpartition(".")[2] in LEFT_OUT:
@@ -62,7 +62,7 @@ def frames_of(hyperparameters: Mapping[str, Any]) -> int | None:
 
     :param hyperparameters: of its training
     :return: their number; ``None`` if it sees one as it is
-    :raises ModelMismatch: if what is written is no number
+    :raises ModelMismatch: if it is not a number
     """
     frames = hyperparameters.get("frame_stack")
     if frames is not None and (type(frames) is not int or frames < 1):
@@ -92,10 +92,10 @@ def stacked_space(space: spaces.Space[Any], frames: int | None) -> spaces.Space[
 
 def unrebuilt(hyperparameters: Mapping[str, Any]) -> str | None:
     """
-    Find what cannot be put around a single car.
+    Find a wrapper that cannot be put around a single car.
 
     :param hyperparameters: of a training
-    :return: what to say about it, if there is something
+    :return: why not; ``None`` if there is none
     """
     for path, _ in _items(hyperparameters, "vec_env_wrapper"):
         package, _, name = path.rpartition(".")
@@ -136,5 +136,7 @@ def _imported(path: str, trust: bool) -> Any:
             "install the package that it is in"
         ) from error
     if not (isinstance(found, type) and issubclass(found, gym.Wrapper)):
-        raise ModelMismatch(f"env_wrapper of a training has {path}, which is no gymnasium.Wrapper")
+        raise ModelMismatch(
+            f"env_wrapper of a training has {path}, which is not a gymnasium.Wrapper"
+        )
     return found

@@ -1,7 +1,6 @@
-"""The ladder: what a drive on a track is worth beside the scripted driver and the game's robots.
+"""The ladder: rank a driver on a track against the scripted driver and the game's robots.
 
-Their laps were measured by the engine (``examples/reference_laps.py``) and are shipped, so that
-nobody has to measure them again to climb.
+Their laps were measured by the engine (``examples/reference_laps.py``) and are shipped.
 """
 
 from __future__ import annotations
@@ -31,11 +30,11 @@ REFERENCE_ENV = "Torcs-v0"  # laps of another world say nothing here
 @functools.cache
 def reference_laps(track: str, car: str = DEFAULT_CAR) -> dict[str, float]:
     """
-    Look up what others drive.
+    Look up the laps of the other drivers.
 
     :param track: its name, without category
     :param car: that they drive it with
-    :return: best flying laps [s] by driver; who does not finish three laps is not there
+    :return: best flying laps [s] by driver; without drivers that do not finish three laps
     """
     with REFERENCE_FILE.open(newline="", encoding="utf-8") as file:
         return {
@@ -47,7 +46,7 @@ def reference_laps(track: str, car: str = DEFAULT_CAR) -> dict[str, float]:
 
 def rung(race: Episode, env_id: str, car: str, track: str) -> str:
     """
-    Say how high a race of three laps from the grid stands.
+    Return the rung of a race of three laps from the grid.
 
     :param race: what was driven
     :param env_id: where

@@ -1,4 +1,4 @@
-"""The policy with split heads for stock DDPG and TD3, and what it is made of."""
+"""The policy with split heads for stock DDPG and TD3, and its parts."""
 
 from sb3_torcs.policies.export import export_actor
 from sb3_torcs.policies.split_head import SplitHeadPolicy

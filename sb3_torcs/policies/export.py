@@ -1,4 +1,4 @@
-"""What drives as an ONNX graph: it runs in many languages, without SB3, PyTorch or this package."""
+"""Export a driver as an ONNX graph, which runs without SB3, PyTorch and this package."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ NEEDED = ("onnx", "onnxscript")
 
 class _Predicting(nn.Module):
     """
-    A policy that is asked as ``predict(deterministic=True)`` asks it.
+    A policy with the forward pass of ``predict(deterministic=True)``.
 
     :param policy: of Stable-Baselines3
     """
@@ -46,7 +46,7 @@ class _Predicting(nn.Module):
 
 class _RawDriver(nn.Module):
     """
-    From observations as the environment gives them to actions as it takes them.
+    A driver from the environment's observations to its actions.
 
     :param policy: of Stable-Baselines3
     :param statistics: of ``VecNormalize``, or ``None``
@@ -85,7 +85,7 @@ class _RawDriver(nn.Module):
 
 def export_actor(model: Any, path: str | os.PathLike[str]) -> Path:
     """
-    Export what drives as ONNX.
+    Export a driver as ONNX.
 
     The graph takes raw observations and gives actions in the environment's units: steering in
     [-1, 1], pedals in [0, 1]. It does what ``predict(deterministic=True)`` does, so it drives the
@@ -181,7 +181,7 @@ def _graph(driver: _RawDriver, space: spaces.Space[Any]) -> bytes:
 @contextlib.contextmanager
 def _for_tracing() -> Iterator[None]:
     """
-    Leave out what has no place in a graph, and what PyTorch says of packages that nobody needs.
+    Disable checks that a graph cannot hold, and PyTorch's warnings about unneeded packages.
 
     Distributions check their arguments by looking at numbers, which a graph does not have yet.
     """

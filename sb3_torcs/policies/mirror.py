@@ -1,8 +1,8 @@
-"""A drive seen in a mirror: left is right.
+"""Mirror images of drives, with left and right exchanged.
 
 A car is built alike on both sides, so what was driven on a road is also a drive on the road that
-bends the other way. Who learns from both has twice the experience, and has met every bend from
-either side.
+bends the other way. Learning from both gives twice the experience, with every bend in
+both directions.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ OTHER_WHEEL = (1, 0, 3, 2)
 
 
 def _order() -> th.Tensor:
-    """Where in an observation stands what its mirror image has in each place."""
+    """Return the index in an observation of each number of its mirror image."""
     order, where = np.arange(OBSERVATION_SIZE), feature_slices()
     beams, wheels = where["range_finders"], where["wheel_speeds"]
     order[beams] = order[beams][::-1]
@@ -32,7 +32,7 @@ def _order() -> th.Tensor:
 
 
 def _signs() -> th.Tensor:
-    """What each number of a mirrored observation is multiplied with."""
+    """Return the sign of each number of a mirrored observation."""
     signs, where = np.ones(OBSERVATION_SIZE, np.float32), feature_slices()
     for name in SIDED:
         signs[where[name]] = -1.0
@@ -44,7 +44,7 @@ _ORDER, _SIGNS = _order(), _signs()
 
 def mirror_observations(observations: th.Tensor) -> th.Tensor:
     """
-    Look at the world in a mirror. Twice gives the same observations back.
+    Mirror observations. Mirroring twice gives the same observations.
 
     :param observations: (n, 29) with range finders that look equally far to both sides
     :return: (n, 29)
@@ -65,7 +65,7 @@ def mirror_actions(actions: th.Tensor) -> th.Tensor:
 
 def mirror_half(batch: ReplayBufferSamples) -> ReplayBufferSamples:
     """
-    Mirror the first half of a batch, whose order is by chance anyway.
+    Mirror the first half of a batch, whose order is random.
 
     :param batch: of a replay buffer; left as it is
     :return: as many transitions

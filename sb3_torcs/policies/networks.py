@@ -176,7 +176,7 @@ class ExactDriver(nn.Module):
     """
     A copy of an actor that drives in double precision.
 
-    Processors round sums differently, and a car that is steered a hair otherwise is elsewhere
+    Processors round sums differently, and a car that is steered slightly differently is elsewhere
     after a lap. Rounded from double to single precision, the actions are the same everywhere.
 
     :param actor: of SB3's DDPG or TD3

@@ -1,4 +1,4 @@
-"""Optimizers for small networks, where the Python around a step counts."""
+"""Optimizers for small networks, with less Python code per step."""
 
 from __future__ import annotations
 

@@ -143,7 +143,7 @@ class SplitHeadPolicy(TD3Policy):
         return self.actor if self.average is None else cast(Actor, self.average.module)
 
     def exact_driver(self) -> ExactDriver:
-        """Return a copy of what drives when ``predict`` is deterministic."""
+        """Return a copy of the actor that drives when ``predict`` is deterministic."""
         return ExactDriver(self.driver, symmetric=self.own_kwargs["symmetric"])
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:

@@ -1,7 +1,7 @@
 """The picture of a race: the road from above, the car, its beams and its instruments.
 
-Loaded by the first ``render()``; it brings highway-env and pygame with it. A frame depends on
-nothing but what it is made from: the same state gives the same bytes.
+Loaded by the first ``render()``; it brings highway-env and pygame with it. A frame depends only
+on the state: the same state gives the same bytes.
 
 The car is highway-env's (``VehicleGraphics`` on a ``WorldSurface``). The road is not: its
 ``LaneGraphics`` draws unbroken lines as one chord per lane (across the bend) or as pieces that
@@ -58,7 +58,7 @@ SMALLEST_DASHBOARD = 240  # [px] smaller pictures show the road only: figures wo
 
 
 class Camera(NamedTuple):
-    """Where the picture looks from, in highway-env's frame."""
+    """The view of the picture, in highway-env's frame."""
 
     position: FloatArray  # (2,) [m] what is seen at the car's place on the picture
     heading: float  # [rad] what points up
@@ -112,7 +112,7 @@ def _camera(track: Track, car: CarState, pixels_ahead: float) -> Camera:
 
 
 class _Stage(NamedTuple):
-    """What is kept while the track stays the same."""
+    """The prepared drawing of a track, kept while the track stays the same."""
 
     track: Track
     scenery: Scenery
@@ -172,7 +172,7 @@ class Viewer:
         return pixels.reshape(self._size[1], self._size[0], 3).copy()
 
     def close(self) -> None:
-        """Close the window. Calling it twice does no harm."""
+        """Close the window. A second call does nothing."""
         if self._window is not None:
             pygame.display.quit()
             self._window = None
@@ -210,7 +210,7 @@ class Viewer:
         VehicleGraphics.display(turned, world, offscreen=True, draw_roof=True)
 
     def _show(self) -> None:
-        """Bring the picture to the window, and wait until the next is due."""
+        """Show the picture in the window, and wait until the next is due."""
         for event in pygame.event.get():
             if event.type == pygame.QUIT:
                 self.close()
@@ -234,7 +234,7 @@ def _open_window(size: tuple[int, int]) -> Any:
         )
     try:
         pygame.display.init()
-        # SDL draws into the void of its own accord when it finds no display.
+        # Without a display SDL draws nowhere, and does not report it.
         if pygame.display.get_driver() == "offscreen" and "SDL_VIDEODRIVER" not in os.environ:
             logger.warning(
                 "no display was found, so nobody will see this window; are DISPLAY or "

@@ -1,4 +1,4 @@
-"""Study files: which agents are to be trained, read and checked before anything starts.
+"""Study files, read and checked before anything starts.
 
 A study is a table of variants by seeds. A variant is an entry of a hyperparameter file of the RL
 Zoo with some of its values changed; a trial is one variant with one seed.
@@ -78,7 +78,7 @@ class Trial:
         return dict(self.entry.get("env_kwargs") or {})
 
     def recipe(self) -> dict[str, Any]:
-        """Return what the training depends on: another recipe is another training."""
+        """Return everything that the training depends on."""
         recipe = {**asdict(self), "eval_tracks": list(self.eval_tracks)}
         del recipe["final_tracks"]
         return recipe
@@ -86,7 +86,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Study:
-    """What a study file asks for."""
+    """The content of a study file."""
 
     name: str
     path: Path
@@ -99,8 +99,8 @@ def read_study(path: str | Path) -> Study:
 
     :param path: of a YAML file; ``docs/evaluation.md`` says what it holds
     :return: the study
-    :raises StudyError: if the file says something that cannot be done
-    :raises ZooConfigError: if a variant has something that nothing would read
+    :raises StudyError: if the file has a mistake
+    :raises ZooConfigError: if the hyperparameters of a variant have a mistake
     :raises TrackNotFound: if there is no such track
     """
     file = Path(os.path.expanduser(path))
@@ -129,10 +129,10 @@ def read_study(path: str | Path) -> Study:
 
 def merged(entry: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
     """
-    Change an entry: mappings are merged, ``null`` takes away, all else replaces.
+    Change an entry: mappings are merged, ``null`` removes, other values replace.
 
-    The list of callbacks is changed by a mapping from dotted paths to arguments: what is not in the
-    list yet is added.
+    The list of callbacks is changed by a mapping from dotted paths to arguments: new paths are
+    added to the list.
 
     :param entry: of a hyperparameter file
     :param changes: to it
@@ -156,7 +156,7 @@ def merged(entry: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, An
 
 def track_name(track: str) -> str:
     """
-    Return what a track is called in results.
+    Return the name of a track in results.
 
     :param track: name or path
     :return: the name without category
@@ -269,7 +269,7 @@ def _trials(
 def _source(
     said: Mapping[str, Any], changes: Mapping[str, Any], place: zoo.Place
 ) -> dict[str, Any]:
-    """Collect what a variant says for itself, or the study for all."""
+    """Collect the options of a variant, or else those of the study."""
     source = {key: changes.get(key, said.get(key)) for key in SOURCE}
     for key in WORDS:
         if not isinstance(source[key], str | None):

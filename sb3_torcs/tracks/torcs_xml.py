@@ -2,10 +2,10 @@
 
 A track file is a tree of sections holding numbers and texts. The road is a list of segments:
 ``str`` has a length, ``lft`` and ``rgt`` have a radius, an arc and perhaps another radius at the
-end. What a segment does not say of its sides, it inherits from the segment before it. The rules
+end. A segment inherits missing values of its sides from the segment before it. The rules
 are those of the game's loader (``src/modules/track/track3.cpp`` and ``track4.cpp`` of TORCS
-1.3.7); elevation, banking, cameras and graphics are not read: the world is a plane. What that
-loader would lay otherwise than it is written, or could not lay at all, is refused.
+1.3.7); elevation, banking, cameras and graphics are not read: the world is a plane. A file that
+that loader would read differently, or could not read at all, is refused.
 
 Beside the road come a border (a kerb), a side (grass, sand, more asphalt) and the barrier. Border
 and side become one strip of ground with the surface of the wider one, and the barrier stands at
@@ -40,7 +40,7 @@ SAMPLES_PER_ARC = 36  # as TORCS does when it looks for the corner of its map
 
 @dataclass
 class _Verge:
-    """What stands beside the road on one side; segments hand it on to the next."""
+    """The border, side and barrier on one side of the road; segments inherit them."""
 
     side: str
     end_width: float = 0.0  # [m] of the side

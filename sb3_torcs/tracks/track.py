@@ -1,8 +1,8 @@
-"""A track as straights and arcs, and where tracks come from.
+"""A track of straights and arcs.
 
 A :class:`Track` is a closed chain of segments of constant curvature in a plane: elevation and
-banking are left to worlds that have them. It knows geometry only; what drives on it is the
-business of a backend.
+banking are left to worlds that have them. It has geometry only; backends
+drive on it.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ MAX_GAP = 0.005  # [-] of the length: a chain that misses its start by more is n
 
 
 class Surface(NamedTuple):
-    """What the ground does to a tyre and to a body that hits it."""
+    """The effect of a ground on tyres, and of a wall on a car."""
 
     name: str
     friction: float  # [-] factor on the tyre's own coefficient of friction
@@ -87,7 +87,7 @@ class Grid(NamedTuple):
 
 
 class Pose(NamedTuple):
-    """A place and a direction in the track's plane."""
+    """A position and a direction in the track's plane."""
 
     x: float  # [m]
     y: float  # [m]

@@ -1,8 +1,8 @@
-"""Whether the game can drive a track, and drives the road that was read of its file.
+"""Check that the game can load a track, and that its road is the one that was read from the file.
 
 The game's loader trusts its files: one wrong value can crash it or keep it busy for ever, and with
 it the process that it is in. So a file that is not one of TORCS 1.3.7's own is first loaded in a
-process of its own, which may end as it likes.
+process of its own, which may crash.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ COMPUTING_PER_ROBOT = 1  # [s] besides; planning takes 0.3 on the longest track
 PATIENCE = 300.0  # [s] until a process that computes nothing is given up
 RANGE_FINDERS = 19  # whose angles the engine wants
 PLACES = 40  # along the road, at which a car that is alone is put down
-UNSETTLED = "does not come to rest"  # what the engine says of a car that stands nowhere
+UNSETTLED = "does not come to rest"  # the engine's error for a car without a position
 ADVICE = "the game understands the file otherwise than it is written"
 HINT = "look at what was changed last: heights of walls, lengths, names of other segments"
 
@@ -110,7 +110,7 @@ def try_race(path: Path, race: dict[str, Any]) -> None:
 
 def check_road(path: Path, road: FloatArray) -> None:
     """
-    Hold the road that the game has laid to the one that was read.
+    Compare the road that the game has made with the one that was read.
 
     :param path: of the track's file
     :param road: (n_segments, 13) from the engine
@@ -183,7 +183,7 @@ def _load(path: Path, race: dict[str, Any]) -> FloatArray:
 
 def _verdict(path: Path, status: int, output: bytes, words: bytes) -> FloatArray:
     """
-    Say what the end of the process means.
+    Turn the end of the process into a result or an error.
 
     :param path: of the track's file
     :param status: with which it ended
@@ -215,13 +215,13 @@ def _known_digests() -> frozenset[str]:
 
 
 def _engine_is_built() -> bool:
-    """Without it only the game's own process loads tracks, which hurts nobody by a crash."""
+    """Check for the engine. Without it only the game's own process loads tracks, and may crash."""
     return find_spec("sb3_torcs._engine") is not None
 
 
 def check_track(game: Game, race: RaceSetup, file: Path) -> None:
     """
-    Refuse a track at which the game would end without a word, or not at all.
+    Refuse a track at which the game would crash or hang.
 
     :param game: the installation
     :param race: who races where

@@ -1,4 +1,4 @@
-"""What a training keeps while it learns: whole files, whatever ends it.
+"""Save a training while it learns, so that its files are complete however it ends.
 
 Each file is written into a folder beside the others first, and moved when it is whole. So a kill, a
 power cut or a full disk leaves what was saved before.
@@ -36,12 +36,12 @@ class WholeFiles:
         self.aside = folder / UNFINISHED
 
     def unfinished(self) -> list[Path]:
-        """Return the files that are not where they are to be, the first that was begun first."""
+        """Return the files that are not moved yet, in the order in which they were begun."""
         files = [file for file in self.aside.rglob("*") if file.is_file()]
         return sorted(files, key=lambda file: file.stat().st_mtime_ns)
 
     def settle(self) -> None:
-        """Move the files to where they are to be: all of them are whole."""
+        """Move the files, which are complete, to their final paths."""
         files = self.unfinished()
         for file in files:
             with file.open("rb") as content:
@@ -51,7 +51,7 @@ class WholeFiles:
 
     def place(self, file: Path) -> Path:
         """
-        Say where a file is to be.
+        Return the final path of a file.
 
         :param file: in :attr:`aside`
         :return: its path; the folder of it is made
@@ -61,7 +61,7 @@ class WholeFiles:
         return target
 
     def drop(self) -> None:
-        """Remove what was not finished."""
+        """Remove unfinished files."""
         for file in self.unfinished():
             file.unlink()
 
@@ -72,10 +72,10 @@ class WholeFiles:
 
 class KeepCallback(BaseCallback):
     """
-    Keep the last model while it learns, with all that a training goes on from.
+    Save the last model while it learns, with everything that a training resumes from.
 
     That is the replay buffer of an off-policy algorithm, and the statistics of ``VecNormalize``.
-    What the callbacks before this one have written aside is moved to its place in each timestep.
+    In each timestep it moves the files of the callbacks before it to their final paths.
 
     :param files: folder of the run
     :param name: of the model's file, without ``.zip``; and of the folder of the statistics
@@ -102,9 +102,9 @@ class KeepCallback(BaseCallback):
 
     def keep(self) -> None:
         """
-        Save the model and what belongs to it; what was saved before is there until then.
+        Save the model and what belongs to it. The previous files stay until then.
 
-        The replay buffer comes last: it is large, and a disk may not take it.
+        The replay buffer comes last: it is large, and may not fit on the disk.
         """
         self.files.drop()
         aside = self.files.aside
@@ -120,5 +120,5 @@ class KeepCallback(BaseCallback):
             self.files.settle()
 
     def is_healthy(self) -> bool:
-        """Say whether all weights are numbers: a model that has diverged replaces none."""
+        """Check that all weights are finite; a diverged model must not replace a good one."""
         return all(bool(th.isfinite(weights).all()) for weights in self.model.policy.parameters())
