@@ -247,7 +247,7 @@ def test_a_search_that_was_ended_before_its_first_trial_is_told(monkeypatch, tmp
     monkeypatch.setattr(ExperimentManager, "hyperparameters_optimization", nothing)
     words = argparse.Namespace()
     manager = zoo_training.Manager(words, "ddpg", "TorcsLite-v0", str(tmp_path / "logs"))
-    with pytest.raises(InvalidOption, match="no trial of the search has come to its end"):
+    with pytest.raises(InvalidOption, match="no trial of the search has ended"):
         manager.hyperparameters_optimization()
 
 
