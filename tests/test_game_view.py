@@ -289,8 +289,8 @@ def test_races_on_threads_draw_it():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"render_mode": "game"}, "render_mode is 'game'.*that is for Torcs-v0"),
-        ({"picture": "game"}, "picture is 'game'.*that is for Torcs-v0"),
+        ({"render_mode": "game"}, "render_mode is 'game'.*so it is for Torcs-v0"),
+        ({"picture": "game"}, "picture is 'game'.*so it is for Torcs-v0"),
         ({"picture": "abov"}, "picture is 'abov'; expected 'above'"),
         ({"boards": False}, "boards is False, which needs the installed game"),
     ],
