@@ -3,6 +3,9 @@
 from collections.abc import Sequence
 from typing import TypedDict
 
+import numpy as np
+import numpy.typing as npt
+
 from sb3_torcs.car import CarState, FloatArray
 
 class TrackSummary(TypedDict):
@@ -81,6 +84,13 @@ class Fleet:
     ) -> None: ...
     def wait(self, index: int) -> CarState: ...
     def finish(self) -> None: ...
+    def step(
+        self,
+        indices: npt.NDArray[np.int64],  # (n,) of the engines
+        controls: FloatArray,  # (n, 5) as of Controls; a gear of nan is the gearbox's choice
+        ticks: npt.NDArray[np.int64],  # (n,)
+        cars: FloatArray,  # (n, 82) filled, as of CarState
+    ) -> list[int]: ...  # the rows that were not, of races that failed
 
 def scr_format_state(  # 79 numbers, SI, in the protocol's order
     numbers: Sequence[float], exact: bool = False

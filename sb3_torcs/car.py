@@ -16,6 +16,7 @@ from sb3_torcs.errors import InvalidOption
 
 __all__ = [
     "CAR_LENGTH",
+    "CAR_RECORD",
     "CAR_WIDTH",
     "CONTROL_TICK",
     "DEFAULT_CAR",
@@ -29,6 +30,7 @@ __all__ = [
     "FloatArray",
     "Start",
     "StartName",
+    "car_from_record",
     "checked_laps",
     "checked_start",
     "checked_start_speed",
@@ -188,3 +190,29 @@ class CarState(NamedTuple):
     def off_track(self) -> bool:
         """Whether the mass centre has left the road, as the SCR server judges it."""
         return abs(self.distance_from_axis) > 0.5 * self.track_width
+
+
+_ARRAYS = {"wheel_speeds": 4, "range_finders": 19, "opponents": 36}
+_COUNTS = tuple(CarState._fields.index(name) for name in ("gear", "laps", "race_position"))
+_SCALARS = len(CarState._fields) - len(_ARRAYS)
+
+CAR_RECORD = np.dtype([(name, "f8", _ARRAYS.get(name, ())) for name in CarState._fields])
+"""A :class:`CarState` as a record of an array, for many cars at once; the engine writes such."""
+
+
+def car_from_record(numbers: FloatArray) -> CarState:
+    """
+    Read a car from an array.
+
+    :param numbers: (82,) of a :data:`CAR_RECORD`
+    :return: the car, which shares no memory with it
+    """
+    values: list[Any] = numbers[:_SCALARS].tolist()
+    for place in _COUNTS:
+        values[place] = int(values[place])
+    arrays, begin = numbers[_SCALARS:].copy(), 0
+    arrays.flags.writeable = False
+    for size in _ARRAYS.values():
+        values.append(arrays[begin : begin + size])
+        begin += size
+    return CarState._make(values)

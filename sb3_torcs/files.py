@@ -1,18 +1,22 @@
-"""Checks of files and folders for results, before any work begins."""
+"""Checks of files and folders for results, before any work begins; and YAML that people write."""
 
 from __future__ import annotations
 
+import itertools
 import os
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
+
+import yaml
 
 from sb3_torcs.errors import OutputNotWritable
 
-__all__ = ["writable_file", "writable_folder"]
+__all__ = ["read_yaml", "writable_file", "writable_folder"]
 
-if TYPE_CHECKING:
-    pass
+MAX_LENGTH = 2**16  # [characters] PyYAML takes about a second for as many
+MAX_BRACKETS = 100  # open at once: PyYAML's time grows with their square
+MAX_NODES = 100_000  # after aliases are expanded
 
 
 def writable_folder(folder: str | Path) -> Path:
@@ -51,3 +55,45 @@ def writable_file(file: str | Path, suffixes: tuple[str, ...]) -> Path:
         raise OutputNotWritable(f"'{path}' is a folder; give a file in it")
     writable_folder(path.parent)
     return path
+
+
+def read_yaml(text: str, loader_class: type[yaml.SafeLoader] = yaml.SafeLoader) -> Any:
+    """
+    Read a YAML document as plain data, with limits on size, depth and aliases, so that reading
+    never hangs.
+
+    :param text: of the file
+    :param loader_class: that builds the values
+    :return: of plain Python types
+    :raises yaml.YAMLError: if it is not YAML, or beyond the limits
+    """
+    if len(text) > MAX_LENGTH:
+        raise yaml.YAMLError(f"{len(text)} characters; at most {MAX_LENGTH} are read")
+    steps = ((char in "[{") - (char in "]}") for char in text)
+    if max(itertools.accumulate(steps), default=0) > MAX_BRACKETS:
+        raise yaml.YAMLError("it nests too deep")
+    loader = loader_class(text)
+    try:
+        node = loader.get_single_node()
+        if node is None:
+            return None
+        if _written_out(node, {}) > MAX_NODES:
+            raise yaml.YAMLError(f"its aliases stand for more than {MAX_NODES} values")
+        return loader.construct_document(node)
+    except RecursionError as error:
+        raise yaml.YAMLError("it nests too deep, or an alias is within what it stands for") from (
+            error
+        )
+    except ValueError as error:  # of an invalid date or number
+        raise yaml.YAMLError(str(error)) from error
+    finally:
+        loader.dispose()
+
+
+def _written_out(node: yaml.Node, known: dict[int, int]) -> int:
+    """Count the nodes after aliases are expanded, visiting each once."""
+    if id(node) not in known:
+        parts = node.value if isinstance(node, yaml.CollectionNode) else []
+        children = [child for part in parts for child in (part if type(part) is tuple else (part,))]
+        known[id(node)] = 1 + sum(_written_out(child, known) for child in children)
+    return known[id(node)]

@@ -134,7 +134,7 @@ class Reward:
         self.weights = {name: float(weight) for name, weight in weights.items()}
         scale = self.weights.get("scale", 1.0)
         self._crash = float(weights.get("crash", 0.0))
-        self._terms = tuple(
+        self.terms = tuple(
             (name, TERMS[name], float(weight) * scale)
             for name, weight in weights.items()
             if name in TERMS
@@ -146,7 +146,7 @@ class Reward:
 
         :return: all terms, each 0
         """
-        return dict.fromkeys((*(name for name, _, _ in self._terms), "crash"), 0.0)
+        return dict.fromkeys((*(name for name, _, _ in self.terms), "crash"), 0.0)
 
     def __call__(
         self, before: CarState, after: CarState, controls: Controls, end: str | None
@@ -162,7 +162,7 @@ class Reward:
         """
         seconds = after.time - before.time
         terms = {}  # filled in a loop: a comprehension is one more call per timestep
-        for name, term, weight in self._terms:
+        for name, term, weight in self.terms:
             # The state of a lost car does not advance: without time there is no rate.
             terms[name] = weight * seconds * term(before, after, controls) if seconds else 0.0
         terms["crash"] = self._crash if end in CRASHES else 0.0

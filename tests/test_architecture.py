@@ -30,14 +30,14 @@ LONGER_FILES = {
 # From the ground up. `sb3_torcs/__init__.py` registers the environments and loads nothing.
 FLOORS = (
     {"_engine", "errors", "signals"},
-    {"car", "files", "plain_yaml"},
+    {"car", "files"},
     {"telemetry", "torcs"},
     {"tracks"},
     {"actions", "rewards", "sensors"},  # with car and tracks: the vocabulary
     {"noise", "policies", "rendering", "scr"},
     {"backends"},
     {"envs"},
-    {"agents"},
+    {"agents", "vec_env"},
     {"callbacks", "evaluation"},
     {"training"},
     {"bench", "studies"},

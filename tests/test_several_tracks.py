@@ -99,5 +99,26 @@ def test_what_cannot_be_is_told(make):
 def test_what_has_one_track_refuses_a_list(options):
     with pytest.raises(InvalidOption, match="one track"):
         gym.make("Torcs-v0", track=TRACKS, **options)
-    with pytest.raises(InvalidOption, match="one track"):
-        gym.make_vec("Torcs-v0", num_envs=2, track=TRACKS)
+    with pytest.raises(InvalidOption, match="one car"):
+        gym.make("Torcs-v0", car=["car1-trb1"], **options)
+
+
+@pytest.mark.usefixtures("game")
+def test_every_car_has_its_turn_on_every_track():
+    env = gym.make("Torcs-v0", track=["aalborg", "dirt-1"], car=["car1-trb1", "baja-bug"]).unwrapped
+    seen = []
+    for number in range(40):
+        env.reset(seed=0 if number == 0 else None)
+        seen.append((env.track.name, env.backend.car))
+    assert len(set(seen)) == 4
+    again = gym.make("Torcs-v0", track="dirt-1", car="baja-bug").unwrapped
+    again.reset()
+    while (env.track.name, env.backend.car) != ("dirt-1", "baja-bug"):
+        env.reset()
+    assert env.step(GAS)[0].tobytes() == again.step(GAS)[0].tobytes()
+
+
+@pytest.mark.usefixtures("game")
+def test_a_list_of_cars_may_not_be_empty():
+    with pytest.raises(InvalidOption, match="car is an empty list"):
+        gym.make("Torcs-v0", car=[])

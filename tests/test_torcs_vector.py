@@ -88,6 +88,8 @@ def assert_same(one, other, where):
         (1, {"start": "random"}),
         (2, {"start": "random", "reward": "blog", "max_episode_steps": 40, "action_repeat": 2}),
         (3, {"start": "random", "sensor_noise": True, "track": "michigan"}),
+        (4, {"start": "random", "track": ["aalborg", "g-track-1"], "max_episode_steps": 20}),
+        (5, {"start": "random", "car": ["car1-trb1", "baja-bug"]}),
     ],
 )
 def test_threads_change_nothing_but_the_time(make, threads, mode, seed, options):

@@ -7,7 +7,7 @@ import yaml
 
 from sb3_torcs.cli import main
 from sb3_torcs.errors import StudyError, ZooConfigError
-from sb3_torcs.plain_yaml import read_yaml
+from sb3_torcs.files import read_yaml
 from sb3_torcs.studies.config import read_study
 from sb3_torcs.training import zoo, zoo_data
 

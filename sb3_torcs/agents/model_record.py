@@ -19,7 +19,7 @@ import yaml
 from sb3_torcs.agents.model_file import as_mismatch
 from sb3_torcs.agents.model_policy import Spaces, restored_space
 from sb3_torcs.errors import ModelMismatch
-from sb3_torcs.plain_yaml import read_yaml
+from sb3_torcs.files import read_yaml
 
 __all__ = ["RECORD", "VERSION", "Statistics", "TrainingRecord", "record_beside", "record_within"]
 

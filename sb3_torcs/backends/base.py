@@ -6,14 +6,16 @@ write these three methods and three attributes, and run the contract suite over 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Protocol
 
 import numpy as np
+import numpy.typing as npt
 
 from sb3_torcs.car import CarState, Controls, FloatArray, Start
 from sb3_torcs.tracks.track import Track
 
-__all__ = ["Backend"]
+__all__ = ["Backend", "Fleet"]
 
 
 class Backend(Protocol):
@@ -55,3 +57,44 @@ class Backend(Protocol):
 
     def close(self) -> None:
         """Free all resources. Called once by ``RacingEnv.close``."""
+
+
+class Fleet(Protocol):
+    """Several worlds of one kind that are driven at once. It may be handed over to no fork."""
+
+    def step(
+        self,
+        worlds: npt.NDArray[np.int64],
+        controls: FloatArray,
+        ticks: npt.NDArray[np.int64],
+        cars: FloatArray,
+    ) -> list[int]:
+        """
+        Hold controls in some of the worlds.
+
+        :param worlds: (n,) which
+        :param controls: (n, 5) as of :class:`~sb3_torcs.car.Controls`, finite and within their
+            ranges; a gear of nan leaves it to the gearbox
+        :param ticks: (n,) control ticks of 0.02 s
+        :param cars: (n, 82) filled, each row a :data:`~sb3_torcs.car.CAR_RECORD`
+        :return: the rows that are not filled, of races that failed
+        """
+
+    def failure(self, world: int) -> Exception:
+        """
+        Say what stopped a race.
+
+        :param world: that failed in the latest step
+        """
+
+    def arrive(self, world: int, steps: Iterable[tuple[Controls, int]], car: CarState) -> None:
+        """
+        Tell a world what it has been driven, before anybody else uses it.
+
+        :param world: which
+        :param steps: controls and ticks since it was told
+        :param car: at their end
+        """
+
+    def close(self) -> None:
+        """End the threads. The worlds stay."""

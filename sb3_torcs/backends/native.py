@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from sb3_torcs.actions import checked_gearbox
 from sb3_torcs.car import (
@@ -296,9 +297,37 @@ class Fleet:
         self._backends[index].arrive(*self._begun[index], state)
         return state
 
+    def step(
+        self,
+        worlds: npt.NDArray[np.int64],
+        controls: FloatArray,
+        ticks: npt.NDArray[np.int64],
+        cars: FloatArray,
+    ) -> list[int]:
+        """Drive some of them; see :class:`~sb3_torcs.backends.base.Fleet`."""
+        failed: list[int] = self._fleet.step(worlds, controls, ticks, cars)
+        return failed
+
+    def failure(self, world: int) -> Exception:
+        """Say what stopped a race; see :class:`~sb3_torcs.backends.base.Fleet`."""
+        try:
+            self._fleet.wait(world)
+        except Exception as error:
+            return error
+        raise AssertionError("the race has not failed")
+
+    def arrive(self, world: int, steps: Iterable[tuple[Controls, int]], car: CarState) -> None:
+        """Tell a world what it has been driven; see :class:`~sb3_torcs.backends.base.Fleet`."""
+        for controls, ticks in steps:
+            self._backends[world].arrive(controls, ticks, car)
+
     def finish(self) -> None:
         """Drive until all steps are done."""
         self._fleet.finish()
+
+    def close(self) -> None:
+        """End the threads; see :class:`~sb3_torcs.backends.base.Fleet`."""
+        del self._fleet
 
 
 @lru_cache

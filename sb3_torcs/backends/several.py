@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypeGuard
 
 import numpy as np
@@ -13,43 +13,61 @@ from sb3_torcs.car import CarState, Controls, Start
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.tracks.track import Track
 
-__all__ = ["SeveralTracks", "is_several"]
+__all__ = ["SeveralWorlds", "is_several", "one_or_several", "world_index", "worlds_of"]
 
 
-def is_several(track: Any) -> TypeGuard[Sequence[Any]]:
+def is_several(choice: Any, name: str = "track") -> TypeGuard[Sequence[Any]]:
     """
-    Check whether several tracks are given.
+    Check whether several tracks or cars are given.
 
-    :param track: what was given
+    :param choice: what was given
+    :param name: of the option
     :raises InvalidOption: if it is an empty list
     """
-    several = isinstance(track, Sequence) and not isinstance(track, str)
-    if several and not track:
-        raise InvalidOption("track is an empty list; give a name, or a list with one at least")
+    several = isinstance(choice, Sequence) and not isinstance(choice, str)
+    if several and not choice:
+        raise InvalidOption(f"{name} is an empty list; give a name, or a list with one at least")
     return several
 
 
-class SeveralTracks:
+def one_or_several(make: Callable[[Any, Any], Backend], track: Any, car: Any) -> Backend:
     """
-    The same car on one of several tracks, drawn anew for each episode.
+    Make the world of a track and a car; or one for each pair, where a list was given.
 
-    :param worlds: one for each track; they have the same car and range finders
+    :param make: makes the world of a track and a car
+    :param track: or several
+    :param car: or several
+    :raises InvalidOption: if a list is empty
+    """
+    several = is_several(track), is_several(car, "car")
+    if not any(several):
+        return make(track, car)
+    tracks, cars = (track if several[0] else [track]), (car if several[1] else [car])
+    return SeveralWorlds(make(one, other) for one in tracks for other in cars)
+
+
+class SeveralWorlds:
+    """
+    One of several cars on one of several tracks, both drawn anew for each episode.
+
+    :param worlds: one for each track and car; they have the same range finders
     """
 
     def __init__(self, worlds: Iterable[Backend]) -> None:
-        self._worlds = tuple(worlds)
+        self.worlds = tuple(worlds)
         self._enter(0)
-        self.car = self._world.car
-        self.gears: int = getattr(self._world, "gears", GEARS)
+        self.gears: int = min(getattr(world, "gears", GEARS) for world in self.worlds)
         self.range_finder_angles = self._world.range_finder_angles
 
-    def _enter(self, place: int) -> None:
-        self._world = self._worlds[place]
+    def _enter(self, index: int) -> None:
+        self.index = index
+        self._world = self.worlds[index]
         self.track: Track = self._world.track
+        self.car = self._world.car
 
     def draw_track(self, rng: np.random.Generator) -> None:
-        """Choose the next episode's track; see :class:`~sb3_torcs.backends.base.Backend`."""
-        self._enter(int(rng.integers(len(self._worlds))))
+        """Choose the next episode's world; see :class:`~sb3_torcs.backends.base.Backend`."""
+        self._enter(int(rng.integers(len(self.worlds))))
 
     def reset(self, rng: np.random.Generator, start: Start | None) -> CarState:
         """Begin an episode; see :class:`~sb3_torcs.backends.base.Backend`."""
@@ -63,5 +81,23 @@ class SeveralTracks:
 
     def close(self) -> None:
         """Close all worlds."""
-        for world in self._worlds:
+        for world in self.worlds:
             world.close()
+
+
+def worlds_of(backend: Backend) -> tuple[Backend, ...]:
+    """
+    Say which worlds there are behind a backend.
+
+    :param backend: one world, or several
+    """
+    return backend.worlds if isinstance(backend, SeveralWorlds) else (backend,)
+
+
+def world_index(backend: Backend) -> int:
+    """
+    Say in which of its worlds a backend is.
+
+    :param backend: one world, or several
+    """
+    return backend.index if isinstance(backend, SeveralWorlds) else 0

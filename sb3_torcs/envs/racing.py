@@ -69,6 +69,61 @@ class RacingInfo(TypedDict):
     end: str  # why the episode ended; empty if the time limit truncated it
 
 
+def racing_info(
+    car: CarState, lap_time: float, terms: dict[str, float], end: str | None = None
+) -> dict[str, Any]:
+    """
+    Say what ``info`` holds.
+
+    :param car: at the end of the timestep
+    :param lap_time: of the lap that the timestep has completed, else 0 [s]
+    :param terms: of the reward
+    :param end: why the episode ended, or ``None``
+    """
+    info: RacingInfo = {
+        "laps": car.laps,
+        "lap_time": lap_time,
+        "best_lap_time": car.best_lap_time,
+        "distance": car.distance_raced,
+        "off_track": car.off_track,
+        "damage": car.damage,
+        "reward_terms": terms,
+        "car": car,
+        "end": end or "",
+    }
+    return info  # type: ignore[return-value]  # Gymnasium says dict, and it is one
+
+
+ENDS = ("", "laps", "off_track", "backwards", "damage")
+"""Why an episode ends where a car is; the numbers of :func:`end_of`."""
+
+
+def end_of(car: CarState, laps: float) -> int:
+    """
+    Say whether an episode ends here, but for a car that stands. Compiled code calls it, too.
+
+    :param car: at the end of a timestep
+    :param laps: whole laps after which it does
+    :return: the place of the reason in :data:`ENDS`, 0 if it goes on
+    """
+    if car.laps >= laps:
+        return 1
+    if car.off_track:
+        return 2
+    if abs(car.heading_error) > BACKWARDS_ANGLE:
+        return 3
+    return 4 if car.damage >= MAX_DAMAGE else 0
+
+
+def stands(car: CarState) -> bool:
+    """
+    Say whether a car is slower along the road than walking. Compiled code calls it, too.
+
+    :param car: at the end of a timestep
+    """
+    return car.speed_x * math.cos(car.heading_error) < STUCK_SPEED
+
+
 class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
     """
     A car on a track, driven by steering and pedals.
@@ -115,9 +170,9 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         }
         self.observation_space = spaces.Box(OBSERVATION_LOW, OBSERVATION_HIGH, dtype=np.float32)
         self.action = action
-        self._layout = action_layout(action, getattr(backend, "gears", GEARS))
+        self.layout = action_layout(action, getattr(backend, "gears", GEARS))
         self.action_space = spaces.Box(
-            np.array(self._layout.low, np.float32), np.array(self._layout.high, np.float32)
+            np.array(self.layout.low, np.float32), np.array(self.layout.high, np.float32)
         )
         self.set_reward(reward)
         self.set_start(start)
@@ -151,7 +206,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         :return: the previous reward
         """
         previous = getattr(self, "_reward_choice", None)
-        self._reward = Reward(reward)
+        self.reward = Reward(reward)
         self._reward_choice = reward
         return previous
 
@@ -197,11 +252,11 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         self.car = None  # if the reset fails, no step is possible
         self.car = self.backend.reset(self.np_random, start)
         self._controls = Controls(0.0, 0.0, 0.0)
-        self._patience = STUCK_TICKS if start is not None and start.speed > 0.0 else GRACE_TICKS
-        self._standing = 0
+        self.patience = STUCK_TICKS if start is not None and start.speed > 0.0 else GRACE_TICKS
+        self.standing = 0
         if self.render_mode == "human":
             self.render()
-        return encode(self.car), self._info(self.car, 0.0, self._reward.nothing(), None)
+        return encode(self.car), racing_info(self.car, 0.0, self.reward.nothing(), None)
 
     def step(
         self, action: npt.NDArray[np.float32]
@@ -224,12 +279,20 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         :param action: as of ``step``
         :return: the arguments of the backend's ``step``
         """
+        self.check_ready()
+        self._controls = controls_from_action(action, self.layout)
+        return self._controls
+
+    def check_ready(self) -> None:
+        """
+        Make sure that there is a race to drive on in.
+
+        :raises EnvClosed: before a reset and after ``close``
+        """
         if self._closed or self.car is None:
             when = "close" if self._closed else "reset"
             remedy = "make a new environment" if self._closed else "call reset first"
             raise EnvClosed(f"step {'after' if self._closed else 'before'} {when}; {remedy}")
-        self._controls = controls_from_action(action, self._layout)
-        return self._controls
 
     @property
     def controls(self) -> Controls:
@@ -254,9 +317,9 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
             # End the episode, and not a training of millions of timesteps.
             after, end = before, "lost"
         self.car = after
-        terms = self._reward(before, after, self._controls, end)
+        terms = self.reward(before, after, self._controls, end)
         lap_time = after.last_lap_time if after.laps > before.laps else 0.0
-        info = self._info(after, lap_time, terms, end)
+        info = racing_info(after, lap_time, terms, end)
         if self.render_mode == "human":
             self.render()
         truncated = end == "laps"
@@ -297,37 +360,28 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
             self._viewer.close()
         self.backend.close()
 
+    def arrive(self, car: CarState, controls: Controls, standing: int) -> None:
+        """
+        Go on from where the car is that somebody else has driven, as a batch of races does.
+
+        :param car: there
+        :param controls: that were held last
+        :param standing: control ticks for which it has been standing
+        """
+        self.car, self._controls, self.standing = car, controls, standing
+        if standing == 0:
+            self.patience = STUCK_TICKS
+
     def _end(self, car: CarState) -> str | None:
         """Return why the episode ends, or ``None`` if it goes on."""
-        if self.laps is not None and car.laps >= self.laps:
-            return "laps"
-        if car.off_track:
-            return "off_track"
-        if abs(car.heading_error) > BACKWARDS_ANGLE:
-            return "backwards"
-        if car.damage >= MAX_DAMAGE:
-            return "damage"
-        if car.speed_x * math.cos(car.heading_error) >= STUCK_SPEED:
-            self._standing, self._patience = 0, STUCK_TICKS
+        reason = end_of(car, math.inf if self.laps is None else self.laps)
+        if reason:
+            return ENDS[reason]
+        if not stands(car):
+            self.standing, self.patience = 0, STUCK_TICKS
             return None
-        self._standing += self.action_repeat
-        return "stuck" if self._standing > self._patience else None
-
-    def _info(
-        self, car: CarState, lap_time: float, terms: dict[str, float], end: str | None
-    ) -> dict[str, Any]:
-        info: RacingInfo = {
-            "laps": car.laps,
-            "lap_time": lap_time,
-            "best_lap_time": car.best_lap_time,
-            "distance": car.distance_raced,
-            "off_track": car.off_track,
-            "damage": car.damage,
-            "reward_terms": terms,
-            "car": car,
-            "end": end or "",
-        }
-        return info  # type: ignore[return-value]  # Gymnasium says dict, and it is one
+        self.standing += self.action_repeat
+        return "stuck" if self.standing > self.patience else None
 
     def _draw_start(self) -> Start | None:
         if self._start == "grid":

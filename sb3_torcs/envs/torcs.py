@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -14,7 +13,7 @@ from sb3_torcs.actions import ActionName, GearboxName, used_gearbox
 from sb3_torcs.backends.base import Backend
 from sb3_torcs.backends.native import NativeBackend
 from sb3_torcs.backends.scr import ScrBackend
-from sb3_torcs.backends.several import SeveralTracks, is_several
+from sb3_torcs.backends.several import is_several, one_or_several
 from sb3_torcs.car import DEFAULT_CAR, StartName, is_count
 from sb3_torcs.envs.racing import RacingEnv, RenderMode
 from sb3_torcs.errors import EnvClosed, InvalidOption, near_miss
@@ -53,7 +52,7 @@ class TorcsEnv(RacingEnv):
 
     :param track: ``"aalborg"``, ``"road/aalborg"``, or the path of a TORCS XML file; or a list of
         them: each episode is on one, drawn from the seed
-    :param car: any of the game's, e.g. ``"car1-trb1"``
+    :param car: any of the game's, e.g. ``"car1-trb1"``; or a list of them, as for the track
     :param reward: ``"progress"``, ``"blog"``, ``"apex"``, or a dict of weights
     :param action_repeat: control ticks of 0.02 s per timestep
     :param range_finders: ``"scr"``, ``"narrow"``, or 19 angles in degrees, left to right
@@ -93,7 +92,7 @@ class TorcsEnv(RacingEnv):
         self,
         *,
         track: str | Path | Sequence[str | Path] = "aalborg",
-        car: str = DEFAULT_CAR,
+        car: str | Sequence[str] = DEFAULT_CAR,
         reward: RewardChoice = "progress",
         action_repeat: int = 5,
         range_finders: RangeFinderName | Sequence[float] = "scr",
@@ -127,8 +126,8 @@ class TorcsEnv(RacingEnv):
                 "picture 'game' is for backend 'native'; `sb3-torcs serve --window` shows the "
                 "game of backend 'scr'"
             )
-        if self.picture == "game" and is_several(track):
-            raise InvalidOption("picture 'game' is for one track; give one, not a list")
+        if self.picture == "game" and (is_several(track) or is_several(car, "car")):
+            raise InvalidOption("picture 'game' is for one track and one car, not for a list")
         if self.picture == "game":
             one: Any = track
             game = find_game()
@@ -137,9 +136,9 @@ class TorcsEnv(RacingEnv):
             _world(
                 backend,
                 track,
+                car,
                 sensor_noise=sensor_noise,
                 address={"host": host, "port": port},
-                car=car,
                 range_finders=range_finders,
                 gearbox=used_gearbox(gearbox, action),
                 opponents=opponents,
@@ -188,6 +187,7 @@ class TorcsEnv(RacingEnv):
 def _world(
     backend: BackendName,
     track: Any,
+    car: Any,
     *,
     sensor_noise: bool,
     address: Mapping[str, Any],
@@ -198,6 +198,7 @@ def _world(
 
     :param backend: as of :class:`TorcsEnv`
     :param track: as there
+    :param car: as there
     :param sensor_noise: as there
     :param address: host and port, as there
     :param options: that all worlds have
@@ -209,19 +210,23 @@ def _world(
                 "sensor_noise is for backend 'native'; an SCR server adds noise of its own if it "
                 "is started with -noisy"
             )
-        if is_several(track):
-            raise InvalidOption(
-                f"track is {track!r}; a game of backend 'scr' has one track, backend 'native' "
-                "takes several"
-            )
-        return ScrBackend(track, **options, **address)
+        for name, choice in (("track", track), ("car", car)):
+            if is_several(choice, name):
+                raise InvalidOption(
+                    f"{name} is {choice!r}; a game of backend 'scr' has one {name}, backend "
+                    "'native' takes several"
+                )
+        return ScrBackend(track, car=car, **options, **address)
     for name, value in address.items():
         if value is not None:
             raise InvalidOption(
                 f"{name} is {value!r}, which is for an SCR server; add backend='scr'"
             )
-    make: Callable[[Any], Backend] = partial(NativeBackend, **options, sensor_noise=sensor_noise)
-    return SeveralTracks(map(make, track)) if is_several(track) else make(track)
+
+    def make(track: Any, car: str) -> Backend:
+        return NativeBackend(track, car=car, **options, sensor_noise=sensor_noise)
+
+    return one_or_several(make, track, car)
 
 
 def _picture(picture: PictureName, render_mode: GameRenderMode | None) -> PictureName:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 from sb3_torcs.actions import ActionName, GearboxName, used_gearbox
 from sb3_torcs.backends.base import Backend
 from sb3_torcs.backends.lite.backend import LiteBackend
-from sb3_torcs.backends.several import SeveralTracks, is_several
+from sb3_torcs.backends.several import one_or_several
 from sb3_torcs.car import DEFAULT_CAR, StartName
 from sb3_torcs.envs.racing import RacingEnv, RenderMode
 from sb3_torcs.errors import InvalidOption
@@ -85,7 +84,7 @@ class TorcsLiteEnv(RacingEnv):
         self,
         *,
         track: str | Path | Track | Sequence[str | Path | Track] = "aalborg",
-        car: str = DEFAULT_CAR,
+        car: str | Sequence[str] = DEFAULT_CAR,
         reward: RewardChoice = "progress",
         action_repeat: int = 5,
         range_finders: RangeFinderName | Sequence[float] = "scr",
@@ -107,11 +106,13 @@ class TorcsLiteEnv(RacingEnv):
         if picture != "above":
             raise InvalidOption(f"picture is {picture!r}; expected 'above'")
         _refuse(of_the_game)
-        make: Callable[[Any], Backend] = partial(
-            LiteBackend, car=car, range_finders=range_finders, gearbox=used_gearbox(gearbox, action)
-        )
+
+        def make(track: Any, car: str) -> Backend:
+            box = used_gearbox(gearbox, action)
+            return LiteBackend(track, car=car, range_finders=range_finders, gearbox=box)
+
         super().__init__(
-            SeveralTracks(map(make, track)) if is_several(track) else make(track),
+            one_or_several(make, track, car),
             action=action,
             reward=reward,
             action_repeat=action_repeat,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 from collections.abc import Callable, Iterable
@@ -15,7 +16,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from sb3_torcs.backends.native import Fleet
-from sb3_torcs.backends.several import is_several
+from sb3_torcs.backends.several import world_index, worlds_of
 from sb3_torcs.car import CarState, is_count
 from sb3_torcs.envs.racing import Observation
 from sb3_torcs.envs.torcs import TorcsEnv
@@ -71,11 +72,6 @@ class TorcsVectorEnv(SyncVectorEnv):
                 f"backend is {options['backend']!r}; races on threads are for backend 'native', "
                 "others drive with gym.make_vec(..., vectorization_mode='async')"
             )
-        if is_several(options.get("track", "aalborg")):
-            raise InvalidOption(
-                "track is a list; races on threads are on one track, others drive with "
-                "gym.make_vec(..., vectorization_mode='sync')"
-            )
         registered = gym.spec("Torcs-v0").max_episode_steps or NO_LIMIT
         limit = registered if max_episode_steps is None else max_episode_steps
         if not is_count(limit) and limit != NO_LIMIT:
@@ -89,7 +85,9 @@ class TorcsVectorEnv(SyncVectorEnv):
             [lambda: _Race(timesteps, **options)] * int(num_envs), autoreset_mode=autoreset_mode
         )
         self.threads = min(threads or len(os.sched_getaffinity(0)), self.num_envs)
-        self._fleet = Fleet([env.backend for env in self.envs], self.threads)
+        worlds: list[Any] = [worlds_of(env.backend) for env in self.envs]
+        self._first = [0, *itertools.accumulate(map(len, worlds))]  # of each race's worlds
+        self._fleet = Fleet([world for several in worlds for world in several], self.threads)
 
     def step(self, actions: Iterable[npt.NDArray[np.float32]]) -> Answers:
         """
@@ -117,11 +115,15 @@ class TorcsVectorEnv(SyncVectorEnv):
         }
         try:
             for index, asked in controls.items():
-                self._fleet.begin(index, asked, ticks)
+                self._fleet.begin(self._world(index), asked, ticks)
             return self._collect(anew)
         except BaseException:
             self._fleet.finish()  # so that a reset finds no thread at work
             raise
+
+    def _world(self, index: int) -> int:
+        """The world of the fleet in which a race is."""
+        return self._first[index] + world_index(self.envs[index].backend)
 
     def _begin_anew(self) -> list[bool]:
         """Say for each race whether this timestep begins an episode instead."""
@@ -148,7 +150,7 @@ class TorcsVectorEnv(SyncVectorEnv):
                 observation, info = env.reset()
             else:
                 observation, reward, end, cut, info = env.finish_step(
-                    partial(self._fleet.wait, index)
+                    partial(self._fleet.wait, self._world(index))
                 )
                 rewards[index] = reward
                 if end or cut:

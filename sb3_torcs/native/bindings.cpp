@@ -94,6 +94,34 @@ std::unique_ptr<Fleet> make_fleet(const std::vector<Engine*>& engines, int threa
     return std::make_unique<Fleet>(engines, threads);
 }
 
+// Reads orders from arrays with a row for each: controls are those of sb3_torcs.car.Controls, a
+// gear that is no number leaves it to the gearbox. Arrivals are written straight into the rows of
+// `cars`.
+std::vector<Fleet::Order> orders_of(const py::array_t<std::int64_t, py::array::c_style>& indices,
+                                    const py::array_t<double, py::array::c_style>& controls,
+                                    const py::array_t<std::int64_t, py::array::c_style>& ticks,
+                                    py::array_t<double, py::array::c_style>& cars) {
+    constexpr py::ssize_t NUMBERS = sizeof(Reading) / sizeof(double);
+    const py::ssize_t number = indices.size();
+    if (indices.ndim() != 1 || ticks.ndim() != 1 || ticks.size() != number ||
+        controls.ndim() != 2 || controls.shape(0) != number || controls.shape(1) != 5 ||
+        cars.ndim() != 2 || cars.shape(0) != number || cars.shape(1) != NUMBERS)
+        throw py::type_error("expected indices (n,), controls (n, 5), ticks (n,), cars (n, " +
+                             std::to_string(NUMBERS) + ")");
+    const auto asked = controls.unchecked<2>();
+    Reading* const arrivals = reinterpret_cast<Reading*>(cars.mutable_data());
+    std::vector<Fleet::Order> orders;
+    orders.reserve(static_cast<std::size_t>(number));
+    for (py::ssize_t i = 0; i < number; i++) {
+        std::optional<int> gear;
+        if (!std::isnan(asked(i, 3))) gear = static_cast<int>(asked(i, 3));
+        orders.push_back({static_cast<std::size_t>(indices.at(i)),
+                          controls_of(asked(i, 0), asked(i, 1), asked(i, 2), gear, asked(i, 4)),
+                          static_cast<int>(ticks.at(i)), arrivals + i});
+    }
+    return orders;
+}
+
 // The game's side of the SCR protocol, so that its client can be held to it.
 void bind_scr(py::module_& module) {
     module.def(
@@ -309,6 +337,18 @@ PYBIND11_MODULE(_engine, module) {
                  }
                  return as_state(*reading);
              })
+        .def(
+            "step",
+            [](Fleet& fleet, const py::array_t<std::int64_t, py::array::c_style>& indices,
+               const py::array_t<double, py::array::c_style>& controls,
+               const py::array_t<std::int64_t, py::array::c_style>& ticks,
+               py::array_t<double, py::array::c_style>& cars) {
+                const std::vector<Fleet::Order> orders = orders_of(indices, controls, ticks, cars);
+                const WithoutPython released;
+                return fleet.step(orders);
+            },
+            "indices"_a, "controls"_a, "ticks"_a, py::arg("cars").noconvert(),
+            "Drive several at once; writes their cars, and returns the rows of those that failed.")
         .def("finish", [](Fleet& fleet) {
             const WithoutPython released;
             fleet.finish();

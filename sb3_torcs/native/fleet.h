@@ -23,15 +23,28 @@ public:
     // Drive until all have arrived.
     void finish() { pool_.finish(); }
 
+    // What one of several engines shall do, and where the car that has arrived is written down.
+    struct Order {
+        std::size_t index;
+        Controls controls;
+        int ticks;
+        Reading* arrival;
+    };
+    // Drive several until all have arrived. Returns which of the orders have failed, and have no
+    // arrival: `wait` throws what stopped them.
+    std::vector<std::size_t> step(const std::vector<Order>& orders);
+
 private:
     struct Task {
         Engine* engine;
         Controls controls;
         int ticks;
-        Reading reading;
+        Reading* arrival;
+        Reading reading;  // of those who give no other place for it
         std::exception_ptr failure;
     };
 
+    void begin(const Order& order);
     void work(std::size_t index);
 
     std::vector<Task> tasks_;

@@ -22,7 +22,7 @@ import yaml
 
 from sb3_torcs.agents.wrapping import unrebuilt
 from sb3_torcs.errors import StudyError, near_miss, with_new_names
-from sb3_torcs.plain_yaml import read_yaml
+from sb3_torcs.files import read_yaml
 from sb3_torcs.torcs.track_names import RANDOM_TRACK
 from sb3_torcs.tracks.catalogue import available_tracks, load_track
 from sb3_torcs.training import zoo

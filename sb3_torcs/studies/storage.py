@@ -28,7 +28,7 @@ import yaml
 
 from sb3_torcs.agents.models import BEST_MODEL
 from sb3_torcs.errors import OutputNotWritable, StudyError
-from sb3_torcs.plain_yaml import read_yaml
+from sb3_torcs.files import read_yaml
 from sb3_torcs.studies.config import FIELDS, Study, Trial, track_name
 
 __all__ = ["RECIPE", "RESULTS", "ROWS", "Files", "StudyFolder", "write_whole"]

@@ -22,7 +22,7 @@ import yaml
 
 from sb3_torcs.car import is_count, is_number
 from sb3_torcs.errors import ZooConfigError, near_miss
-from sb3_torcs.plain_yaml import read_yaml
+from sb3_torcs.files import read_yaml
 from sb3_torcs.sensors import look_both_ways, range_finder_angles
 from sb3_torcs.training.zoo_data import as_data, check_class, check_data
 

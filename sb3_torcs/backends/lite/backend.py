@@ -55,12 +55,33 @@ class LiteBackend:
         self._gearbox = physics.BY_ROAD_SPEED if by_road else physics.AUTOMATIC
         self.range_finder_angles = range_finder_angles(range_finders)
         self._random = track == RANDOM_TRACK
+        self._flying = False
+        self._state = np.zeros(physics.STATE_SIZE)
         self._set_track(load_track(track, np.random.default_rng(0) if self._random else None))
 
     def _set_track(self, track: Track) -> None:
         self.track = track
         self._table: FloatArray = track.table
         self._edges: Edges = road_edges(track)
+
+    def keep_state_in(self, state: FloatArray) -> None:
+        """
+        Keep the car in other memory from now on, e.g. in that of a fleet.
+
+        :param state: (STATE_SIZE,) overwritten by the present state
+        """
+        state[:] = self._state
+        self._state = state
+
+    @property
+    def road(self) -> tuple[FloatArray, Edges]:
+        """The present track for the physics: its table, and the road's edges."""
+        return self._table, self._edges
+
+    @property
+    def manner(self) -> tuple[int, bool]:
+        """How the physics drives it: the gearbox, and whether the episode began on the way."""
+        return self._gearbox, self._flying
 
     def reset(self, rng: np.random.Generator, start: Start | None) -> CarState:
         """Begin an episode; see :class:`~sb3_torcs.backends.base.Backend`."""
@@ -78,7 +99,7 @@ class LiteBackend:
         x, y, heading = track.pose(start.distance, offset)
         segment, _ = track.find(start.distance)
         yaw = heading - start.heading_error
-        self._state = physics.place(x, y, yaw, start.speed, segment, self._table)
+        self._state[:] = physics.place(x, y, yaw, start.speed, segment, self._table)
         if start.distance == 0.0:
             self._state[physics.CROSSINGS] = 1.0  # on the line itself, the lap has begun
         return self._read()
@@ -89,11 +110,15 @@ class LiteBackend:
         asked = (steering, throttle, brake, self._gearbox if gear is None else gear, clutch)
         physics.advance(self._state, self._table, asked, ticks, self._flying)
         if not math.isfinite(self._state[physics.X] + self._state[physics.VX]):
-            raise CarLost(
-                f"the physics has given NaN on {self.track.name}, so the car has no position; see "
-                "the surfaces of that track, and call reset to go on"
-            )
+            raise self.lost()
         return self._read()
+
+    def lost(self) -> CarLost:
+        """Return the error of a car that has no position any more."""
+        return CarLost(
+            f"the physics has given NaN on {self.track.name}, so the car has no position; see the "
+            "surfaces of that track, and call reset to go on"
+        )
 
     def close(self) -> None:
         """Do nothing: the world holds only arrays."""

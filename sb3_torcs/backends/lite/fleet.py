@@ -1,0 +1,130 @@
+"""Several fallback worlds that are driven at once, by one call of compiled code per track."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from sb3_torcs.backends.lite import physics
+from sb3_torcs.backends.lite.backend import LiteBackend
+from sb3_torcs.backends.lite.rays import RANGE, Edges
+from sb3_torcs.car import CarState, Controls, FloatArray
+
+__all__ = ["LiteFleet"]
+
+Rows = npt.NDArray[np.int64]
+Road = tuple[FloatArray, Edges]
+
+WHEELS = physics.SCALARS + 1  # where they begin in a row, behind the place in the race
+BEAMS = WHEELS + 4
+OPPONENTS = BEAMS + 19
+
+
+@njit(cache=True, nogil=True)
+def _drive(
+    rows: Rows,
+    worlds: Rows,
+    states: FloatArray,
+    table: FloatArray,
+    shapes: FloatArray,
+    first: npt.NDArray[np.int64],
+    reach: npt.NDArray[np.int64],
+    angles: FloatArray,
+    gearboxes: Rows,
+    flying: npt.NDArray[np.bool_],
+    controls: FloatArray,
+    ticks: Rows,
+    cars: FloatArray,
+    lost: npt.NDArray[np.bool_],
+) -> None:
+    """Drive those of one track; what is what says :meth:`LiteFleet.step`."""
+    for row in rows:
+        world = worlds[row]
+        state, car = states[world], cars[row]
+        steering, throttle, brake, gear, clutch = controls[row]
+        wanted = gearboxes[world] if math.isnan(gear) else int(gear)
+        asked = (steering, throttle, brake, wanted, clutch)
+        physics.advance(state, table, asked, ticks[row], flying[world])
+        lost[row] = not math.isfinite(state[physics.X] + state[physics.VX])
+        physics.read(
+            state,
+            table,
+            shapes,
+            first,
+            reach,
+            angles[world],
+            car[: physics.SCALARS],
+            car[WHEELS:BEAMS],
+            car[BEAMS:OPPONENTS],
+        )
+        car[physics.SCALARS] = 1.0  # nobody else is here
+        car[OPPONENTS:] = RANGE
+
+
+class LiteFleet:
+    """
+    Several worlds that are driven at once, by threads that live as long as this object.
+
+    :param backends: each only once; their cars are kept by this object from now on
+    :param threads: that drive, with the calling one among them
+    """
+
+    def __init__(self, backends: Sequence[LiteBackend], threads: int) -> None:
+        self._backends = list(backends)
+        self._states = np.zeros((len(self._backends), physics.STATE_SIZE))
+        for backend, state in zip(self._backends, self._states, strict=True):
+            backend.keep_state_in(state)
+        self._angles = np.stack([backend.range_finder_angles for backend in self._backends])
+        self._gearboxes = np.zeros(len(self._backends), np.int64)
+        self._flying = np.zeros(len(self._backends), np.bool_)
+        self._threads = threads
+        self._others = ThreadPoolExecutor(threads - 1) if threads > 1 else None
+
+    def step(self, worlds: Rows, controls: FloatArray, ticks: Rows, cars: FloatArray) -> list[int]:
+        """Drive some of them; see :class:`~sb3_torcs.backends.base.Fleet`."""
+        lost = np.zeros(len(worlds), np.bool_)
+
+        def drive(rows: Rows, road: Road) -> None:
+            table, edges = road
+            manners = self._gearboxes, self._flying
+            _drive(
+                rows, worlds, self._states, table, *edges, self._angles, *manners, controls, ticks,
+                cars, lost,
+            )  # fmt: skip
+
+        first, *others = self._jobs(worlds)
+        begun = [self._others.submit(drive, *job) for job in others] if self._others else []
+        for job in (first,) if begun else (first, *others):
+            drive(*job)
+        for other in begun:
+            other.result()
+        return np.flatnonzero(lost).tolist()
+
+    def _jobs(self, worlds: Rows) -> Iterator[tuple[Rows, Road]]:
+        """The rows of each track, cut so that all threads have work."""
+        tracks: dict[int, list[int]] = {}
+        for row, world in enumerate(worlds.tolist()):
+            backend = self._backends[world]
+            self._gearboxes[world], self._flying[world] = backend.manner
+            tracks.setdefault(id(backend.road[0]), []).append(row)
+        for rows in tracks.values():
+            road = self._backends[worlds[rows[0]]].road
+            parts = math.ceil(self._threads * len(rows) / len(worlds))
+            yield from ((part, road) for part in np.array_split(rows, parts) if len(part))
+
+    def failure(self, world: int) -> Exception:
+        """Say what stopped a race; see :class:`~sb3_torcs.backends.base.Fleet`."""
+        return self._backends[world].lost()
+
+    def arrive(self, world: int, steps: Iterable[tuple[Controls, int]], car: CarState) -> None:
+        """There is nothing to tell: see :class:`~sb3_torcs.backends.base.Fleet`."""
+
+    def close(self) -> None:
+        """End the threads; see :class:`~sb3_torcs.backends.base.Fleet`."""
+        if self._others is not None:
+            self._others.shutdown()

@@ -1,0 +1,313 @@
+"""Many racing environments at once: what ``RacingEnv.step`` does, in a few calls for all."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from sb3_torcs.actions import controls_from_action
+from sb3_torcs.backends.base import Backend, Fleet
+from sb3_torcs.backends.lite.backend import LiteBackend
+from sb3_torcs.backends.lite.fleet import LiteFleet
+from sb3_torcs.backends.native import Fleet as NativeFleet
+from sb3_torcs.backends.native import NativeBackend
+from sb3_torcs.backends.several import world_index, worlds_of
+from sb3_torcs.car import CAR_RECORD, CarState, Controls, FloatArray, car_from_record
+from sb3_torcs.envs.compiled import COMPILED, read_actions, value_timesteps
+from sb3_torcs.envs.racing import RacingEnv, racing_info
+from sb3_torcs.errors import CarLost, InvalidAction, InvalidOption
+from sb3_torcs.rewards import Term
+from sb3_torcs.sensors import OBSERVATION_SIZE
+
+__all__ = ["Batch", "Timestep", "fleet_of"]
+
+Counts = npt.NDArray[np.int64]
+
+CONTROLS_RECORD = np.dtype([(name, "f8") for name in Controls._fields])
+CAR_NUMBERS = CAR_RECORD.itemsize // 8
+NO_TERM = -1
+
+
+class Timestep(NamedTuple):
+    """What a timestep of all races has come to; its arrays are not written to again."""
+
+    before: FloatArray  # (n, 82) cars
+    after: FloatArray  # (n, 82) cars
+    controls: FloatArray  # (n, 5) that were held
+    observations: npt.NDArray[np.float32]  # (n, 29)
+    rewards: list[float]
+    terms: list[list[float]]  # of the rewards, in the order of `names`
+    names: list[tuple[str, ...]]
+    standing: Counts  # (n,) control ticks for which cars had been standing before
+    patience: Counts  # (n,) for which they might
+    ended: npt.NDArray[np.bool_]  # (n,) or the race has failed; a time limit is not known here
+    failures: dict[int, Exception]  # of races that have not arrived
+
+    def info(self, race: int) -> dict[str, Any]:
+        """
+        Make the ``info`` of a race whose episode goes on.
+
+        :param race: which
+        """
+        car = car_from_record(self.after[race])
+        lapped = car.laps > self.before[race, LAPS]
+        terms = dict(zip(self.names[race], self.terms[race], strict=False))
+        terms["crash"] = 0.0
+        return racing_info(car, car.last_lap_time if lapped else 0.0, terms)
+
+
+LAPS = CarState._fields.index("laps")
+
+
+class _Driven:
+    """
+    Stands where a world stands, while an environment takes a timestep that is driven already.
+
+    :param world: that has driven
+    :param timestep: of all races
+    :param race: which
+    """
+
+    def __init__(self, world: Backend, timestep: Timestep, race: int) -> None:
+        self._world, self._timestep, self._race = world, timestep, race
+
+    def step(self, controls: Controls, ticks: int) -> CarState:
+        """Answer what the world would; see :class:`~sb3_torcs.backends.base.Backend`."""
+        del controls, ticks  # the same that were held
+        if self._race in self._timestep.failures:
+            raise self._timestep.failures[self._race]
+        return car_from_record(self._timestep.after[self._race])
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._world, name)
+
+
+class Batch:
+    """
+    Racing environments that take their timesteps at once.
+
+    What is known about a race is here while it is driven, and in its environment while somebody
+    uses that: :meth:`leave` brings it there, :meth:`enter` back.
+
+    :param envs: of one kind and with the same layout of actions
+    :param threads: that drive, at least 1; ``None`` is one per core, and one per race at most
+    :raises InvalidOption: if they cannot be driven together
+    """
+
+    def __init__(self, envs: Sequence[RacingEnv], threads: int | None = None) -> None:
+        self.envs = list(envs)
+        number = len(self.envs)
+        self.threads = min(threads or len(os.sched_getaffinity(0)), number)
+        layouts = {(env.layout.names, env.layout.high) for env in self.envs}
+        if len(layouts) > 1:
+            raise InvalidOption(
+                f"the environments read actions in {len(layouts)} ways; give all the same action "
+                "and cars with as many gears"
+            )
+        self._layout = self.envs[0].layout
+        self._limits = np.array(self._layout.low), np.array(self._layout.high)
+        worlds = [worlds_of(env.backend) for env in self.envs]
+        self._first = np.cumsum([0, *map(len, worlds)])[:-1]
+        self._fleet = fleet_of([world for several in worlds for world in several], self.threads)
+        self._worlds = self._first.astype(np.int64)
+        self._cars = np.zeros((number, CAR_NUMBERS))
+        self._controls = np.zeros((number, 5))
+        self._laps = np.full(number, np.inf)
+        self._ticks, self._patience, self._standing = np.ones((3, number), np.int64)
+        self._driven: list[list[FloatArray]] = [[] for _ in self.envs]
+        self._rewards = [env.reward for env in self.envs]
+        self._read_rewards()
+
+    def _read_rewards(self) -> None:
+        """Look the terms of all rewards up."""
+        number, most = len(self.envs), max(len(reward.terms) for reward in self._rewards)
+        self._choices = np.full((number, most), NO_TERM)
+        self._weights = np.zeros((number, most))
+        self._in_python: list[tuple[int, int, Term, float]] = []
+        for race, reward in enumerate(self._rewards):
+            for i, (_, term, weight) in enumerate(reward.terms):
+                self._weights[race, i] = weight
+                if term in COMPILED:
+                    self._choices[race, i] = COMPILED.index(term)
+                else:
+                    self._in_python.append((race, i, term, weight))
+        self._names = [tuple(name for name, _, _ in reward.terms) for reward in self._rewards]
+
+    def enter(self, race: int) -> None:
+        """
+        Take a race over from its environment, which has been reset.
+
+        :param race: which
+        """
+        env = self.envs[race]
+        assert env.car is not None, "step raises before the first reset"
+        self._worlds[race] = self._first[race] + world_index(env.backend)
+        self._cars[race] = np.hstack(env.car)
+        self._laps[race] = np.inf if env.laps is None else env.laps
+        self._ticks[race] = env.action_repeat
+        self._patience[race], self._standing[race] = env.patience, env.standing
+        self._driven[race] = []
+        if env.reward is not self._rewards[race]:
+            self._rewards[race] = env.reward
+            self._read_rewards()
+
+    def leave(self, race: int) -> None:
+        """
+        Let the environment of a race know all that has happened.
+
+        :param race: which
+        """
+        if not self._driven[race]:
+            return
+        env, ticks = self.envs[race], int(self._ticks[race])
+        car = car_from_record(self._cars[race])
+        steps = [(_controls(row[race]), ticks) for row in self._driven[race]]
+        self._fleet.arrive(int(self._worlds[race]), steps, car)
+        env.arrive(car, steps[-1][0], int(self._standing[race]))
+        self._driven[race] = []
+
+    def step(self, asked: npt.NDArray[np.floating]) -> Timestep:
+        """
+        Hold an action in each race.
+
+        :param asked: (n, numbers of an action)
+        :return: what it has come to; those of ``ended`` and ``failures`` have to be finished
+        :raises InvalidAction: if there is not one action per race, or one is none; then nobody has
+            driven
+        """
+        controls = self._read(asked)
+        before, after = self._cars, np.empty_like(self._cars)
+        failed = self._fleet.step(self._worlds, controls, self._ticks, after)
+        after[failed] = before[failed]
+        number = len(self.envs)
+        observations = np.empty((number, OBSERVATION_SIZE), np.float32)
+        values, ended = np.empty_like(self._weights), np.empty(number, np.bool_)
+        standing, patience = self._standing.copy(), self._patience.copy()
+        value_timesteps(
+            before.view(CAR_RECORD)[:, 0],
+            after.view(CAR_RECORD)[:, 0],
+            controls.view(CONTROLS_RECORD)[:, 0],
+            self._choices,
+            self._weights,
+            self._laps,
+            self._ticks,
+            self._patience,
+            self._standing,
+            observations,
+            values,
+            ended,
+        )
+        for race, i, term, weight in self._in_python:
+            values[race, i] = self._ask(term, weight, before[race], after[race], controls[race])
+        ended[failed] = True
+        terms = values.tolist()
+        self._cars = after
+        for driven in self._driven:
+            driven.append(controls)
+        return Timestep(
+            before,
+            after,
+            controls,
+            observations,
+            [sum(row) for row in terms],
+            terms,
+            self._names,
+            standing,
+            patience,
+            ended,
+            {race: self._fleet.failure(int(self._worlds[race])) for race in failed},
+        )
+
+    def finish(self, race: int, timestep: Timestep, act: Callable[[], Any]) -> Any:
+        """
+        Let an environment take the timestep itself that has been driven, with all its wrappers.
+
+        :param race: which
+        :param timestep: of all races
+        :param act: steps the outermost wrapper
+        :return: what that does
+        :raises Exception: if the race has failed; then it is where it was
+        """
+        env = self.envs[race]
+        failure = timestep.failures.get(race)
+        if failure is not None and not isinstance(failure, CarLost):
+            self._driven[race].pop()
+            self._standing[race] = timestep.standing[race]
+            self._patience[race] = timestep.patience[race]
+            raise failure
+        env.car = car_from_record(timestep.before[race])
+        env.standing = int(timestep.standing[race])
+        env.patience = int(timestep.patience[race])
+        world, env.backend = env.backend, _Driven(env.backend, timestep, race)
+        try:
+            return act()
+        finally:
+            env.backend = world
+            self._driven[race] = []
+
+    def close(self) -> None:
+        """End the threads."""
+        self._fleet.close()
+
+    def _read(self, asked: npt.NDArray[np.floating]) -> FloatArray:
+        """Turn the actions into controls, (n, 5)."""
+        low, high = self._limits
+        controls = np.empty((len(self.envs), len(Controls._fields)))
+        if isinstance(asked, np.ndarray) and asked.dtype.char in "fd":
+            fits = asked.shape == (len(self.envs), len(low))
+            if fits and read_actions(np.ascontiguousarray(asked), low, high, controls):
+                return controls
+        rows = list(asked)
+        if len(rows) != len(self.envs):
+            raise InvalidAction(
+                f"{len(rows)} actions for {len(self.envs)} races; expected shape "
+                f"({len(self.envs)}, {len(low)}), as of model.predict(observations)"
+            )
+        for race, row in enumerate(rows):
+            steering, throttle, brake, gear, clutch = controls_from_action(row, self._layout)
+            controls[race] = steering, throttle, brake, np.nan if gear is None else gear, clutch
+        return controls
+
+    def _ask(
+        self,
+        term: Term,
+        weight: float,
+        before: FloatArray,
+        after: FloatArray,
+        controls: FloatArray,
+    ) -> float:
+        """Value a term that is not compiled."""
+        was, car = car_from_record(before), car_from_record(after)
+        seconds = car.time - was.time
+        return weight * seconds * term(was, car, _controls(controls)) if seconds else 0.0
+
+
+def _controls(row: FloatArray) -> Controls:
+    """Read controls from an array, (5,)."""
+    steering, throttle, brake, gear, clutch = row.tolist()
+    return Controls(steering, throttle, brake, None if gear != gear else int(gear), clutch)
+
+
+def fleet_of(worlds: Sequence[Backend], threads: int) -> Fleet:
+    """
+    Put worlds together that are to be driven at once.
+
+    :param worlds: of one kind
+    :param threads: that drive
+    :raises InvalidOption: if that kind cannot
+    """
+    native = [world for world in worlds if isinstance(world, NativeBackend)]
+    lite = [world for world in worlds if isinstance(world, LiteBackend)]
+    if len(native) == len(worlds):
+        return NativeFleet(native, threads)
+    if len(lite) == len(worlds):
+        return LiteFleet(lite, threads)
+    kinds = sorted({type(world).__name__ for world in worlds})
+    raise InvalidOption(
+        f"races on threads are for backend 'native' of Torcs-v0 or for TorcsLite-v0, these are "
+        f"of {', '.join(kinds)}; others drive in DummyVecEnv or SubprocVecEnv"
+    )

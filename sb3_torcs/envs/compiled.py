@@ -1,0 +1,156 @@
+"""What a single environment does in a timestep, compiled for many at once.
+
+Nothing is said twice here: sensors, terms of rewards, layouts of actions and the end of an episode
+are those of :class:`~sb3_torcs.envs.racing.RacingEnv`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit, types
+from numba.extending import overload_attribute, register_jitable
+
+from sb3_torcs import actions, rewards
+from sb3_torcs.car import CarState, FloatArray
+from sb3_torcs.envs.racing import STUCK_TICKS, end_of, stands
+from sb3_torcs.sensors import encode_record
+
+__all__ = ["COMPILED", "read_actions", "value_timesteps"]
+
+Counts = npt.NDArray[np.int64]
+
+COMPILED: tuple[rewards.Term, ...] = tuple(
+    term for term in rewards.TERMS.values() if term.__module__ == rewards.__name__
+)
+"""Terms of rewards; others, which somebody has added to the table, are asked in Python."""
+
+
+def _derived(name: str) -> None:
+    """Let records of cars have a property of ``CarState`` in compiled code."""
+    formula = register_jitable(getattr(CarState, name).fget)
+
+    @overload_attribute(types.Record, name)
+    def attribute(car: Any) -> Callable[[Any], Any]:
+        del car  # its type alone counts
+
+        def value(car: Any) -> Any:
+            return formula(car)
+
+        return value
+
+
+for _name in ("track_position", "off_track"):
+    _derived(_name)
+for _function in (end_of, stands, *(actions.action_layout(name).read for name in actions.ACTIONS)):
+    register_jitable(_function)
+_read_pedals, _read_pedal, _read_manual = (
+    actions.action_layout(name).read for name in ("pedals", "pedal", "manual")
+)
+
+
+@njit(cache=True)
+def read_actions(asked: Any, low: FloatArray, high: FloatArray, controls: FloatArray) -> bool:
+    """
+    Turn actions into controls, as :func:`~sb3_torcs.actions.controls_from_action` does.
+
+    :param asked: (n, numbers of an action)
+    :param low: of the layout
+    :param high: of the layout
+    :param controls: (n, 5) filled
+    :return: whether all are numbers
+    """
+    numbers = np.empty(len(low))
+    for row in range(len(asked)):
+        for i in range(len(low)):
+            number = float(asked[row, i])
+            if number != number:
+                return False
+            if not low[i] <= number <= high[i]:
+                number = min(max(number, low[i]), high[i])
+            numbers[i] = number
+        shift = np.nan
+        if len(low) == 2:
+            steering, throttle, brake, _, clutch = _read_pedal((numbers[0], numbers[1]))
+        elif len(low) == 3:
+            steering, throttle, brake, _, clutch = _read_pedals(
+                (numbers[0], numbers[1], numbers[2])
+            )
+        else:
+            steering, throttle, brake, gear, clutch = _read_manual(
+                (numbers[0], numbers[1], numbers[2], numbers[3], numbers[4])
+            )
+            shift = gear  # type: ignore[assignment]  # None for no manual layout
+        fields = (steering, throttle, brake, shift, clutch)
+        for i in range(5):
+            controls[row, i] = fields[i]
+    return True
+
+
+def _one_of(terms: Sequence[rewards.Term]) -> Any:
+    """Compile a function that values the term of a place, which it is told first."""
+    first = njit(terms[0])
+    rest = _one_of(terms[1:]) if terms[1:] else None
+
+    @njit
+    def value(place: int, before: Any, after: Any, controls: Any) -> float:
+        if rest is None or place == 0:
+            return first(before, after, controls)
+        return rest(place - 1, before, after, controls)
+
+    return value
+
+
+_term = _one_of(COMPILED)
+
+
+@njit(cache=True)
+def value_timesteps(
+    before: Any,
+    after: Any,
+    controls: Any,
+    choices: Counts,
+    weights: FloatArray,
+    laps: FloatArray,
+    ticks: Counts,
+    patience: Counts,
+    standing: Counts,
+    observations: npt.NDArray[np.float32],
+    terms: FloatArray,
+    ended: npt.NDArray[np.bool_],
+) -> None:
+    """
+    Do for each race what ``RacingEnv.finish_step`` does.
+
+    :param before: (n,) cars
+    :param after: (n,) cars
+    :param controls: (n,) that were held
+    :param choices: (n, k) places in :data:`COMPILED`, or negative
+    :param weights: (n, k) of the terms
+    :param laps: (n,) after which an episode is over
+    :param ticks: (n,) control ticks of a timestep
+    :param patience: (n,) control ticks for which cars may stand, changed
+    :param standing: (n,) control ticks for which they have been standing, changed
+    :param observations: (n, 29) filled
+    :param terms: (n, k) filled
+    :param ended: (n,) filled
+    """
+    for race in range(len(after)):
+        was, car = before[race], after[race]
+        encode_record(car, observations[race])
+        seconds = car.time - was.time
+        for i in range(choices.shape[1]):
+            terms[race, i] = 0.0
+            if choices[race, i] >= 0 and seconds != 0.0:
+                value = _term(choices[race, i], was, car, controls[race])
+                terms[race, i] = weights[race, i] * seconds * value
+        ended[race] = end_of(car, laps[race]) != 0
+        if not ended[race]:
+            if stands(car):
+                standing[race] += ticks[race]
+                ended[race] = standing[race] > patience[race]
+            else:
+                standing[race], patience[race] = 0, STUCK_TICKS

@@ -1,0 +1,292 @@
+"""Many races in one process as an environment of Stable-Baselines3, driven on threads."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, MutableMapping
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.wrappers import OrderEnforcing
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
+
+from sb3_torcs.car import is_count
+from sb3_torcs.envs.batch import Batch, Timestep
+from sb3_torcs.envs.racing import RacingEnv, RacingInfo
+from sb3_torcs.errors import EnvClosed, InvalidOption
+
+__all__ = ["RaceInfo", "TorcsVecEnv"]
+
+EnvMaker = Callable[[], gym.Env[Any, Any]]
+
+TRUNCATED = "TimeLimit.truncated"
+NO_LIMIT = 1 << 62
+
+
+class RaceInfo(MutableMapping[str, Any]):
+    """
+    The ``info`` of a race whose episode goes on. Its values are made when somebody asks for one.
+
+    :param timestep: of all races
+    :param race: which
+    """
+
+    __slots__ = ("_race", "_timestep", "_values")
+
+    def __init__(self, timestep: Timestep, race: int) -> None:
+        self._timestep, self._race = timestep, race
+        self._values: dict[str, Any] | None = None
+
+    def get(self, name: str, default: Any = None) -> Any:
+        """Look a value up; see :class:`dict`."""
+        if self._values is None and name not in RacingInfo.__annotations__:
+            return False if name == TRUNCATED else default
+        return self._made().get(name, default)
+
+    def copy(self) -> dict[str, Any]:
+        """Make a dict of it."""
+        return self._made().copy()
+
+    def _made(self) -> dict[str, Any]:
+        if self._values is None:
+            self._values = self._timestep.info(self._race)
+            self._values[TRUNCATED] = False
+        return self._values
+
+    def __getitem__(self, name: str) -> Any:
+        return self._made()[name]
+
+    def __setitem__(self, name: str, value: Any) -> None:
+        self._made()[name] = value
+
+    def __delitem__(self, name: str) -> None:
+        del self._made()[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._made())
+
+    def __len__(self) -> int:
+        return len(self._made())
+
+    def __repr__(self) -> str:
+        return repr(self._made())
+
+    def __reduce__(self) -> tuple[type, tuple[dict[str, Any]]]:
+        return dict, (self._made(),)
+
+
+class TorcsVecEnv(DummyVecEnv):
+    """
+    Several races, driven at once by threads of this process.
+
+    It does what ``DummyVecEnv`` over the same environments in ``Monitor`` does, to the bit, in much
+    less time. ``make_vec_env`` and whoever else hands over functions that make environments may
+    take it in the place of ``DummyVecEnv``.
+
+    :param races: how many; or functions that make the environments, wrapped in no more than
+        ``Monitor``, ``TimeLimit`` and ``OrderEnforcing``
+    :param agents: cars that learn in each race; 1 for now
+    :param threads: that share the work, at least 1; ``None`` is one per core, and one per race at
+        most
+    :param env_id: ``"Torcs-v0"`` or ``"TorcsLite-v0"``
+    :param env_kwargs: as of ``gym.make``, the same for all races
+    :raises InvalidOption: if an option has a value that is not allowed
+    """
+
+    def __init__(
+        self,
+        races: int | list[EnvMaker] | tuple[EnvMaker, ...] = 1,
+        agents: int = 1,
+        threads: int | None = None,
+        *,
+        env_id: str = "Torcs-v0",
+        **env_kwargs: Any,
+    ) -> None:
+        self._batch: Batch | None = None
+        if agents != 1:
+            raise InvalidOption(f"agents is {agents!r}; races with several learners come later: 1")
+        if threads is not None and not is_count(threads):
+            raise InvalidOption(f"threads is {threads!r}; expected a whole number >= 1, or None")
+        if isinstance(races, (list, tuple)) and races:
+            if env_kwargs:
+                names = ", ".join(env_kwargs)
+                raise InvalidOption(f"{names} is for races made here; give it to your functions")
+            makers = list(races)
+        elif is_count(races):
+            makers = [partial(_monitored, env_id, env_kwargs)] * int(races)  # type: ignore[arg-type]
+        else:
+            raise InvalidOption(f"races is {races!r}; expected a whole number >= 1")
+        super().__init__(makers)
+        try:
+            self._races = [_Race(env) for env in self._envs]
+            self._batch = Batch([race.racing for race in self._races], threads)
+        except BaseException:
+            self.close()
+            raise
+        self.threads = self._batch.threads
+        self._elapsed = np.zeros(self.num_envs, np.int64)  # timesteps of the episodes
+        self._limits = np.full(self.num_envs, NO_LIMIT)
+        self._watched = [race.racing for race in self._races if race.racing.render_mode == "human"]
+
+    @property
+    def envs(self) -> list[gym.Env[Any, Any]]:
+        """The environments; they are told all that has happened when somebody looks at them."""
+        if self._driving:
+            self._leave()
+        return self._envs
+
+    @envs.setter
+    def envs(self, envs: list[gym.Env[Any, Any]]) -> None:
+        """Take the environments over; ``DummyVecEnv`` sets them."""
+        self._envs = envs
+        self._driving = False
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """
+        Hold an action in each race.
+
+        :return: observations, rewards, dones and infos
+        :raises InvalidAction: if there is not one action per race, or one is none; then nobody has
+            driven
+        """
+        if self._batch is None:
+            raise EnvClosed("step after close; make a new environment")
+        if not self._driving:
+            self._enter()
+        timestep = self._batch.step(self.actions)
+        rewards = np.array(timestep.rewards, np.float32)
+        dones = np.zeros(self.num_envs, np.bool_)
+        infos: list[Any] = [RaceInfo(timestep, i) for i in range(self.num_envs)]
+        over = timestep.ended | (self._elapsed + 1 >= self._limits)
+        self._elapsed += ~over
+        failures: list[Exception] = []
+        for i, finished in enumerate(over.tolist()):
+            if not finished:
+                self._races[i].append(timestep.rewards[i])
+                continue
+            try:
+                rewards[i], dones[i], infos[i] = self._finish(i, timestep)
+            except Exception as error:  # the other races have driven, too
+                failures.append(error)
+        for env in self._watched:
+            env.render()
+        if failures:
+            self._leave()
+            raise failures[0]
+        return timestep.observations, rewards, dones, infos
+
+    def _finish(self, i: int, timestep: Timestep) -> tuple[float, bool, dict[str, Any]]:
+        """Let the wrappers of a race see the end of its episode, and begin another one."""
+        assert self._batch is not None
+        race, env = self._races[i], self._envs[i]
+        race.leave(int(self._elapsed[i]))
+        answer = self._batch.finish(i, timestep, partial(env.step, self.actions[i]))
+        observation, reward, terminated, truncated, info = answer
+        info[TRUNCATED] = truncated and not terminated
+        done = terminated or truncated
+        if done:
+            info["terminal_observation"] = observation
+            observation, self.reset_infos[i] = env.reset()
+        timestep.observations[i] = observation
+        self._enter_race(i)
+        return reward, done, info
+
+    def _enter(self) -> None:
+        """Take all races over from their environments."""
+        for i in range(self.num_envs):
+            self._enter_race(i)
+        self._driving = True
+
+    def _enter_race(self, i: int) -> None:
+        assert self._batch is not None
+        self._elapsed[i], self._limits[i] = self._races[i].enter()
+        self._batch.enter(i)
+
+    def _leave(self) -> None:
+        """Tell all environments what has happened."""
+        self._driving = False
+        if self._batch is not None:
+            for i, race in enumerate(self._races):
+                self._batch.leave(i)
+                race.leave(int(self._elapsed[i]))
+
+    def close(self) -> None:
+        """Close all races and end the threads. Calling it twice does no harm."""
+        super().close()
+        if self._batch is not None:
+            self._batch.close()
+            self._batch = None
+
+
+class _Race:
+    """
+    The wrappers of one environment, which count and sum.
+
+    :param env: the outermost one
+    :raises InvalidOption: if there is a wrapper that would have to see every timestep
+    """
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        self._env = env
+        self._monitor: Monitor[Any, Any] | None = None
+        self._limit: Any = None
+        if not isinstance(env.unwrapped, RacingEnv):
+            raise InvalidOption(
+                f"{env} is no race; TorcsVecEnv drives Torcs-v0 and TorcsLite-v0, others drive in "
+                "DummyVecEnv"
+            )
+        self.racing = env.unwrapped
+        while isinstance(env, gym.Wrapper):
+            names = {kind.__name__ for kind in type(env).__mro__}  # the RL Zoo has one of its own
+            if type(env) is Monitor and self._monitor is None:
+                self._monitor = env
+            elif "TimeLimit" in names and self._limit is None:
+                self._limit = env
+            elif type(env) is not OrderEnforcing:
+                raise InvalidOption(
+                    f"a race is wrapped in {type(env).__name__}, which would miss what races that "
+                    "are driven at once do; leave it out, or use DummyVecEnv"
+                )
+            env = env.env
+        self.append: Callable[[float], None] = self._forget
+        self._noted = 0  # timesteps of this episode that the monitor knows
+
+    def _forget(self, reward: float) -> None:
+        """There is no monitor to tell a reward."""
+
+    def enter(self) -> tuple[int, int]:
+        """
+        Look at what has happened.
+
+        :return: timesteps of the present episode, and those after which it is cut
+        :raises EnvClosed: if there is no episode
+        """
+        self.racing.check_ready()
+        if self._monitor is not None:
+            if self._monitor.needs_reset:
+                raise RuntimeError("Tried to step environment that needs reset")
+            self.append = self._monitor.rewards.append
+        if self._limit is None:
+            self._noted = 0
+            return 0, NO_LIMIT
+        self._noted = self._limit._elapsed_steps
+        return self._noted, self._limit._max_episode_steps
+
+    def leave(self, elapsed: int) -> None:
+        """
+        Tell the wrappers what has happened.
+
+        :param elapsed: timesteps of the present episode
+        """
+        if self._monitor is not None:
+            self._monitor.total_steps += elapsed - self._noted
+        if self._limit is not None:
+            self._limit._elapsed_steps = elapsed
+        self._noted = elapsed
+
+
+def _monitored(env_id: str, env_kwargs: dict[str, Any]) -> gym.Env[Any, Any]:
+    return Monitor(gym.make(env_id, **env_kwargs))
