@@ -598,6 +598,17 @@ def test_the_command_that_goes_on_means_the_same_options():
     ]  # fmt: skip
 
 
+def test_the_pictures_come_after_the_entry_s_callbacks_and_the_bar_before(tmp_path):
+    pictures = tmp_path / "pictures"
+    asked = TrainOptions(pictures=pictures)
+    drawn = {"sb3_torcs.callbacks.LinePicturesCallback": {"folder": str(pictures)}}
+    assert training_run._with_display(asked, "own.Callback") == [
+        "sb3_torcs.callbacks.RacingProgressCallback", "own.Callback", drawn
+    ]  # fmt: skip
+    assert pictures.is_dir()
+    assert training_run._command(asked) == f"sb3-torcs train --seed 0 --pictures {pictures}"
+
+
 @pytest.mark.slow
 def test_a_training_leaves_models_and_logs(capsys, tmp_path):
     words = ["--conf-file", write_config(tmp_path), "--folder", str(tmp_path / "logs")]

@@ -43,7 +43,7 @@ def test_durations_are_said_as_people_say_them(seconds, text):
 def test_a_terminal_shows_steps_episode_distance_lap_and_time_left(oval):
     stream = Terminal()
     learned(oval, {"laps": 1, "last_lap_time": 61.234}, OFF, stream=stream)
-    last = stream.getvalue().rstrip().split("\r")[-1]
+    last = stream.getvalue().rpartition("\x1b[2K")[2]  # from where the display was erased
     for part in ("64/64 timesteps", "episode 1", "last 70 m", "best lap 61.23 s", "0 s left"):
         assert part in last
 

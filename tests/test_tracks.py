@@ -297,6 +297,14 @@ class TestPlot:
         plot_track(oval, path, line, np.linspace(0.0, 30.0, len(line)))
         assert path.stat().st_size > 1000
 
+    def test_a_title_and_the_end_of_the_colours_may_be_given(self, oval, tmp_path):
+        path = tmp_path / "oval.svg"
+        line = np.array([[0.0, 0.0], [10.0, 0.0], [20.0, 0.0]])
+        plot_track(oval, path, line, np.full(3, 20.0), title="a lap", fastest=50.0)
+        drawn = path.read_text(encoding="utf-8")
+        for text in ("a lap", "180"):  # [km/h] of 50 m/s
+            assert f"<!-- {text} -->" in drawn
+
     def test_the_line_and_its_speed_may_be_left_out(self, oval, tmp_path):
         plot_track(oval, tmp_path / "a.png")
         plot_track(oval, tmp_path / "b.png", np.zeros((2, 2)))

@@ -9,6 +9,7 @@ from sb3_torcs.callbacks.exploration import (
     StochasticBrakeCallback,
 )
 from sb3_torcs.callbacks.learning import GradientStepsCallback, MirrorCallback
+from sb3_torcs.callbacks.lines import LinePicturesCallback
 from sb3_torcs.callbacks.metrics import MONITOR_KWARGS, DrivingMetricsCallback
 from sb3_torcs.callbacks.progress import RacingProgressCallback
 from sb3_torcs.callbacks.switches import RandomStartCallback, RewardCallback
@@ -17,6 +18,7 @@ __all__ = [
     "MONITOR_KWARGS",
     "DrivingMetricsCallback",
     "GradientStepsCallback",
+    "LinePicturesCallback",
     "MirrorCallback",
     "NoiseCallback",
     "NoiseDecayCallback",

@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 import math
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -264,8 +264,8 @@ class DrivingMetricsCallback(BaseCallback):
     that ended.
 
     Means are taken since the logger's previous row. After each evaluation of an
-    ``EvalCallback`` of the training, one more lap is driven in its environment, and drawn if
-    TensorBoard is used.
+    ``EvalCallback`` of the training, one more lap is driven in its environment if TensorBoard is
+    used, which then shows its line, or if there are :attr:`listeners`, which are given the line.
 
     :param q_every: timesteps of the vector of environments between two estimates of Q
     :param q_size: transitions to ask the critic about
@@ -298,6 +298,7 @@ class DrivingMetricsCallback(BaseCallback):
         self.line_timesteps = line_timesteps
         self.best_lap_time: float | None = None  # [s] of the training
         self.best_evaluation_lap_time: float | None = None  # [s] of the lines driven
+        self.listeners: list[Callable[[DrivenLine], None]] = []
 
     def _on_training_start(self) -> None:
         space = self.training_env.action_space
@@ -404,7 +405,8 @@ class DrivingMetricsCallback(BaseCallback):
 
     def _record_line(self, env: VecEnv) -> None:
         formats = self.logger.output_formats
-        if not self.line or not any(isinstance(f, TensorBoardOutputFormat) for f in formats):
+        shown = any(isinstance(f, TensorBoardOutputFormat) for f in formats)
+        if not self.line or not (shown or self.listeners):
             return
         chance = copy.deepcopy(env.get_attr("np_random"))
         line = drive_lap(self.model, env, self.line_timesteps)
@@ -414,7 +416,10 @@ class DrivingMetricsCallback(BaseCallback):
             best = self.best_evaluation_lap_time or math.inf
             self.best_evaluation_lap_time = min(line.lap_time, best)
             self.logger.record("driving/evaluation_lap_time", line.lap_time)
-        picture = line_image(line)
-        self.logger.record("driving/line", Image(picture, "HWC"), exclude=TEXT_FORMATS)
+        for listener in self.listeners:
+            listener(line)
+        if shown:
+            picture = line_image(line)
+            self.logger.record("driving/line", Image(picture, "HWC"), exclude=TEXT_FORMATS)
         # Dump at once, as EvalCallback does: the next row may come much later.
         self.logger.dump(self.num_timesteps)

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import contextlib
+import math
+import os
 import sys
 import time
 from typing import Any, TextIO
 
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_torcs.callbacks.metrics import DrivingMetricsCallback, callbacks_in
+from sb3_torcs.callbacks.display import Display
+from sb3_torcs.callbacks.metrics import DrivenLine, DrivingMetricsCallback, callbacks_in
 from sb3_torcs.car import is_number
 from sb3_torcs.errors import InvalidOption
 
-__all__ = ["RacingProgressCallback", "Unbroken", "spoken_time"]
+__all__ = ["RacingProgressCallback", "Unbroken", "spoken_moment", "spoken_time"]
 
-BAR = "{percentage:3.0f}% {bar} {n_fmt}/{total_fmt} timesteps{postfix}"
-REDRAW = 0.2  # [s] between two looks of the bar
+REDRAW = 0.2  # [s] between two pictures of the display
+FIRST_LAP = "bold green"  # style of the line that tells of it
 
 
 def spoken_time(seconds: float) -> str:
@@ -31,6 +34,17 @@ def spoken_time(seconds: float) -> str:
         return f"{whole} s"
     minutes = round(whole / 60)
     return f"{minutes} min" if minutes < 100 else f"{minutes // 60} h {minutes % 60:02d} min"
+
+
+def spoken_moment(seconds: float) -> str:
+    """
+    Format a moment of a training.
+
+    :param seconds: since it began [s]
+    :return: e.g. ``"12 s"`` or ``"1 min 12 s"``
+    """
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"
 
 
 class Unbroken:
@@ -66,8 +80,9 @@ class RacingProgressCallback(BaseCallback):
     Show the progress: timesteps, episode, distance of the last one, best lap, time left.
 
     On a terminal this is a bar; elsewhere (a log file, CI) a line every ``every`` seconds. The
-    training does not depend on the clock. Lap times of evaluations come from the
-    :class:`~sb3_torcs.callbacks.DrivingMetricsCallback` of the same training, if it has one.
+    training does not depend on the clock. With the
+    :class:`~sb3_torcs.callbacks.DrivingMetricsCallback` of the same training, there are a line for
+    each evaluation, and on a terminal curves of them. The first whole lap is told at once.
 
     :param every: seconds between two lines where there is no terminal [s]
     :param stream: where to write; ``None`` is the standard error
@@ -85,7 +100,10 @@ class RacingProgressCallback(BaseCallback):
         self.distance: float | None = None  # [m] of the last episode
         self.best_lap_time: float | None = None  # [s]
         self._stream = stream
-        self._bar: Any = None
+        self._display: Display | None = None
+        self._distances: list[float] = []  # [m] of the evaluations
+        self._lap_times: list[float | None] = []  # [s]
+        self._lap_length = 0.0  # [m]
         self._ended = True  # has not begun
 
     def _on_training_start(self) -> None:
@@ -100,30 +118,21 @@ class RacingProgressCallback(BaseCallback):
             for callback in callbacks_in(self.locals.get("callback"))
             if isinstance(callback, DrivingMetricsCallback)
         ]
-        if stream.isatty():
-            from tqdm import tqdm
-
-            class Bar(tqdm):
-                monitor_interval = 0  # no thread: SubprocVecEnv may still have to fork
-
-            self._bar = Bar(
-                total=self._total,
-                initial=self._first,
-                file=stream,
-                bar_format=BAR,
-                dynamic_ncols=True,
-                mininterval=REDRAW,
-            )
+        for metrics in self._metrics:
+            if self._take_line not in metrics.listeners:
+                metrics.listeners.append(self._take_line)
+        if stream.isatty() and os.environ.get("TERM") != "dumb":
+            self._display = Display(stream, self._total)
 
     def _on_step(self) -> bool:
         for info, done in zip(self.locals["infos"], self.locals["dones"], strict=True):
             if info.get("lap_time"):
-                self._take_lap(info["lap_time"])
+                self._take_lap(info["lap_time"], ", by a car that learns")
             if done:
                 self.episodes += 1
                 self.distance = info.get("distance")
         now = time.monotonic()
-        if now - self._spoken >= (REDRAW if self._bar is not None else self.every):
+        if now - self._spoken >= (REDRAW if self._display is not None else self.every):
             self._spoken = now
             self._show(now)
         return True
@@ -133,8 +142,9 @@ class RacingProgressCallback(BaseCallback):
             return
         self._ended = True
         self._show(time.monotonic())
-        if self._bar is not None:
-            self._bar.close()
+        if self._display is not None:
+            self._display.close()
+            self._display = None
 
     def describe(self, now: float) -> str:
         """
@@ -154,18 +164,50 @@ class RacingProgressCallback(BaseCallback):
             parts.append(f"{spoken_time(left)} left")
         return ", ".join(parts)
 
-    def _take_lap(self, seconds: float | None) -> None:
-        if seconds is not None and (self.best_lap_time is None or seconds < self.best_lap_time):
-            self.best_lap_time = seconds
+    def say(self, text: str, style: str = "") -> None:
+        """
+        Write a line that stays, also on a terminal.
+
+        :param text: to write
+        :param style: of rich, e.g. ``"bold"``
+        """
+        if self._display is not None:
+            self._display.say(text, style)
+            return
+        self._out.write(f"{text}\n")
+        self._out.flush()
+
+    def _moment(self) -> str:
+        return spoken_moment(time.monotonic() - self._started)
+
+    def _take_lap(self, seconds: float | None, where: str = "") -> None:
+        if seconds is None or seconds >= (self.best_lap_time or math.inf):
+            return
+        if self.best_lap_time is None:
+            self.say(f"{self._moment()}: the first whole lap, {seconds:.2f} s{where}", FIRST_LAP)
+        self.best_lap_time = seconds
+
+    def _take_line(self, line: DrivenLine) -> None:
+        """Tell what was driven after an evaluation."""
+        lap_time, known = line.lap_time, [seconds for seconds in self._lap_times if seconds]
+        self._distances.append(line.distance)
+        self._lap_times.append(lap_time)
+        self._lap_length = line.track.length
+        first = lap_time is not None and self.best_lap_time is None
+        self._take_lap(lap_time)
+        if lap_time is None:
+            self.say(f"{self._moment()}: {max(line.distance, 0.0):.0f} m")
+        elif not first:
+            best = ", the best so far" if known and lap_time < min(known) else ""
+            self.say(f"{self._moment()}: a whole lap, {lap_time:.2f} s{best}")
 
     def _show(self, now: float) -> None:
         for metrics in self._metrics:
             self._take_lap(metrics.best_evaluation_lap_time)
         text = self.describe(now)
-        if self._bar is not None:
-            self._bar.set_postfix_str(text, refresh=False)
-            self._bar.n = min(self.num_timesteps, self._total)
-            self._bar.refresh()
+        if self._display is not None:
+            curves = self._distances, self._lap_times, self._lap_length
+            self._display.show(self.num_timesteps, text, *curves)
             return
         share = 100 * self.num_timesteps // max(self._total, 1)
         self._out.write(f"{share}% {self.num_timesteps}/{self._total} timesteps, {text}\n")

@@ -78,6 +78,7 @@ def add_parser(subparsers: Any) -> None:
         "hyperparameter file: only if you trust their author",
     )
     add("--progress", action=argparse.BooleanOptionalAction, default=True, help="progress bar")
+    add("--pictures", metavar="DIR", help="keep pictures of the lines it learns, one a minute")
     parser.set_defaults(run=run)
 
 

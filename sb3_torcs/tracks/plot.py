@@ -31,6 +31,8 @@ def plot_track(
     path: str | os.PathLike[str],
     line: FloatArray | None = None,
     speed: FloatArray | None = None,
+    title: str | None = None,
+    fastest: float | None = None,
 ) -> None:
     """
     Draw a track seen from above, to scale.
@@ -39,6 +41,9 @@ def plot_track(
     :param path: of the picture; its suffix says the format, e.g. ``.png``, ``.svg`` or ``.pdf``
     :param line: places the car has passed, x and y, (n, 2) [m]
     :param speed: at these places, (n,) [m/s]; without it the line has one colour
+    :param title: above the picture; ``None`` is the track's name and measures
+    :param fastest: speed at the end of the colours, which begin at 0 [m/s]; ``None`` spreads them
+        over the given speeds
     """
     # Drawing is rare and its import is slow. Figures of their own leave the caller's windows be.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -53,11 +58,14 @@ def plot_track(
     if line is not None:
         drawn = _draw_line(axes, np.asarray(line), speed)
         if drawn is not None:
+            if fastest is not None:
+                drawn.set_clim(0.0, KMH * fastest)
             figure.colorbar(drawn, ax=axes, label="speed [km/h]", shrink=0.8)
-    axes.set_title(
+    measures = (
         f"{track.category}/{track.name}: {track.length:.0f} m, {track.width:.0f} m wide, "
         f"tightest bend {track.tightest_radius:.0f} m"
     )
+    axes.set_title(measures if title is None else title)
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")
     figure.savefig(path, dpi=120)

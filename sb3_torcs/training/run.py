@@ -26,6 +26,7 @@ EVALUATIONS = 40  # of a whole training, unless --eval-freq says otherwise
 SHORTEST_EVAL_FREQ = 1000  # timesteps
 
 PROGRESS = "sb3_torcs.callbacks.RacingProgressCallback"
+PICTURES = "sb3_torcs.callbacks.LinePicturesCallback"
 WORKER = "sb3_torcs.training.zoo.UninterruptedWorker"
 OURS = ("--algo", "--env", "--n-timesteps", "-n", "--log-folder", "-f", "--conf-file", "--uuid")
 """Words of the zoo that decide where things are; ours say the same."""
@@ -51,6 +52,8 @@ class TrainOptions:
     :param resume: a saved model (.zip) or a run's folder to continue from
     :param trust: accept a model without a record, and evaluate strings of the hyperparameter file
     :param progress: show a progress bar
+    :param pictures: folder for pictures of the driven lines, one a minute, and their table
+        ``laps.csv``; ``None`` draws none
     :param zoo_args: further arguments for the RL Zoo, which override the options
     """
 
@@ -68,6 +71,7 @@ class TrainOptions:
     resume: str | Path | None = None
     trust: bool = False
     progress: bool = True
+    pictures: str | Path | None = None
     zoo_args: tuple[str, ...] = ()
 
 
@@ -130,8 +134,8 @@ def train_run(options: TrainOptions) -> Run:
     if any(word.endswith("subproc") for word in options.zoo_args):
         wrappers = entry.get("env_wrapper") or []
         entry["env_wrapper"] = [*(wrappers if isinstance(wrappers, list) else [wrappers]), WORKER]
-    if options.progress:
-        entry["callback"] = _with_progress(entry.get("callback"))
+    if options.progress or options.pictures is not None:
+        entry["callback"] = _with_display(options, entry.get("callback"))
     words = _zoo_words(options, wanted, changed["env_kwargs"])
     words += ["--log-folder", str(folder), "--tensorboard-log", str(tensorboard)]
     words += ["--trained-agent", str(resume)] if resume else []
@@ -238,14 +242,20 @@ def _zoo_words(options: TrainOptions, wanted: int, env_kwargs: dict[str, Any]) -
     return words
 
 
-def _with_progress(callbacks: Any) -> list[Any]:
+def _with_display(options: TrainOptions, callbacks: Any) -> list[Any]:
     """
-    Add our progress bar, in front: the zoo cleans up after the first one when it is interrupted.
+    Add the pictures, and in front the progress bar: the zoo ends its first callback on Ctrl-C.
 
+    :param options: what to train
     :param callbacks: of the entry, in any of the zoo's forms
-    :return: as a list, with the bar
+    :return: as a list
     """
     items = callbacks if isinstance(callbacks, list) else [] if callbacks is None else [callbacks]
+    items = list(items)
+    if options.pictures is not None:
+        items.append({PICTURES: {"folder": str(writable_folder(options.pictures))}})
+    if not options.progress:
+        return items
     return [PROGRESS, *(item for item in items if item != PROGRESS)]
 
 

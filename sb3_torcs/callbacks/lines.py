@@ -1,0 +1,205 @@
+"""The lines that a training learns to drive, as a series of pictures and a table."""
+
+from __future__ import annotations
+
+import csv
+import math
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+
+from sb3_torcs.callbacks.metrics import DrivenLine, DrivingMetricsCallback, callbacks_in
+from sb3_torcs.callbacks.progress import RacingProgressCallback, spoken_moment
+from sb3_torcs.car import is_number
+from sb3_torcs.errors import InvalidOption
+
+if TYPE_CHECKING:
+    from matplotlib.figure import SubFigure
+
+__all__ = ["DrivenLap", "LinePicturesCallback", "draw_learning", "driven_laps"]
+
+TABLE = "laps.csv"
+SHOWN, COLUMNS = 6, 3  # pictures of a series, at most, in the picture of the learning; in a row
+SIZE, ROW = 15.0, 4.4  # [in] its width, and the height of the curves and of each row
+FASTEST = 70.0  # [m/s] the end of the colours, the same in all pictures of a series
+
+
+class DrivenLap(NamedTuple):
+    """One row of the table: what an evaluation of the training drove."""
+
+    seconds: float  # [s] since the training began
+    timesteps: int  # that were learned from until then
+    distance: float  # [m]
+    lap_time: float | None  # [s] of the whole lap, if it was one
+    picture: str  # its file, or nothing
+
+
+def driven_laps(folder: Path) -> list[DrivenLap]:
+    """
+    Read the table of a series.
+
+    :param folder: of a :class:`LinePicturesCallback`
+    :return: its rows; those that a full disk has broken are left out
+    """
+    if not (folder / TABLE).is_file():
+        return []
+    laps = []
+    with (folder / TABLE).open(newline="", encoding="utf-8") as file:
+        for row in csv.reader(file):
+            try:
+                seconds, timesteps, distance, lap_time, picture = row
+                time_of_lap = float(lap_time) if lap_time else None
+                lap = DrivenLap(
+                    float(seconds), int(timesteps), float(distance), time_of_lap, picture
+                )
+            except ValueError:  # the header, or half a row
+                continue
+            laps.append(lap)
+    return laps
+
+
+class LinePicturesCallback(BaseCallback):
+    """
+    Keep pictures of the lines that are driven after evaluations, and a table of all of them.
+
+    The folder gets ``001.png``, ``002.png``, ... and ``laps.csv``; a training that goes on
+    continues the series. The first evaluation and the first whole lap are always drawn. The lines
+    come from the :class:`~sb3_torcs.callbacks.DrivingMetricsCallback` of the same training. A file
+    that cannot be written ends the series, and not the training.
+
+    :param folder: is made
+    :param every: seconds between two pictures, at least [s]
+    :param verbose: as in ``BaseCallback``
+    """
+
+    def __init__(self, *, folder: str, every: float = 60.0, verbose: int = 0) -> None:
+        super().__init__(verbose)
+        if not is_number(every) or every < 0.0:
+            raise InvalidOption(f"every is {every!r} s; expected 0 or more")
+        self.folder = Path(folder)
+        self.every = every
+        self.writable = True
+
+    def _on_training_start(self) -> None:
+        callbacks = list(callbacks_in(self.locals.get("callback")))
+        drivers = [item for item in callbacks if isinstance(item, DrivingMetricsCallback)]
+        if not drivers or not any(isinstance(item, EvalCallback) for item in callbacks):
+            raise InvalidOption(
+                f"{type(self).__name__} draws what DrivingMetricsCallback drives after "
+                "evaluations; add sb3_torcs.callbacks.DrivingMetricsCallback and an EvalCallback"
+            )
+        if self._take not in drivers[0].listeners:
+            drivers[0].listeners.append(self._take)
+        self._progress = [item for item in callbacks if isinstance(item, RacingProgressCallback)]
+        self._begun = time.monotonic()
+        self._due = -math.inf  # [s] since then
+        self._before = driven_laps(self.folder)
+        self._complete = any(lap.lap_time for lap in self._before)
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _take(self, line: DrivenLine) -> None:
+        """Keep one line."""
+        if not self.writable:
+            return
+        now = time.monotonic() - self._begun
+        last = self._before[-1] if self._before else DrivenLap(0.0, 0, 0.0, None, "")
+        lap = DrivenLap(
+            now + last.seconds,
+            self.num_timesteps + last.timesteps,
+            line.distance,
+            line.lap_time,
+            "",
+        )
+        first_lap = line.lap_time is not None and not self._complete
+        self._complete |= first_lap
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            if first_lap or now >= self._due:
+                self._due = now + self.every
+                lap = lap._replace(picture=self._draw(line, lap).name)
+            self._write(lap)
+        except OSError as error:
+            self.writable = False
+            self._say(f"no more pictures: cannot write to {self.folder}: {error.strerror or error}")
+
+    def _draw(self, line: DrivenLine, lap: DrivenLap) -> Path:
+        # Graphics load only when there is something to draw.
+        from sb3_torcs.tracks.plot import plot_track
+
+        path = self.folder / f"{len(list(self.folder.glob('*.png'))) + 1:03d}.png"
+        aside = path.with_name(f".{path.name}")
+        driven = f"{lap.lap_time:.2f} s" if lap.lap_time else f"{max(lap.distance, 0.0):.0f} m"
+        title = f"{spoken_moment(lap.seconds)}, {lap.timesteps:,} timesteps: {driven}"
+        points = np.column_stack([line.x, line.y])
+        try:
+            plot_track(
+                line.track, aside, line=points, speed=line.speed, title=title, fastest=FASTEST
+            )
+            aside.replace(path)
+        finally:
+            aside.unlink(missing_ok=True)
+        self._say(f"{spoken_moment(lap.seconds)}: the line it drives, {path}")
+        return path
+
+    def _write(self, lap: DrivenLap) -> None:
+        path = self.folder / TABLE
+        new = not path.exists()
+        with path.open("a", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            if new:
+                writer.writerow(DrivenLap._fields)
+            seconds, distance = f"{lap.seconds:.1f}", f"{lap.distance:.1f}"
+            writer.writerow(lap._replace(seconds=seconds, distance=distance))  # type: ignore[arg-type]
+
+    def _say(self, text: str) -> None:
+        for progress in self._progress:
+            progress.say(text)
+
+
+def draw_learning(folder: Path, path: Path) -> None:
+    """
+    Draw how a training learned: distances and lap times of its evaluations, and some of its lines.
+
+    :param folder: of a :class:`LinePicturesCallback`
+    :param path: of the picture
+    :raises InvalidOption: if the folder has no evaluations
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from matplotlib.image import imread
+
+    laps = driven_laps(folder)
+    if not laps:
+        raise InvalidOption(f"'{folder / TABLE}' has no evaluations; train for longer")
+    pictures = sorted(folder.glob("[0-9]*.png"))
+    chosen = np.unique(np.linspace(0, len(pictures) - 1, SHOWN).round().astype(int))
+    rows = math.ceil(len(chosen) / COLUMNS)
+    figure = Figure(figsize=(SIZE, ROW * (1 + rows)), layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = figure.add_gridspec(1 + rows, 1)
+    _draw_curves(figure.add_subfigure(grid[0]), laps)
+    cells = figure.add_subfigure(grid[1:]).subplots(rows, COLUMNS, squeeze=False)
+    for axes in cells.flat:
+        axes.axis("off")
+    for axes, number in zip(cells.flat, chosen, strict=False):
+        axes.imshow(imread(pictures[number]))
+    figure.savefig(path, dpi=120)
+
+
+def _draw_curves(figure: SubFigure, laps: list[DrivenLap]) -> None:
+    whole = [lap for lap in laps if lap.lap_time]
+    distance, lap_time = figure.subplots(1, 2)
+    distance.set_title("distance of an evaluation, at most a lap [m]")
+    distance.plot([lap.seconds / 60.0 for lap in laps], [lap.distance for lap in laps], ".-")
+    lap_time.set_title("time of its lap from a standing start [s]")
+    minutes, seconds = [lap.seconds / 60.0 for lap in whole], [lap.lap_time for lap in whole]
+    lap_time.plot(minutes, np.array(seconds, float), ".-", color="tab:green")
+    for axes in (distance, lap_time):
+        axes.set_xlabel("training [min]")
+        axes.set_xlim(0.0, laps[-1].seconds / 60.0)
+        axes.grid(alpha=0.3)

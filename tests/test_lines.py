@@ -1,0 +1,211 @@
+"""What evaluations drive is told at once, drawn now and then, and kept in a table."""
+
+import io
+import re
+
+import numpy as np
+import pytest
+from conftest import ScriptedBackend
+from matplotlib.image import imread
+from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_torcs.callbacks import LinePicturesCallback, RacingProgressCallback
+from sb3_torcs.callbacks.display import bars
+from sb3_torcs.callbacks.lines import DrivenLap, draw_learning, driven_laps
+from sb3_torcs.callbacks.metrics import DrivenLine, DrivingMetricsCallback
+from sb3_torcs.callbacks.progress import spoken_moment
+from sb3_torcs.envs.racing import RacingEnv
+from sb3_torcs.errors import InvalidOption
+
+EVERY = 16  # timesteps between two evaluations
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+class Evaluations(EvalCallback):
+    """Evaluations whose lines are given."""
+
+    def __init__(self, env, metrics, lines):
+        super().__init__(env, eval_freq=0, verbose=0)
+        self.metrics, self.lines = metrics, list(lines)
+
+    def _on_step(self):
+        if self.n_calls % EVERY == 0 and self.lines:
+            line = self.lines.pop(0)
+            for listener in self.metrics.listeners:
+                listener(line)
+        return True
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """A clock that a test sets."""
+    now = [0.0]
+    for module in ("progress", "lines"):
+        monkeypatch.setattr(f"sb3_torcs.callbacks.{module}.time.monotonic", lambda: now[0])
+    return now
+
+
+def driven(oval, distance, lap_time=None):
+    """A straight line with three places in it."""
+    x = np.array([0.0, 0.5, 1.0]) * distance
+    return DrivenLine(oval, x, np.zeros(3), np.full(3, 20.0), distance, lap_time)
+
+
+def learned(oval, lines, *states, stream=None, callbacks=()):
+    env = DummyVecEnv([lambda: RacingEnv(ScriptedBackend(oval, *states))])
+    model = PPO(
+        "MlpPolicy", env, n_steps=32, batch_size=32, n_epochs=1, policy_kwargs={"net_arch": [4]},
+        device="cpu", seed=0,
+    )  # fmt: skip
+    metrics = DrivingMetricsCallback()
+    progress = RacingProgressCallback(stream=stream or io.StringIO())
+    model.learn(64, [progress, metrics, *callbacks, Evaluations(env, metrics, lines)])
+
+
+# ------------------------------------------------------------------------------ told
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(0.4, "0 s"), (59.0, "59 s"), (60.0, "1 min 00 s"), (72.4, "1 min 12 s")]
+)
+def test_moments_are_said_to_the_second(seconds, text):
+    assert spoken_moment(seconds) == text
+
+
+@pytest.mark.usefixtures("clock")
+def test_each_evaluation_is_told_and_the_first_lap_and_the_best(oval):
+    stream = io.StringIO()
+    drives = (296.0, None), (900.0, 104.2), (900.0, 98.1), (900.0, 99.0)
+    learned(oval, [driven(oval, *drive) for drive in drives], stream=stream)
+    assert stream.getvalue().splitlines()[:4] == [
+        "0 s: 296 m",
+        "0 s: the first whole lap, 104.20 s",
+        "0 s: a whole lap, 98.10 s, the best so far",
+        "0 s: a whole lap, 99.00 s",
+    ]
+
+
+@pytest.mark.usefixtures("clock")
+def test_the_first_lap_of_a_car_that_learns_is_told_at_once(oval):
+    stream = io.StringIO()
+    learned(
+        oval, [driven(oval, 900.0, 98.1)], {}, {"laps": 1, "last_lap_time": 61.2}, stream=stream
+    )
+    assert stream.getvalue().splitlines()[:2] == [
+        "0 s: the first whole lap, 61.20 s, by a car that learns",
+        "0 s: a whole lap, 98.10 s",
+    ]
+
+
+def test_a_terminal_shows_curves_below_what_is_told(oval):
+    stream = Terminal()
+    learned(oval, [driven(oval, 296.0), driven(oval, 900.0, 104.2)], stream=stream)
+    text = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", stream.getvalue())
+    frame = text[text.rindex("distance of evaluations [m]") :]
+    assert text.count("the first whole lap, 104.20 s") == 1
+    for part in ("914 ", "█", "time of their lap [s]", "104.2", "64/64 timesteps"):
+        assert part in frame
+
+
+def test_bars_are_as_high_as_their_values():
+    drawn = bars([0.0, None, 50.0, 100.0, 200.0], 0.0, 100.0, 10)
+    assert drawn == ["   ██", "   ██", "  ▄██", "  ███", "▁ ███"]
+
+
+def test_of_more_values_than_columns_the_newest_is_drawn():
+    assert bars([0.0] * 99 + [100.0], 0.0, 100.0, 4)[-1] == "▁▁▁█"
+
+
+# ------------------------------------------------------------------------------ drawn and kept
+
+
+def test_the_first_line_and_the_first_lap_are_drawn_and_all_are_kept(oval, clock, tmp_path):
+    folder = tmp_path / "lines"
+    stream = io.StringIO()
+    drives = (296.0, None), (300.0, None), (900.0, 104.2), (900.0, 98.1)
+    pictures = LinePicturesCallback(folder=str(folder))
+    learned(oval, [driven(oval, *drive) for drive in drives], stream=stream, callbacks=[pictures])
+    assert driven_laps(folder) == [
+        DrivenLap(0.0, 16, 296.0, None, "001.png"),
+        DrivenLap(0.0, 32, 300.0, None, ""),
+        DrivenLap(0.0, 48, 900.0, 104.2, "002.png"),
+        DrivenLap(0.0, 64, 900.0, 98.1, ""),
+    ]
+    assert sorted(path.name for path in folder.iterdir()) == ["001.png", "002.png", "laps.csv"]
+    assert imread(folder / "002.png").ndim == 3
+    assert f"0 s: the line it drives, {folder / '001.png'}" in stream.getvalue().splitlines()
+
+
+def test_pictures_come_at_their_interval(oval, clock, tmp_path):
+    class Ticks(BaseCallback):
+        def _on_step(self):
+            clock[0] += 30.0 / EVERY  # half a minute from one evaluation to the next
+            return True
+
+    callbacks = [Ticks(), LinePicturesCallback(folder=str(tmp_path), every=60.0)]
+    learned(oval, [driven(oval, 296.0)] * 4, callbacks=callbacks)
+    assert [lap.picture for lap in driven_laps(tmp_path)] == ["001.png", "", "002.png", ""]
+
+
+def test_a_training_that_goes_on_continues_the_series(oval, clock, tmp_path):
+    for _ in range(2):
+        learned(
+            oval,
+            [driven(oval, 900.0, 104.2)],
+            callbacks=[LinePicturesCallback(folder=str(tmp_path))],
+        )
+    assert driven_laps(tmp_path) == [
+        DrivenLap(0.0, 16, 900.0, 104.2, "001.png"),
+        DrivenLap(0.0, 32, 900.0, 104.2, "002.png"),
+    ]
+
+
+def test_half_a_row_is_left_out(tmp_path):
+    (tmp_path / "laps.csv").write_text(
+        "seconds,timesteps,distance,lap_time,picture\n1.0,16,296.0,,001.png\n2.0,32,30"
+    )
+    assert driven_laps(tmp_path) == [DrivenLap(1.0, 16, 296.0, None, "001.png")]
+
+
+def test_a_full_disk_ends_the_series_and_not_the_training(oval, monkeypatch, tmp_path):
+    def full(*arguments, **keywords):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("sb3_torcs.tracks.plot.plot_track", full)
+    stream = io.StringIO()
+    pictures = LinePicturesCallback(folder=str(tmp_path))
+    learned(oval, [driven(oval, 296.0)] * 2, stream=stream, callbacks=[pictures])
+    told = f"no more pictures: cannot write to {tmp_path}: No space left on device"
+    assert stream.getvalue().splitlines().count(told) == 1
+    assert "64/64 timesteps" in stream.getvalue()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_without_evaluations_there_is_nothing_to_draw(oval, tmp_path):
+    env = DummyVecEnv([lambda: RacingEnv(ScriptedBackend(oval))])
+    model = PPO("MlpPolicy", env, n_steps=32, batch_size=32, device="cpu")
+    with pytest.raises(InvalidOption, match="what DrivingMetricsCallback drives"):
+        model.learn(32, LinePicturesCallback(folder=str(tmp_path)))
+
+
+def test_an_interval_below_zero_is_refused(tmp_path):
+    with pytest.raises(InvalidOption, match="every is -1"):
+        LinePicturesCallback(folder=str(tmp_path), every=-1)
+
+
+def test_the_picture_of_a_learning_holds_curves_and_lines(oval, tmp_path):
+    with pytest.raises(InvalidOption, match="train for longer"):
+        draw_learning(tmp_path, tmp_path / "learning.png")
+    learned(
+        oval,
+        [driven(oval, 296.0), driven(oval, 900.0, 104.2)],
+        callbacks=[LinePicturesCallback(folder=str(tmp_path), every=0.0)],
+    )
+    draw_learning(tmp_path, tmp_path / "learning.png")
+    assert imread(tmp_path / "learning.png").shape == (1056, 1800, 4)
