@@ -1,6 +1,7 @@
-"""Train DDPG on TorcsLite-v0 and show what it learned: `make demo` runs this.
+"""Watch a car learn to lap aalborg, in five minutes: `make demo` runs this.
 
-Ctrl-C at any time keeps what was learned; a second run goes on, or starts over as asked.
+It learns in the game if TORCS is installed, and on TorcsLite-v0 otherwise. Ctrl-C at any time keeps
+what was learned; a second run continues, or starts over as asked.
 """
 
 from __future__ import annotations
@@ -14,27 +15,32 @@ import shutil
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
-import gymnasium as gym
 import numpy as np
 
-from sb3_torcs.agents.models import find_model, load_driver, saved_timesteps
+from sb3_torcs.agents.models import find_model, load_driver, saved_timesteps, training_record
+from sb3_torcs.callbacks.lines import draw_learning
 from sb3_torcs.cli.common import positive, seed
 from sb3_torcs.errors import OutputNotWritable, Sb3TorcsError
-from sb3_torcs.evaluation.protocol import Timestep, drive
+from sb3_torcs.evaluation.protocol import choose_world, evaluate, time_limit
+from sb3_torcs.evaluation.recording import Recorder, best_stretch
 from sb3_torcs.files import writable_folder
-from sb3_torcs.training import zoo
 from sb3_torcs.training.run import TrainOptions, train_run
 
-ALGO, ENV, TRACK = "ddpg", "TorcsLite-v0", "aalborg"
+TRACK = "aalborg"
+ALGO, ENTRY = "ppo", "Torcs-v0"  # on TorcsLite-v0, too: nothing else laps there as soon
+TIMESTEPS = 1_024_000
+EVALUATIONS = 25  # of a whole training
+ROLLOUT = 2048  # timesteps that PPO learns from at once
 LAPS = 3  # the best of these is shown
-EVALUATIONS = 40  # of a whole training
 
 STATE, LOG, RUNS = "demo.json", "training.log", "runs"
 MODEL, LAST_MODEL, TENSORBOARD = "model.zip", "last_model.zip", "tensorboard"
-VIDEO, PICTURE = "lap.mp4", "line.png"
-EVERYTHING = (STATE, LOG, RUNS, MODEL, LAST_MODEL, TENSORBOARD, VIDEO, PICTURE)
+VIDEO, PICTURE, CURVE, LINES = "lap.mp4", "line.png", "learning.png", "lines"
+EVERYTHING = (
+    STATE, LOG, RUNS, MODEL, LAST_MODEL, TENSORBOARD, VIDEO, PICTURE, CURVE, LINES
+)  # fmt: skip
 
 
 def main(words: list[str] | None = None) -> int:
@@ -46,7 +52,7 @@ def main(words: list[str] | None = None) -> int:
         clear(folder)
         wanted, done = None, 0
     if plan != "show":
-        wanted = args.timesteps or wanted or shipped_timesteps()
+        wanted = args.timesteps or wanted or TIMESTEPS
     interrupted = False
     if wanted is not None and plan != "show" and done < wanted:
         interrupted = train(folder, wanted, done, args.seed)
@@ -94,14 +100,34 @@ def read_state(folder: Path) -> tuple[int | None, int]:
     try:
         wanted = int(json.loads((folder / STATE).read_text())["timesteps"])
     except (ValueError, KeyError, TypeError):  # a full disk took half of it
-        wanted = shipped_timesteps()
+        wanted = TIMESTEPS
     return wanted, sum(saved_timesteps(find_model(run, prefer_last=True)) for run in runs(folder))
+
+
+class Course(NamedTuple):
+    """What learns, and where."""
+
+    algo: str
+    env: str
+    entry: str | None  # of the algorithm's hyperparameter file; None is the environment's own
+
+
+def course_of(folder: Path) -> Course:
+    """Return what was begun in this folder, or else the best that this machine can do."""
+    begun = runs(folder)
+    if begun:
+        algo, env = begun[0].parent.name, begun[0].name.rpartition("_")[0]
+        return Course(algo, env, ENTRY if algo == ALGO else None)
+    return Course(ALGO, choose_world("the demo", None).env_id, ENTRY)
 
 
 def runs(folder: Path) -> list[Path]:
     """List the zoo's folders that hold a model, oldest first."""
-    found = (folder / RUNS / ALGO).glob(f"{ENV}_*")
-    usable = [run for run in found if (run / f"{ENV}.zip").is_file() or best_of(run).is_file()]
+    usable = [
+        run
+        for run in (folder / RUNS).glob("*/*_*")
+        if (run / f"{run.name.rpartition('_')[0]}.zip").is_file() or best_of(run).is_file()
+    ]
     return sorted(usable, key=lambda run: int(run.name.rpartition("_")[2]))
 
 
@@ -121,45 +147,47 @@ def clear(folder: Path) -> None:
     writable_folder(folder)
 
 
-def shipped_timesteps() -> int:
-    """Return the timesteps that the shipped hyperparameters ask for."""
-    return int(zoo.read_entry(zoo.config_file(ALGO), ENV)["n_timesteps"])
-
-
 def train(folder: Path, wanted: int, done: int, seed: int) -> bool:
     """Learn from the timesteps that are still wanted; say whether Ctrl-C ended it."""
-    before = runs(folder)
+    before, course = runs(folder), course_of(folder)
     (folder / STATE).write_text(json.dumps({"timesteps": wanted, "seed": seed}))
     options = TrainOptions(
-        algo=ALGO,
-        env=ENV,
+        algo=course.algo,
+        env=course.env,
+        entry=course.entry,
         track=TRACK,
         timesteps=wanted - done,
         seed=seed + len(before),  # the same chance twice would teach the same twice
         folder=folder / RUNS,
         tensorboard=folder / TENSORBOARD,
-        eval_freq=max(wanted // EVALUATIONS, 1),
+        eval_freq=max(wanted // EVALUATIONS, ROLLOUT),
         resume=find_model(before[-1], prefer_last=True) if before else None,
+        pictures=folder / LINES,
     )
-    verb = "goes on learning" if before else "learns"
-    print(f"DDPG {verb} to drive {TRACK}: {wanted - done:,} timesteps, log in {folder / LOG}.")
-    print("Ctrl-C keeps what was learned so far.", flush=True)
+    print("\n".join(first_words(folder, course, wanted - done, bool(before))), flush=True)
     try:
         # The zoo's tables would run through the progress bar.
         with (folder / LOG).open("a", buffering=1) as log, contextlib.redirect_stdout(log):
             interrupted = train_run(options).interrupted
     except KeyboardInterrupt:  # before the first timestep, or a third time
         interrupted = True
-    forget(folder)
     return interrupted
 
 
-def forget(folder: Path) -> None:
-    """Drop all replay buffers but the newest: they are large, and only that one is of use."""
-    buffers = [run / "replay_buffer.pkl" for run in runs(folder)]
-    if buffers and buffers[-1].is_file():
-        for buffer in buffers[:-1]:
-            buffer.unlink(missing_ok=True)
+def first_words(folder: Path, course: Course, timesteps: int, again: bool) -> list[str]:
+    """Say what begins now."""
+    if course.env == "Torcs-v0":
+        where = "in TORCS itself"
+    else:
+        where = f"on {course.env}, which needs no TORCS (`make game` gets it)"
+    verb = "goes on learning" if again else "learns from nothing"
+    return [
+        f"{course.algo.upper()} {verb} to drive {TRACK}, {where}.",
+        f"{timesteps:,} timesteps; log: {folder / LOG}; pictures of its line: {folder / LINES}/",
+        "Each evaluation says how far the car comes from the grid, or the time of its first lap.",
+        "Ctrl-C keeps what was learned so far.",
+        "",
+    ]
 
 
 def best_model(folder: Path) -> Path:
@@ -182,6 +210,7 @@ def show(folder: Path, interrupted: bool) -> bool:
         print("\nStopped. Showing what was learned so far; Ctrl-C skips a step.", flush=True)
     steps: dict[str, Callable[[Path], str]] = {
         "the models": keep_models,
+        "the curve": curve,
         "the picture": draw,
         "the video": video,
     }
@@ -207,74 +236,58 @@ def keep_models(folder: Path) -> str:
     return f"{folder / MODEL}: the best model by evaluation"
 
 
+def curve(folder: Path) -> str:
+    draw_learning(folder / LINES, folder / CURVE)
+    return f"{folder / CURVE}: how it learned"
+
+
 @contextlib.contextmanager
-def car_and_driver(folder: Path, **options: Any) -> Iterator[tuple[Any, Any]]:
-    env = gym.make(ENV, track=TRACK, laps=LAPS, **options)
-    try:
-        yield env, load_driver(best_model(folder), env, ALGO)
-    finally:
-        env.close()
-
-
-def best_lap(folder: Path) -> tuple[list[Timestep], slice, float | None]:
-    """Drive some laps; return the drive, where in it the best lap is, and its time in seconds."""
-    with car_and_driver(folder) as (env, driver):
-        timesteps = list(drive(env, driver, seed=0))
-    best, seconds, first = slice(0, len(timesteps)), None, 0
-    for number, timestep in enumerate(timesteps):
-        lap_time = timestep.info["lap_time"]
-        if not lap_time:
-            continue
-        if seconds is None or lap_time < seconds:
-            best, seconds = slice(first, number + 1), lap_time
-        first = number + 1
-    return timesteps, best, seconds
+def driven(folder: Path) -> Iterator[Recorder]:
+    """Drive some laps from the grid with the best model."""
+    model = best_model(folder)
+    env_kwargs = {**training_record(model).env_kwargs, "laps": LAPS}
+    recorder = Recorder(course_of(folder).env, env_kwargs, time_limit(env_kwargs))
+    with contextlib.closing(recorder):
+        evaluate(recorder, load_driver(model, recorder))
+        yield recorder
 
 
 def draw(folder: Path) -> str:
-    from sb3_torcs.tracks.catalogue import load_track
-    from sb3_torcs.tracks.plot import plot_track
-
-    timesteps, lap, seconds = best_lap(folder)
-    cars = [timestep.car for timestep in timesteps[lap]]
-    line = np.array([(car.x, car.y) for car in cars])
-    speed = np.array([car.speed_x for car in cars])
-    plot_track(load_track(TRACK), folder / PICTURE, line=line, speed=speed)
-    return f"{folder / PICTURE}: {described(seconds, timesteps)}"
+    with driven(folder) as recorder:
+        recorder.draw_line(folder / PICTURE)
+        return f"{folder / PICTURE}: {described(recorder)}"
 
 
 def video(folder: Path) -> str:
-    from sb3_torcs.rendering.encoder import write_video
-
-    timesteps, lap, seconds = best_lap(folder)
-    with car_and_driver(folder, render_mode="rgb_array") as (env, driver):
-        # The same drive again: it is deterministic.
-        frames = (
-            env.render()
-            for number, _ in enumerate(drive(env, driver, seed=0))
-            if lap.start <= number < lap.stop
-        )
-        fps = env.unwrapped.metadata["render_fps"]
-        write_video(folder / VIDEO, frames, fps, lap.stop - lap.start)
-    return f"{folder / VIDEO}: {described(seconds, timesteps)}"
+    with driven(folder) as recorder:
+        recorder.save_video(folder / VIDEO)
+        return f"{folder / VIDEO}: {described(recorder)}"
 
 
-def described(seconds: float | None, timesteps: list[Timestep]) -> str:
-    if seconds is not None:
-        return f"its best lap of {LAPS}, {seconds:.2f} s"
-    return f"no whole lap yet: {timesteps[-1].car.distance_raced:.0f} m"
+def described(recorder: Recorder) -> str:
+    stretch = best_stretch(recorder.episodes)
+    last = recorder.episodes[stretch.episode][stretch.last - 1]
+    if last.lap_time:
+        return f"its best lap of {LAPS}, {last.lap_time:.2f} s"
+    return f"no whole lap yet: {last.car.distance_raced:.0f} m"
 
 
 def last_words(folder: Path) -> str:
     """Say what there is, how to open it, and how to go on."""
     wanted, done = read_state(folder)
     lines = [""]
-    laps = ["--env", ENV, "--track", TRACK, "--laps", str(LAPS)]
+    sb3_torcs, env = tool("sb3-torcs"), course_of(folder).env
+    laps = ["--env", env, "--track", TRACK, "--laps", str(LAPS)]
     for name, what, command in (
-        (MODEL, "the best model by evaluation", [tool("sb3-torcs"), "evaluate", MODEL, *laps]),
-        (TENSORBOARD, "how it learned", [tool("tensorboard"), "--logdir", TENSORBOARD]),
-        (VIDEO, "its best drive, seen from above", ["xdg-open", VIDEO]),
-        (PICTURE, "the line it drove, coloured by speed", ["xdg-open", PICTURE]),
+        (MODEL, "the best model by evaluation", [sb3_torcs, "evaluate", MODEL, *laps]),
+        (
+            TENSORBOARD,
+            "how it learned, in figures",
+            [tool("tensorboard"), "--logdir", TENSORBOARD],
+        ),
+        (CURVE, "how it learned", ["xdg-open", CURVE]),
+        (PICTURE, "the line it drives, coloured by speed", ["xdg-open", PICTURE]),
+        (VIDEO, "its best lap, seen from above", ["xdg-open", VIDEO]),
     ):
         path = str(folder / name)
         if (folder / name).exists():
@@ -283,6 +296,9 @@ def last_words(folder: Path) -> str:
     if wanted is None or not done:
         lines.append(f"Nothing was learned yet. Begin with: {again(folder, '--fresh')}")
         return "\n".join(lines)
+    if env == "Torcs-v0":
+        watch = shlex.join([sb3_torcs, "watch", str(folder / MODEL)])
+        lines += ["In the game's own window:", f"    {watch}"]
     lines.append(f"\nLearned from {done:,} of {wanted:,} timesteps.")
     more = "--continue" if done < wanted else f"--continue --timesteps {2 * wanted}"
     lines += [f"Go on:      {again(folder, more)}", f"Start over: {again(folder, '--fresh')}"]

@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 
 from sb3_torcs.agents.models import AGENTS
+from sb3_torcs.callbacks.lines import driven_laps
 from sb3_torcs.errors import OutputNotWritable
+from sb3_torcs.evaluation.protocol import World
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
@@ -110,7 +112,7 @@ def test_a_fresh_start_leaves_other_files_alone(demo, tmp_path):
 
 def test_half_a_state_is_no_obstacle(demo, tmp_path):
     (tmp_path / demo.STATE).write_text('{"timest')
-    assert demo.read_state(tmp_path) == (demo.shipped_timesteps(), 0)
+    assert demo.read_state(tmp_path) == (demo.TIMESTEPS, 0)
 
 
 def test_one_failed_part_of_the_show_does_not_lose_the_others(demo, monkeypatch, capsys, tmp_path):
@@ -119,12 +121,14 @@ def test_one_failed_part_of_the_show_does_not_lose_the_others(demo, monkeypatch,
 
     monkeypatch.setattr(demo, "runs", lambda folder: [folder])
     monkeypatch.setattr(demo, "keep_models", lambda folder: "models kept")
+    monkeypatch.setattr(demo, "curve", lambda folder: "curve drawn")
     monkeypatch.setattr(demo, "draw", broken)
     monkeypatch.setattr(demo, "video", lambda folder: "recorded")
     assert demo.show(tmp_path, interrupted=False)
     out = capsys.readouterr().out
     assert out.splitlines() == [
         "models kept",
+        "curve drawn",
         "the picture: failed: RuntimeError: no encoder",
         "recorded",
     ]
@@ -142,23 +146,41 @@ def test_ctrl_c_during_the_training_still_shows_and_says_how_to_go_on(
     assert json.loads((tmp_path / demo.STATE).read_text())["timesteps"] == 300
 
 
+@pytest.mark.parametrize("env", ["Torcs-v0", "TorcsLite-v0"])
+def test_the_demo_learns_where_this_machine_can(demo, monkeypatch, tmp_path, env):
+    monkeypatch.setattr(demo, "choose_world", lambda *asked: World(env, "as the test says"))
+    assert demo.course_of(tmp_path) == demo.Course("ppo", env, "Torcs-v0")
+    first, *_ = demo.first_words(tmp_path, demo.course_of(tmp_path), 1, False)
+    assert ("in TORCS itself" in first) == (env == "Torcs-v0")
+
+
+@pytest.mark.parametrize(("algo", "entry"), [("ppo", "Torcs-v0"), ("ddpg", None)])
+def test_the_demo_goes_on_with_what_was_begun(demo, tmp_path, algo, entry):
+    """Also with that of an earlier version, which had another algorithm."""
+    run_folder = tmp_path / "runs" / algo / "TorcsLite-v0_1"
+    run_folder.mkdir(parents=True)
+    (run_folder / "best_model.zip").write_text("")
+    assert demo.course_of(tmp_path) == demo.Course(algo, "TorcsLite-v0", entry)
+
+
 @pytest.mark.slow
+@pytest.mark.usefixtures("game")
 def test_the_demo_learns_shows_goes_on_and_shows_again(demo, capsys, tmp_path):
     """What `make demo` promises, in small."""
     folder = tmp_path / "demo"
-    words = ["--timesteps", "400", "--folder", str(folder)]
+    words = ["--timesteps", "2048", "--folder", str(folder)]
     assert demo.main(words) == 0
-    for name in ("model.zip", "last_model.zip", "lap.mp4", "line.png", "tensorboard"):
+    made = "model.zip", "last_model.zip", "lap.mp4", "line.png", "learning.png", "tensorboard"
+    for name in made:
         assert (folder / name).exists(), name
-    out = capsys.readouterr().out
-    assert "Learned from 400 of 400 timesteps." in out
-    assert f"evaluate {folder / 'model.zip'}" in out
-    assert "Loading replay buffer" not in (folder / "training.log").read_text()
+    out, err = capsys.readouterr()
+    assert "Learned from 2,048 of 2,048 timesteps." in out
+    assert f"evaluate {folder / 'model.zip'} --env Torcs-v0" in out
+    assert f"the line it drives, {folder / 'lines' / '001.png'}" in err
 
-    assert demo.main(["--continue", "--timesteps", "600", "--folder", str(folder)]) == 0
-    assert "Learned from 600 of 600 timesteps." in capsys.readouterr().out
-    assert "Loading replay buffer" in (folder / "training.log").read_text()
-    assert len(list(folder.rglob("replay_buffer.pkl"))) == 1
+    assert demo.main(["--continue", "--timesteps", "4096", "--folder", str(folder)]) == 0
+    assert "Learned from 4,096 of 4,096 timesteps." in capsys.readouterr().out
+    assert [lap.timesteps for lap in driven_laps(folder / "lines")] == [2048, 4096]
 
     assert demo.main(["--folder", str(folder)]) == 0  # shows again, learns nothing
     out = capsys.readouterr().out
