@@ -5,6 +5,7 @@ SI units and radians throughout. Left is positive for steering, lateral position
 
 from __future__ import annotations
 
+import itertools
 import math
 from numbers import Integral, Real
 from typing import Any, Literal, NamedTuple, get_args
@@ -195,6 +196,8 @@ class CarState(NamedTuple):
 _ARRAYS = {"wheel_speeds": 4, "range_finders": 19, "opponents": 36}
 _COUNTS = tuple(CarState._fields.index(name) for name in ("gear", "laps", "race_position"))
 _SCALARS = len(CarState._fields) - len(_ARRAYS)
+_ENDS = tuple(itertools.accumulate(_ARRAYS.values()))
+_PARTS = tuple(slice(end - size, end) for end, size in zip(_ENDS, _ARRAYS.values(), strict=True))
 
 CAR_RECORD = np.dtype([(name, "f8", _ARRAYS.get(name, ())) for name in CarState._fields])
 """A :class:`CarState` as a record of an array, for many cars at once; the engine writes such."""
@@ -207,12 +210,10 @@ def car_from_record(numbers: FloatArray) -> CarState:
     :param numbers: (82,) of a :data:`CAR_RECORD`
     :return: the car, which shares no memory with it
     """
-    values: list[Any] = numbers[:_SCALARS].tolist()
-    for place in _COUNTS:
-        values[place] = int(values[place])
-    arrays, begin = numbers[_SCALARS:].copy(), 0
+    values = numbers[:_SCALARS].tolist()
+    for index in _COUNTS:
+        values[index] = int(values[index])
+    arrays = numbers[_SCALARS:].copy()
     arrays.flags.writeable = False
-    for size in _ARRAYS.values():
-        values.append(arrays[begin : begin + size])
-        begin += size
-    return CarState._make(values)
+    # As CarState(...) does, without the call that a NamedTuple puts in front of it.
+    return tuple.__new__(CarState, (*values, *[arrays[part] for part in _PARTS]))

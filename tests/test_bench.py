@@ -7,6 +7,7 @@ from sb3_torcs.bench import scr as bench_scr
 from sb3_torcs.bench import torcs as bench_torcs
 from sb3_torcs.bench.learning import training_share
 from sb3_torcs.bench.stages import KEYS, stages
+from sb3_torcs.bench.vec_env import vec_env
 from sb3_torcs.errors import BackendUnavailable
 
 
@@ -16,7 +17,7 @@ def test_every_figure_is_measured_once_or_empty(monkeypatch):
     measurements = stages(0.01)
     figures = measurements["resets"]()
     assert list(figures) == ["lite_reset_ms"]
-    assert len(set(KEYS)) == len(KEYS) == 17
+    assert len(set(KEYS)) == len(KEYS) == 19
 
 
 def test_the_environments_are_measured_in_the_same_run(monkeypatch):
@@ -81,9 +82,19 @@ def test_the_second_thread_is_measured_against_a_second_process(monkeypatch):
     assert bench_torcs.vector(0.0001)["torcs_vector2_ratio"] > 0.0
 
 
+@pytest.mark.usefixtures("game")
+def test_races_at_once_are_measured_by_their_names(monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0, 1})
+    figures = vec_env(0.0001)
+    assert list(figures) == ["vec_env_timesteps_per_s", "vec_env_two_threads_ratio"]
+    assert min(figures.values()) > 0.0
+    assert set(figures) < set(KEYS)
+
+
 def test_one_core_has_no_second_thread_to_measure(monkeypatch):
     monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0})
     assert bench_torcs.vector(1.0) == {"torcs_vector2_ratio": None}
+    assert vec_env(0.0001)["vec_env_two_threads_ratio"] is None
 
 
 @pytest.mark.usefixtures("game")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import multiprocessing
 import pickle
+import time
 from collections.abc import Mapping
 from functools import partial
 
@@ -73,6 +74,14 @@ def assert_same(one, other, where=""):
     else:
         assert type(one) is type(other), where
         assert one == other, f"{where}: {one} != {other}"
+
+
+def wait_until(true, seconds=30.0):
+    """The system takes a moment to forget a thread that has ended."""
+    end = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < end
+        time.sleep(0.001)
 
 
 def random_actions(envs, steps, seed=0):
@@ -475,13 +484,12 @@ def test_threads_end_with_the_races(env_id, make):
     envs = drive(4)
     assert before < threads() <= before + 2
     envs.close()
-    assert threads() == before
+    wait_until(lambda: threads() == before)
     envs = drive(2)
     assert (envs.threads, threads()) == (2, before + 1), "one thread per race at most"
     del envs  # forgotten without close
     gc.collect()
-    while threads() > before:
-        pass  # which takes a moment
+    wait_until(lambda: threads() == before)
 
 
 @pytest.mark.usefixtures("game")

@@ -9,6 +9,7 @@ from sb3_torcs.bench.environments import environments, resets
 from sb3_torcs.bench.learning import training_share
 from sb3_torcs.bench.policy import measure
 from sb3_torcs.bench.torcs import Figures
+from sb3_torcs.bench.vec_env import vec_env
 from sb3_torcs.errors import BackendUnavailable
 
 __all__ = ["KEYS", "stages"]
@@ -25,6 +26,8 @@ KEYS = (
     "torcs_reset_ms",
     "torcs_load_ms",
     "torcs_vector2_ratio",
+    "vec_env_timesteps_per_s",
+    "vec_env_two_threads_ratio",
     "scr_ticks_per_s",
     "scr_reset_ms",
     "game_frames_per_s",
@@ -54,6 +57,7 @@ def stages(seconds: float) -> dict[str, Callable[[], Figures]]:
         "game resets": _where_it_is(torcs.resets),
         "game loads": _where_it_is(torcs.loads),
         "game threads": _where_it_is(lambda: torcs.vector(share)),
+        "races at once": _where_it_is(lambda: vec_env(share)),
         "SCR": _where_it_is(lambda: scr.ticks(share)),
         "SCR resets": _where_it_is(scr.resets),
         "pictures": _where_it_is(scr.pictures),

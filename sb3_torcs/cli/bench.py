@@ -23,6 +23,8 @@ torcs_reset_ms            resets of Torcs-v0, to the grid and to random position
 torcs_load_ms             gym.make on the track that takes longest
 torcs_vector2_ratio       the gain by a second thread in gym.make_vec with 16 races, divided by the
                           gain by a second process with bare engines
+vec_env_timesteps_per_s   TorcsVecEnv on one thread: 16 races of Torcs-v0, five ticks per timestep
+vec_env_two_threads_ratio the gain by a second thread in the same, at best
 scr_ticks_per_s           env.step with backend="scr", five ticks per timestep
 scr_reset_ms              resets with backend="scr"
 game_frames_per_s         render_mode="game" at 640x480
@@ -30,8 +32,9 @@ policy_*                  updates of a DDPG with SplitHeadPolicy, batch size 64
 training_env_share        share of a DDPG training (shipped hyperparameters) that the environment
                           and the callbacks take
 
-torcs_vector2_ratio, scr_* and game_frames_per_s are measured by the wall clock, since several
-processes or threads work. A figure that cannot be measured on this machine is null.
+torcs_vector2_ratio, vec_env_two_threads_ratio, scr_* and game_frames_per_s are measured by the
+wall clock, since several processes or threads work. A figure that cannot be measured on this
+machine is null.
 """
 
 

@@ -54,10 +54,11 @@ class Timestep(NamedTuple):
         :param race: which
         """
         car = car_from_record(self.after[race])
-        lapped = car.laps > self.before[race, LAPS]
+        lap_time = car.last_lap_time if car.laps > self.before[race, LAPS] else 0.0
+        # A race with fewer terms than another has zeros behind its own.
         terms = dict(zip(self.names[race], self.terms[race], strict=False))
         terms["crash"] = 0.0
-        return racing_info(car, car.last_lap_time if lapped else 0.0, terms)
+        return racing_info(car, lap_time, terms)
 
 
 LAPS = CarState._fields.index("laps")
