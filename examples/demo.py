@@ -20,7 +20,8 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_torcs.agents.models import find_model, load_driver, saved_timesteps, training_record
-from sb3_torcs.callbacks.lines import draw_learning
+from sb3_torcs.callbacks.lines import draw_learning, driven_laps
+from sb3_torcs.callbacks.progress import spoken_moment
 from sb3_torcs.cli.common import positive, seed
 from sb3_torcs.errors import OutputNotWritable, Sb3TorcsError
 from sb3_torcs.evaluation.protocol import choose_world, evaluate, time_limit
@@ -238,7 +239,9 @@ def keep_models(folder: Path) -> str:
 
 def curve(folder: Path) -> str:
     draw_learning(folder / LINES, folder / CURVE)
-    return f"{folder / CURVE}: how it learned"
+    first = next((lap for lap in driven_laps(folder / LINES) if lap.lap_time), None)
+    told = f", the first whole lap after {spoken_moment(first.seconds)}" if first else ""
+    return f"{folder / CURVE}: how it learned{told}"
 
 
 @contextlib.contextmanager
@@ -287,7 +290,7 @@ def last_words(folder: Path) -> str:
         ),
         (CURVE, "how it learned", ["xdg-open", CURVE]),
         (PICTURE, "the line it drives, coloured by speed", ["xdg-open", PICTURE]),
-        (VIDEO, "its best lap, seen from above", ["xdg-open", VIDEO]),
+        (VIDEO, "its best drive, seen from above", ["xdg-open", VIDEO]),
     ):
         path = str(folder / name)
         if (folder / name).exists():

@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 
 from sb3_torcs.agents.models import AGENTS
-from sb3_torcs.callbacks.lines import driven_laps
+from sb3_torcs.callbacks.lines import DrivenLap, driven_laps
 from sb3_torcs.errors import OutputNotWritable
 from sb3_torcs.evaluation.protocol import World
+from sb3_torcs.training import zoo
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
@@ -152,6 +153,20 @@ def test_the_demo_learns_where_this_machine_can(demo, monkeypatch, tmp_path, env
     assert demo.course_of(tmp_path) == demo.Course("ppo", env, "Torcs-v0")
     first, *_ = demo.first_words(tmp_path, demo.course_of(tmp_path), 1, False)
     assert ("in TORCS itself" in first) == (env == "Torcs-v0")
+
+
+@pytest.mark.parametrize("env", ["Torcs-v0", "TorcsLite-v0"])
+def test_what_the_demo_asks_for_fits_both_worlds(demo, env):
+    place = zoo.Place(zoo.config_file(demo.ALGO), demo.ENTRY)
+    zoo.check_entry(zoo.read_entry(*place), demo.ALGO, env, place)
+
+
+def test_the_demo_says_when_the_first_lap_was(demo, monkeypatch, tmp_path):
+    monkeypatch.setattr(demo, "draw_learning", lambda folder, path: None)
+    monkeypatch.setattr(demo, "driven_laps", lambda folder: [
+        DrivenLap(12.0, 2048, 296.0, None, "001.png"), DrivenLap(72.4, 4096, 2692.0, 98.47, ""),
+    ])  # fmt: skip
+    assert demo.curve(tmp_path).endswith("how it learned, the first whole lap after 1 min 12 s")
 
 
 @pytest.mark.parametrize(("algo", "entry"), [("ppo", "Torcs-v0"), ("ddpg", None)])
