@@ -26,11 +26,14 @@ from rl_zoo3.callbacks import SaveVecNormalizeCallback
 from rl_zoo3.exp_manager import ExperimentManager
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 import sb3_torcs  # noqa: F401  registers the environments
 from sb3_torcs.agents.model_writing import RecordCallback, recipe
 from sb3_torcs.errors import InvalidOption, WorkerLost
 from sb3_torcs.training.keeping import KeepCallback, WholeFiles
+from sb3_torcs.training.zoo import OURS
+from sb3_torcs.vec_env import TorcsVecEnv
 
 __all__ = ["Built", "Manager", "build", "train"]
 
@@ -58,7 +61,7 @@ def build(algo: str, env_id: str, entry: Mapping[str, Any], *, seed: int = 0) ->
     said = argparse.Namespace(algo=algo, env=env_id, seed=seed)
     with tempfile.TemporaryDirectory() as scratch, contextlib.redirect_stdout(io.StringIO()):
         conf_file = _write_entry(Path(scratch), env_id, entry)
-        manager = ExperimentManager(
+        manager = _Threaded(
             said, algo, env_id, scratch, eval_freq=-1, seed=seed, verbose=0, device="cpu",
             config=str(conf_file),
         )  # fmt: skip
@@ -118,7 +121,35 @@ def _write_entry(folder: Path, env_id: str, entry: Mapping[str, Any]) -> Path:
     return path
 
 
-class Manager(ExperimentManager):
+class _Threaded(ExperimentManager):
+    """The zoo's manager, which lets several cars of a training drive on threads."""
+
+    vec_env_class: type[VecEnv]
+
+    def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
+        """
+        Make environments as the zoo does; where threads can drive them, in :class:`TorcsVecEnv`.
+
+        :param n_envs: how many
+        :param eval_env: whether they are for evaluations
+        :param no_log: whether to write no ``monitor.csv``
+        :return: what ``DummyVecEnv`` would be, to the bit
+        """
+        own = self.vec_env_class
+        if own is DummyVecEnv and n_envs > 1 and self._on_threads():
+            self.vec_env_class = TorcsVecEnv
+        try:
+            return super().create_envs(n_envs, eval_env, no_log)
+        finally:
+            self.vec_env_class = own
+
+    def _on_threads(self) -> bool:
+        """Say whether the entry has nothing that would have to see each timestep of a race."""
+        world = self.env_kwargs.get("backend", "native")
+        return self.env_name.gym_id in OURS and self.env_wrapper is None and world == "native"
+
+
+class Manager(_Threaded):
     """
     The zoo's manager of one training. It saves the model at each evaluation.
 
