@@ -111,12 +111,12 @@ def _compiled_numbers(value: Any) -> Callable[[Any], Any]:
 
 
 @njit(cache=True)
-def _scaled(number: float, place: int) -> float:
-    """The number of an observation, in one place of it."""
-    scaled = number * _SCALE[place]
-    if scaled <= _LOW[place]:
-        return _LOW[place]
-    return _HIGH[place] if scaled >= _HIGH[place] else scaled
+def _scaled(number: float, index: int) -> float:
+    """Return a number of the observation, by its index there."""
+    scaled = number * _SCALE[index]
+    if scaled <= _LOW[index]:
+        return _LOW[index]
+    return _HIGH[index] if scaled >= _HIGH[index] else scaled
 
 
 @njit(cache=True)

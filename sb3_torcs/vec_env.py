@@ -28,10 +28,10 @@ NO_LIMIT = 1 << 62
 
 class RaceInfo(MutableMapping[str, Any]):
     """
-    The ``info`` of a race whose episode goes on. Its values are made when somebody asks for one.
+    The ``info`` of a race whose episode goes on. Its values are made when one is read.
 
-    :param timestep: of all races
-    :param race: which
+    :param timestep: the outcome of a timestep of all races
+    :param race: index of the race
     """
 
     __slots__ = ("_race", "_timestep", "_values")
@@ -82,13 +82,12 @@ class TorcsVecEnv(DummyVecEnv):
     """
     Several races, driven at once by threads of this process.
 
-    It does what ``DummyVecEnv`` over the same environments in ``Monitor`` does, to the bit, in much
-    less time. ``make_vec_env`` and whoever else hands over functions that make environments may
-    take it in the place of ``DummyVecEnv``.
+    It returns what ``DummyVecEnv`` over the same environments in ``Monitor`` returns, to the bit,
+    in less time. ``make_vec_env`` and the RL Zoo can use it in the place of ``DummyVecEnv``.
 
     :param races: how many; or functions that make the environments, wrapped in no more than
         ``Monitor``, ``TimeLimit`` and ``OrderEnforcing``
-    :param agents: cars that learn in each race; 1 for now
+    :param agents: cars that learn in each race: 1
     :param threads: that share the work, at least 1; ``None`` is one per core, and one per race at
         most
     :param env_id: ``"Torcs-v0"`` or ``"TorcsLite-v0"``
@@ -107,7 +106,7 @@ class TorcsVecEnv(DummyVecEnv):
     ) -> None:
         self._batch: Batch | None = None
         if agents != 1:
-            raise InvalidOption(f"agents is {agents!r}; races with several learners come later: 1")
+            raise InvalidOption(f"agents is {agents!r}; expected 1: one car learns in each race")
         if threads is not None and not is_count(threads):
             raise InvalidOption(f"threads is {threads!r}; expected a whole number >= 1, or None")
         if isinstance(races, (list, tuple)) and races:
@@ -129,18 +128,18 @@ class TorcsVecEnv(DummyVecEnv):
         self.threads = self._batch.threads
         self._elapsed = np.zeros(self.num_envs, np.int64)  # timesteps of the episodes
         self._limits = np.full(self.num_envs, NO_LIMIT)
-        self._watched = [race.racing for race in self._races if race.racing.render_mode == "human"]
+        self._watched = [i for i, race in enumerate(self._races) if race.is_watched]
 
     @property
     def envs(self) -> list[gym.Env[Any, Any]]:
-        """The environments; they are told all that has happened when somebody looks at them."""
+        """The environments, brought up to date."""
         if self._driving:
             self._leave()
         return self._envs
 
     @envs.setter
     def envs(self, envs: list[gym.Env[Any, Any]]) -> None:
-        """Take the environments over; ``DummyVecEnv`` sets them."""
+        """Set the environments, as ``DummyVecEnv`` does once."""
         self._envs = envs
         self._driving = False
 
@@ -169,17 +168,20 @@ class TorcsVecEnv(DummyVecEnv):
                 continue
             try:
                 rewards[i], dones[i], infos[i] = self._finish(i, timestep)
-            except Exception as error:  # the other races have driven, too
+            except Exception as error:  # raised when the other races have been handled
+                error.add_note(f"in race {i} of {self.num_envs}")
                 failures.append(error)
-        for env in self._watched:
-            env.render()
-        if failures:
+        if self._watched or failures:
             self._leave()
+        for i in self._watched:
+            if not over[i]:  # who has ended has been drawn by its environment
+                self._races[i].racing.render()
+        if failures:
             raise failures[0]
         return timestep.observations, rewards, dones, infos
 
     def _finish(self, i: int, timestep: Timestep) -> tuple[float, bool, dict[str, Any]]:
-        """Let the wrappers of a race see the end of its episode, and begin another one."""
+        """Take the last timestep of an episode through all wrappers, and reset."""
         assert self._batch is not None
         race, env = self._races[i], self._envs[i]
         race.leave(int(self._elapsed[i]))
@@ -195,7 +197,7 @@ class TorcsVecEnv(DummyVecEnv):
         return reward, done, info
 
     def _enter(self) -> None:
-        """Take all races over from their environments."""
+        """Take the states of all races over from their environments."""
         for i in range(self.num_envs):
             self._enter_race(i)
         self._driving = True
@@ -206,7 +208,7 @@ class TorcsVecEnv(DummyVecEnv):
         self._batch.enter(i)
 
     def _leave(self) -> None:
-        """Tell all environments what has happened."""
+        """Give the states of all races back to their environments."""
         self._driving = False
         if self._batch is not None:
             for i, race in enumerate(self._races):
@@ -223,22 +225,26 @@ class TorcsVecEnv(DummyVecEnv):
 
 class _Race:
     """
-    The wrappers of one environment, which count and sum.
+    The wrappers of one environment, which count timesteps and sum rewards.
 
-    :param env: the outermost one
-    :raises InvalidOption: if there is a wrapper that would have to see every timestep
+    :param env: the outermost wrapper
+    :raises InvalidOption: if there is another wrapper, which would have to see every timestep
     """
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
-        self._env = env
         self._monitor: Monitor[Any, Any] | None = None
         self._limit: Any = None
         if not isinstance(env.unwrapped, RacingEnv):
             raise InvalidOption(
-                f"{env} is no race; TorcsVecEnv drives Torcs-v0 and TorcsLite-v0, others drive in "
-                "DummyVecEnv"
+                f"{env} is no racing environment; TorcsVecEnv is for Torcs-v0 and TorcsLite-v0, "
+                "use DummyVecEnv for others"
             )
         self.racing = env.unwrapped
+        if type(self.racing).step is not RacingEnv.step:
+            raise InvalidOption(
+                f"{type(self.racing).__name__} has a step of its own, which TorcsVecEnv would not "
+                "call; use DummyVecEnv"
+            )
         while isinstance(env, gym.Wrapper):
             names = {kind.__name__ for kind in type(env).__mro__}  # the RL Zoo has one of its own
             if type(env) is Monitor and self._monitor is None:
@@ -247,21 +253,26 @@ class _Race:
                 self._limit = env
             elif type(env) is not OrderEnforcing:
                 raise InvalidOption(
-                    f"a race is wrapped in {type(env).__name__}, which would miss what races that "
-                    "are driven at once do; leave it out, or use DummyVecEnv"
+                    f"an environment is wrapped in {type(env).__name__}, which would not see the "
+                    "timesteps of TorcsVecEnv; leave the wrapper out, or use DummyVecEnv"
                 )
             env = env.env
         self.append: Callable[[float], None] = self._forget
         self._noted = 0  # timesteps of this episode that the monitor knows
 
+    @property
+    def is_watched(self) -> bool:
+        """Whether each timestep is shown in a window."""
+        return self.racing.render_mode == "human"
+
     def _forget(self, reward: float) -> None:
-        """There is no monitor to tell a reward."""
+        """Do nothing with a reward, where there is no monitor."""
 
     def enter(self) -> tuple[int, int]:
         """
-        Look at what has happened.
+        Read the state of the wrappers.
 
-        :return: timesteps of the present episode, and those after which it is cut
+        :return: timesteps of the present episode, and the time limit
         :raises EnvClosed: if there is no episode
         """
         self.racing.check_ready()
@@ -277,7 +288,7 @@ class _Race:
 
     def leave(self, elapsed: int) -> None:
         """
-        Tell the wrappers what has happened.
+        Bring the wrappers up to date.
 
         :param elapsed: timesteps of the present episode
         """

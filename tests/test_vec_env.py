@@ -24,6 +24,7 @@ from sb3_torcs.agents.scripted import ScriptedDriver
 from sb3_torcs.callbacks import DrivingMetricsCallback
 from sb3_torcs.car import CAR_RECORD, car_from_record
 from sb3_torcs.envs import batch
+from sb3_torcs.envs.torcs_lite import TorcsLiteEnv
 from sb3_torcs.errors import CarLost, EngineForked, EnvClosed, InvalidAction, InvalidOption
 from sb3_torcs.vec_env import TorcsVecEnv
 
@@ -325,6 +326,20 @@ def test_a_race_can_be_copied_out(env_id, make):
     copy.close()
 
 
+def test_a_window_shows_each_timestep_once(make, monkeypatch):
+    shown = []
+    monkeypatch.setattr(TorcsLiteEnv, "render", lambda env: shown.append(env.car.time))
+    options = {"render_mode": "human", "max_episode_steps": 3}
+    seen = []
+    for envs in (make(2, env_id=LITE, **options), plain(2, LITE, **options)):
+        envs.reset()
+        for _ in range(5):
+            envs.step(np.stack([GAS, GAS]))
+        seen.append(sorted(shown))
+        shown.clear()
+    assert seen[0] == seen[1]
+
+
 def test_pictures_are_taken_of_the_present_moment(make):
     ours, theirs = (f(1, env_id=LITE, render_mode="rgb_array") for f in (make, plain))
     for envs in (ours, theirs):
@@ -335,19 +350,25 @@ def test_pictures_are_taken_of_the_present_moment(make):
     assert_same(ours.get_images(), theirs.get_images())
 
 
+class Own(TorcsLiteEnv):
+    def step(self, action):
+        return super().step(-action)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         ({"races": 0}, "races is 0; expected a whole number >= 1"),
         ({"races": "two"}, "races is 'two'"),
-        ({"agents": 2}, "agents is 2; .* 1"),
+        ({"agents": 2}, "agents is 2; expected 1"),
         ({"threads": 0}, "threads is 0; expected a whole number >= 1, or None"),
         ({"races": [partial(gym.make, LITE)], "laps": 1}, "laps is for races made here"),
-        ({"races": [partial(gym.make, "CartPole-v1")]}, "is no race"),
+        ({"races": [partial(gym.make, "CartPole-v1")]}, "is no racing environment"),
         (
             {"races": [lambda: gym.wrappers.RecordEpisodeStatistics(gym.make(LITE))]},
-            "wrapped in RecordEpisodeStatistics.*use DummyVecEnv",
+            "wrapped in RecordEpisodeStatistics.* use DummyVecEnv",
         ),
+        ({"races": [Own]}, "Own has a step of its own"),
         (
             {"races": [partial(gym.make, LITE), partial(gym.make, LITE, action="pedal")]},
             "read actions in 2 ways",
@@ -492,11 +513,11 @@ def test_threads_end_with_the_races(env_id, make):
     wait_until(lambda: threads() == before)
 
 
-@pytest.mark.usefixtures("game")
 @pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")  # of forks beside threads
-def test_a_forked_child_is_told_to_make_its_own(make):
-    envs = make(2, threads=2)
+def test_a_forked_child_is_told_to_make_its_own(env_id, make):
+    envs = make(2, env_id=env_id, threads=2)
     envs.reset()
+    envs.step(np.stack([GAS, GAS]))
 
     def child(pipe):
         try:

@@ -60,7 +60,7 @@ class Backend(Protocol):
 
 
 class Fleet(Protocol):
-    """Several worlds of one kind that are driven at once. It may be handed over to no fork."""
+    """Several worlds of one kind that are driven at once, in the process that has made them."""
 
     def step(
         self,
@@ -82,14 +82,14 @@ class Fleet(Protocol):
 
     def failure(self, world: int) -> Exception:
         """
-        Say what stopped a race.
+        Return what stopped a race.
 
-        :param world: that failed in the latest step
+        :param world: one that failed in the latest step
         """
 
     def arrive(self, world: int, steps: Iterable[tuple[Controls, int]], car: CarState) -> None:
         """
-        Tell a world what it has been driven, before anybody else uses it.
+        Tell a world which steps it has been driven, before it is used without the fleet.
 
         :param world: which
         :param steps: controls and ticks since it was told

@@ -309,7 +309,7 @@ class Fleet:
         return failed
 
     def failure(self, world: int) -> Exception:
-        """Say what stopped a race; see :class:`~sb3_torcs.backends.base.Fleet`."""
+        """Return what stopped a race; see :class:`~sb3_torcs.backends.base.Fleet`."""
         try:
             self._fleet.wait(world)
         except Exception as error:

@@ -32,7 +32,7 @@ def is_several(choice: Any, name: str = "track") -> TypeGuard[Sequence[Any]]:
 
 def one_or_several(make: Callable[[Any, Any], Backend], track: Any, car: Any) -> Backend:
     """
-    Make the world of a track and a car; or one for each pair, where a list was given.
+    Make the world of a track and a car, or one world for each pair if a list is given.
 
     :param make: makes the world of a track and a car
     :param track: or several
@@ -48,7 +48,7 @@ def one_or_several(make: Callable[[Any, Any], Backend], track: Any, car: Any) ->
 
 class SeveralWorlds:
     """
-    One of several cars on one of several tracks, both drawn anew for each episode.
+    One of several cars on one of several tracks: each episode draws a pair of them.
 
     :param worlds: one for each track and car; they have the same range finders
     """
@@ -87,7 +87,7 @@ class SeveralWorlds:
 
 def worlds_of(backend: Backend) -> tuple[Backend, ...]:
     """
-    Say which worlds there are behind a backend.
+    Return the worlds of a backend.
 
     :param backend: one world, or several
     """
@@ -96,7 +96,7 @@ def worlds_of(backend: Backend) -> tuple[Backend, ...]:
 
 def world_index(backend: Backend) -> int:
     """
-    Say in which of its worlds a backend is.
+    Return the index of the world of the present episode.
 
     :param backend: one world, or several
     """

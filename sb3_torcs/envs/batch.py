@@ -33,25 +33,24 @@ NO_TERM = -1
 
 
 class Timestep(NamedTuple):
-    """What a timestep of all races has come to; its arrays are not written to again."""
+    """The outcome of a timestep of all races."""
 
     before: FloatArray  # (n, 82) cars
     after: FloatArray  # (n, 82) cars
-    controls: FloatArray  # (n, 5) that were held
     observations: npt.NDArray[np.float32]  # (n, 29)
     rewards: list[float]
     terms: list[list[float]]  # of the rewards, in the order of `names`
-    names: list[tuple[str, ...]]
+    names: list[tuple[str, ...]]  # of the terms
     standing: Counts  # (n,) control ticks for which cars had been standing before
     patience: Counts  # (n,) for which they might
-    ended: npt.NDArray[np.bool_]  # (n,) or the race has failed; a time limit is not known here
+    ended: npt.NDArray[np.bool_]  # (n,) also if the race has failed; time limits are not known here
     failures: dict[int, Exception]  # of races that have not arrived
 
     def info(self, race: int) -> dict[str, Any]:
         """
         Make the ``info`` of a race whose episode goes on.
 
-        :param race: which
+        :param race: index of the race
         """
         car = car_from_record(self.after[race])
         lap_time = car.last_lap_time if car.laps > self.before[race, LAPS] else 0.0
@@ -66,18 +65,18 @@ LAPS = CarState._fields.index("laps")
 
 class _Driven:
     """
-    Stands where a world stands, while an environment takes a timestep that is driven already.
+    Takes the place of a world while its environment takes a timestep that is already driven.
 
-    :param world: that has driven
-    :param timestep: of all races
-    :param race: which
+    :param world: that has been driven
+    :param timestep: the outcome
+    :param race: index of the race
     """
 
     def __init__(self, world: Backend, timestep: Timestep, race: int) -> None:
         self._world, self._timestep, self._race = world, timestep, race
 
     def step(self, controls: Controls, ticks: int) -> CarState:
-        """Answer what the world would; see :class:`~sb3_torcs.backends.base.Backend`."""
+        """Return what the world has come to; see :class:`~sb3_torcs.backends.base.Backend`."""
         del controls, ticks  # the same that were held
         if self._race in self._timestep.failures:
             raise self._timestep.failures[self._race]
@@ -91,8 +90,8 @@ class Batch:
     """
     Racing environments that take their timesteps at once.
 
-    What is known about a race is here while it is driven, and in its environment while somebody
-    uses that: :meth:`leave` brings it there, :meth:`enter` back.
+    The state of a race is here while it is driven by :meth:`step`. :meth:`leave` gives it back to
+    the environment, before that is used by itself; :meth:`enter` takes it over again.
 
     :param envs: of one kind and with the same layout of actions
     :param threads: that drive, at least 1; ``None`` is one per core, and one per race at most
@@ -110,13 +109,12 @@ class Batch:
                 "and cars with as many gears"
             )
         self._layout = self.envs[0].layout
-        self._limits = np.array(self._layout.low), np.array(self._layout.high)
+        self._bounds = np.array(self._layout.low), np.array(self._layout.high)
         worlds = [worlds_of(env.backend) for env in self.envs]
         self._first = np.cumsum([0, *map(len, worlds)])[:-1]
         self._fleet = fleet_of([world for several in worlds for world in several], self.threads)
         self._worlds = self._first.astype(np.int64)
         self._cars = np.zeros((number, CAR_NUMBERS))
-        self._controls = np.zeros((number, 5))
         self._laps = np.full(number, np.inf)
         self._ticks, self._patience, self._standing = np.ones((3, number), np.int64)
         self._driven: list[list[FloatArray]] = [[] for _ in self.envs]
@@ -124,7 +122,7 @@ class Batch:
         self._read_rewards()
 
     def _read_rewards(self) -> None:
-        """Look the terms of all rewards up."""
+        """Look up which terms the rewards have, and which of them are compiled."""
         number, most = len(self.envs), max(len(reward.terms) for reward in self._rewards)
         self._choices = np.full((number, most), NO_TERM)
         self._weights = np.zeros((number, most))
@@ -140,9 +138,9 @@ class Batch:
 
     def enter(self, race: int) -> None:
         """
-        Take a race over from its environment, which has been reset.
+        Take the state of a race over from its environment, which has been reset.
 
-        :param race: which
+        :param race: index of the race
         """
         env = self.envs[race]
         assert env.car is not None, "step raises before the first reset"
@@ -158,9 +156,9 @@ class Batch:
 
     def leave(self, race: int) -> None:
         """
-        Let the environment of a race know all that has happened.
+        Give the state of a race back to its environment.
 
-        :param race: which
+        :param race: index of the race
         """
         if not self._driven[race]:
             return
@@ -176,7 +174,7 @@ class Batch:
         Hold an action in each race.
 
         :param asked: (n, numbers of an action)
-        :return: what it has come to; those of ``ended`` and ``failures`` have to be finished
+        :return: the outcome; a race that has ended or failed has to be finished
         :raises InvalidAction: if there is not one action per race, or one is none; then nobody has
             driven
         """
@@ -212,7 +210,6 @@ class Batch:
         return Timestep(
             before,
             after,
-            controls,
             observations,
             [sum(row) for row in terms],
             terms,
@@ -225,13 +222,13 @@ class Batch:
 
     def finish(self, race: int, timestep: Timestep, act: Callable[[], Any]) -> Any:
         """
-        Let an environment take the timestep itself that has been driven, with all its wrappers.
+        Let an environment take the timestep itself, with all its wrappers, without driving again.
 
-        :param race: which
-        :param timestep: of all races
+        :param race: index of the race
+        :param timestep: the outcome of the latest ``step``
         :param act: steps the outermost wrapper
-        :return: what that does
-        :raises Exception: if the race has failed; then it is where it was
+        :return: what ``act`` returns
+        :raises Exception: what has stopped the race; its state is that of before the timestep
         """
         env = self.envs[race]
         failure = timestep.failures.get(race)
@@ -256,7 +253,7 @@ class Batch:
 
     def _read(self, asked: npt.NDArray[np.floating]) -> FloatArray:
         """Turn the actions into controls, (n, 5)."""
-        low, high = self._limits
+        low, high = self._bounds
         controls = np.empty((len(self.envs), len(Controls._fields)))
         if isinstance(asked, np.ndarray) and asked.dtype.char in "fd":
             fits = asked.shape == (len(self.envs), len(low))
@@ -281,7 +278,7 @@ class Batch:
         after: FloatArray,
         controls: FloatArray,
     ) -> float:
-        """Value a term that is not compiled."""
+        """Return the weighted value of a term that is not compiled."""
         was, car = car_from_record(before), car_from_record(after)
         seconds = car.time - was.time
         return weight * seconds * term(was, car, _controls(controls)) if seconds else 0.0
@@ -295,11 +292,11 @@ def _controls(row: FloatArray) -> Controls:
 
 def fleet_of(worlds: Sequence[Backend], threads: int) -> Fleet:
     """
-    Put worlds together that are to be driven at once.
+    Make a fleet of worlds.
 
     :param worlds: of one kind
     :param threads: that drive
-    :raises InvalidOption: if that kind cannot
+    :raises InvalidOption: if worlds of that kind cannot be driven at once
     """
     native = [world for world in worlds if isinstance(world, NativeBackend)]
     lite = [world for world in worlds if isinstance(world, LiteBackend)]

@@ -1,7 +1,7 @@
-"""What a single environment does in a timestep, compiled for many at once.
+"""What an environment computes in a timestep, compiled for many environments at once.
 
-Nothing is said twice here: sensors, terms of rewards, layouts of actions and the end of an episode
-are those of :class:`~sb3_torcs.envs.racing.RacingEnv`.
+The sensors, the terms of rewards, the layouts of actions and the ends of episodes are the functions
+that :class:`~sb3_torcs.envs.racing.RacingEnv` calls in Python; numba compiles them here.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ Counts = npt.NDArray[np.int64]
 COMPILED: tuple[rewards.Term, ...] = tuple(
     term for term in rewards.TERMS.values() if term.__module__ == rewards.__name__
 )
-"""Terms of rewards; others, which somebody has added to the table, are asked in Python."""
+"""The terms of rewards of this package. Terms that a user adds are called in Python."""
 
 
 def _derived(name: str) -> None:
-    """Let records of cars have a property of ``CarState`` in compiled code."""
+    """Give a property of ``CarState`` to records of cars in compiled code."""
     formula = register_jitable(getattr(CarState, name).fget)
 
     @overload_attribute(types.Record, name)
@@ -91,15 +91,15 @@ def read_actions(asked: Any, low: FloatArray, high: FloatArray, controls: FloatA
 
 
 def _one_of(terms: Sequence[rewards.Term]) -> Any:
-    """Compile a function that values the term of a place, which it is told first."""
+    """Compile a function that returns the value of one of several terms, by its index."""
     first = njit(terms[0])
     rest = _one_of(terms[1:]) if terms[1:] else None
 
     @njit
-    def value(place: int, before: Any, after: Any, controls: Any) -> float:
-        if rest is None or place == 0:
+    def value(index: int, before: Any, after: Any, controls: Any) -> float:
+        if rest is None or index == 0:
             return first(before, after, controls)
-        return rest(place - 1, before, after, controls)
+        return rest(index - 1, before, after, controls)
 
     return value
 
@@ -123,14 +123,14 @@ def value_timesteps(
     ended: npt.NDArray[np.bool_],
 ) -> None:
     """
-    Do for each race what ``RacingEnv.finish_step`` does.
+    Compute observations, terms of the rewards and ends, as ``RacingEnv.finish_step`` does.
 
     :param before: (n,) cars
     :param after: (n,) cars
     :param controls: (n,) that were held
-    :param choices: (n, k) places in :data:`COMPILED`, or negative
+    :param choices: (n, k) indices in :data:`COMPILED`, negative for none
     :param weights: (n, k) of the terms
-    :param laps: (n,) after which an episode is over
+    :param laps: (n,) after which an episode ends
     :param ticks: (n,) control ticks of a timestep
     :param patience: (n,) control ticks for which cars may stand, changed
     :param standing: (n,) control ticks for which they have been standing, changed

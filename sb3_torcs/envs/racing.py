@@ -73,7 +73,7 @@ def racing_info(
     car: CarState, lap_time: float, terms: dict[str, float], end: str | None = None
 ) -> dict[str, Any]:
     """
-    Say what ``info`` holds.
+    Make the ``info`` of a timestep.
 
     :param car: at the end of the timestep
     :param lap_time: of the lap that the timestep has completed, else 0 [s]
@@ -95,16 +95,16 @@ def racing_info(
 
 
 ENDS = ("", "laps", "off_track", "backwards", "damage")
-"""Why an episode ends where a car is; the numbers of :func:`end_of`."""
+"""Why an episode ends because of the state of the car, by the index that :func:`end_of` returns."""
 
 
 def end_of(car: CarState, laps: float) -> int:
     """
-    Say whether an episode ends here, but for a car that stands. Compiled code calls it, too.
+    Check whether the state of the car ends the episode. Compiled code calls it, too.
 
     :param car: at the end of a timestep
-    :param laps: whole laps after which it does
-    :return: the place of the reason in :data:`ENDS`, 0 if it goes on
+    :param laps: whole laps after which the episode ends
+    :return: the index of the reason in :data:`ENDS`, 0 if the episode goes on
     """
     if car.laps >= laps:
         return 1
@@ -117,7 +117,7 @@ def end_of(car: CarState, laps: float) -> int:
 
 def stands(car: CarState) -> bool:
     """
-    Say whether a car is slower along the road than walking. Compiled code calls it, too.
+    Check whether a car is slower along the road than walking. Compiled code calls it, too.
 
     :param car: at the end of a timestep
     """
@@ -285,7 +285,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
 
     def check_ready(self) -> None:
         """
-        Make sure that there is a race to drive on in.
+        Check that the environment can be stepped.
 
         :raises EnvClosed: before a reset and after ``close``
         """
@@ -362,10 +362,10 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
 
     def arrive(self, car: CarState, controls: Controls, standing: int) -> None:
         """
-        Go on from where the car is that somebody else has driven, as a batch of races does.
+        Take over the state of a car that has been driven without ``step``, in a batch of races.
 
-        :param car: there
-        :param controls: that were held last
+        :param car: the car now
+        :param controls: the last that it was driven with
         :param standing: control ticks for which it has been standing
         """
         self.car, self._controls, self.standing = car, controls, standing

@@ -66,7 +66,7 @@ class LiteBackend:
 
     def keep_state_in(self, state: FloatArray) -> None:
         """
-        Keep the car in other memory from now on, e.g. in that of a fleet.
+        Keep the state of the car in other memory from now on: a fleet has one array for all cars.
 
         :param state: (STATE_SIZE,) overwritten by the present state
         """
@@ -75,12 +75,12 @@ class LiteBackend:
 
     @property
     def road(self) -> tuple[FloatArray, Edges]:
-        """The present track for the physics: its table, and the road's edges."""
+        """The present track as the physics takes it: its table, and the edges of its road."""
         return self._table, self._edges
 
     @property
     def manner(self) -> tuple[int, bool]:
-        """How the physics drives it: the gearbox, and whether the episode began on the way."""
+        """The gearbox, and whether the episode began elsewhere than on the grid."""
         return self._gearbox, self._flying
 
     def reset(self, rng: np.random.Generator, start: Start | None) -> CarState:

@@ -1,10 +1,11 @@
-"""Several fallback worlds that are driven at once, by one call of compiled code per track."""
+"""Several fallback worlds that are driven at once: one call of compiled code per track."""
 
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +15,7 @@ from sb3_torcs.backends.lite import physics
 from sb3_torcs.backends.lite.backend import LiteBackend
 from sb3_torcs.backends.lite.rays import RANGE, Edges
 from sb3_torcs.car import CarState, Controls, FloatArray
+from sb3_torcs.errors import EngineForked
 
 __all__ = ["LiteFleet"]
 
@@ -42,7 +44,24 @@ def _drive(
     cars: FloatArray,
     lost: npt.NDArray[np.bool_],
 ) -> None:
-    """Drive those of one track; what is what says :meth:`LiteFleet.step`."""
+    """
+    Drive worlds that are on one track.
+
+    :param rows: of the worlds, in the arrays that have a row for each race of a step
+    :param worlds: (n,) which world each race is in
+    :param states: (worlds, STATE_SIZE) of the physics, changed
+    :param table: ``Track.table``
+    :param shapes: of the road's edges, as :class:`~sb3_torcs.backends.lite.rays.Edges` has them
+    :param first: of the edges
+    :param reach: of the edges
+    :param angles: (worlds, 19) of the range finders [rad]
+    :param gearboxes: (worlds,) ``AUTOMATIC`` or ``BY_ROAD_SPEED``
+    :param flying: (worlds,) whether the episode began elsewhere than on the grid
+    :param controls: (n, 5)
+    :param ticks: (n,) control ticks
+    :param cars: (n, 82) filled
+    :param lost: (n,) filled: whether the physics has given NaN
+    """
     for row in rows:
         world = worlds[row]
         state, car = states[world], cars[row]
@@ -83,10 +102,15 @@ class LiteFleet:
         self._gearboxes = np.zeros(len(self._backends), np.int64)
         self._flying = np.zeros(len(self._backends), np.bool_)
         self._threads = threads
-        self._others = ThreadPoolExecutor(threads - 1) if threads > 1 else None
+        self._others = ThreadPoolExecutor(max(threads - 1, 1))  # which begins one when it has work
+        self._owner = os.getpid()
 
     def step(self, worlds: Rows, controls: FloatArray, ticks: Rows, cars: FloatArray) -> list[int]:
         """Drive some of them; see :class:`~sb3_torcs.backends.base.Fleet`."""
+        if os.getpid() != self._owner:
+            raise EngineForked(
+                "these threads belong to the parent process; make the environment after the fork"
+            )
         lost = np.zeros(len(worlds), np.bool_)
 
         def drive(rows: Rows, road: Road) -> None:
@@ -97,16 +121,23 @@ class LiteFleet:
                 cars, lost,
             )  # fmt: skip
 
-        first, *others = self._jobs(worlds)
-        begun = [self._others.submit(drive, *job) for job in others] if self._others else []
-        for job in (first,) if begun else (first, *others):
-            drive(*job)
-        for other in begun:
+        jobs = iter(list(self._jobs(worlds)))
+
+        def work() -> None:
+            for rows, road in jobs:  # an iterator that all threads share
+                drive(rows, road)
+
+        others = [self._others.submit(work) for _ in range(self._threads - 1)]
+        try:
+            work()
+        finally:
+            wait(others)
+        for other in others:
             other.result()
         return np.flatnonzero(lost).tolist()
 
     def _jobs(self, worlds: Rows) -> Iterator[tuple[Rows, Road]]:
-        """The rows of each track, cut so that all threads have work."""
+        """Return the rows of each track, split so that all threads have work."""
         tracks: dict[int, list[int]] = {}
         for row, world in enumerate(worlds.tolist()):
             backend = self._backends[world]
@@ -118,13 +149,12 @@ class LiteFleet:
             yield from ((part, road) for part in np.array_split(rows, parts) if len(part))
 
     def failure(self, world: int) -> Exception:
-        """Say what stopped a race; see :class:`~sb3_torcs.backends.base.Fleet`."""
+        """Return what stopped a race; see :class:`~sb3_torcs.backends.base.Fleet`."""
         return self._backends[world].lost()
 
     def arrive(self, world: int, steps: Iterable[tuple[Controls, int]], car: CarState) -> None:
-        """There is nothing to tell: see :class:`~sb3_torcs.backends.base.Fleet`."""
+        """Do nothing: the worlds share the cars. See :class:`~sb3_torcs.backends.base.Fleet`."""
 
     def close(self) -> None:
         """End the threads; see :class:`~sb3_torcs.backends.base.Fleet`."""
-        if self._others is not None:
-            self._others.shutdown()
+        self._others.shutdown()
