@@ -166,6 +166,15 @@ def test_a_training_that_goes_on_continues_the_series(oval, clock, tmp_path):
     ]
 
 
+def test_no_picture_of_a_series_is_overwritten(oval, tmp_path):
+    """Also if somebody has taken some away."""
+    (tmp_path / "004.png").write_text("theirs")
+    pictures = LinePicturesCallback(folder=str(tmp_path))
+    learned(oval, [driven(oval, 296.0)], callbacks=[pictures])
+    assert [lap.picture for lap in driven_laps(tmp_path)] == ["005.png"]
+    assert (tmp_path / "004.png").read_text() == "theirs"
+
+
 def test_half_a_row_is_left_out(tmp_path):
     (tmp_path / "laps.csv").write_text(
         "seconds,timesteps,distance,lap_time,picture\n1.0,16,296.0,,001.png\n2.0,32,30"
@@ -209,3 +218,7 @@ def test_the_picture_of_a_learning_holds_curves_and_lines(oval, tmp_path):
     )
     draw_learning(tmp_path, tmp_path / "learning.png")
     assert imread(tmp_path / "learning.png").shape == (1056, 1800, 4)
+    for picture in tmp_path.glob("00*.png"):
+        picture.unlink()
+    draw_learning(tmp_path, tmp_path / "learning.png")
+    assert imread(tmp_path / "learning.png").shape == (528, 1800, 4)

@@ -131,7 +131,8 @@ class LinePicturesCallback(BaseCallback):
         # Graphics load only when there is something to draw.
         from sb3_torcs.tracks.plot import plot_track
 
-        path = self.folder / f"{len(list(self.folder.glob('*.png'))) + 1:03d}.png"
+        number = max((int(path.stem) for path in _pictures(self.folder)), default=0) + 1
+        path = self.folder / f"{number:03d}.png"
         aside = path.with_name(f".{path.name}")
         driven = f"{lap.lap_time:.2f} s" if lap.lap_time else f"{max(lap.distance, 0.0):.0f} m"
         title = f"{spoken_moment(lap.seconds)}, {lap.timesteps:,} timesteps: {driven}"
@@ -153,8 +154,9 @@ class LinePicturesCallback(BaseCallback):
             writer = csv.writer(file, lineterminator="\n")
             if new:
                 writer.writerow(DrivenLap._fields)
+            lap_time = f"{lap.lap_time:.3f}" if lap.lap_time else ""
             seconds, distance = f"{lap.seconds:.1f}", f"{lap.distance:.1f}"
-            writer.writerow(lap._replace(seconds=seconds, distance=distance))  # type: ignore[arg-type]
+            writer.writerow((seconds, lap.timesteps, distance, lap_time, lap.picture))
 
     def _say(self, text: str) -> None:
         for progress in self._progress:
@@ -176,19 +178,27 @@ def draw_learning(folder: Path, path: Path) -> None:
     laps = driven_laps(folder)
     if not laps:
         raise InvalidOption(f"'{folder / TABLE}' has no evaluations; train for longer")
-    pictures = sorted(folder.glob("[0-9]*.png"))
-    chosen = np.unique(np.linspace(0, len(pictures) - 1, SHOWN).round().astype(int))
+    pictures = _pictures(folder)
+    numbers = np.linspace(0, len(pictures) - 1, SHOWN).round().astype(int)
+    chosen = [pictures[number] for number in np.unique(numbers)] if pictures else []
     rows = math.ceil(len(chosen) / COLUMNS)
     figure = Figure(figsize=(SIZE, ROW * (1 + rows)), layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(1 + rows, 1)
     _draw_curves(figure.add_subfigure(grid[0]), laps)
-    cells = figure.add_subfigure(grid[1:]).subplots(rows, COLUMNS, squeeze=False)
-    for axes in cells.flat:
-        axes.axis("off")
-    for axes, number in zip(cells.flat, chosen, strict=False):
-        axes.imshow(imread(pictures[number]))
+    for row in range(rows):
+        cells = figure.add_subfigure(grid[1 + row]).subplots(1, COLUMNS)
+        for number, axes in enumerate(cells, row * COLUMNS):
+            axes.axis("off")
+            if number < len(chosen):
+                axes.imshow(imread(chosen[number]))
     figure.savefig(path, dpi=120)
+
+
+def _pictures(folder: Path) -> list[Path]:
+    """List the pictures of a series, the oldest first."""
+    numbered = [path for path in folder.glob("*.png") if path.stem.isdecimal()]
+    return sorted(numbered, key=lambda path: int(path.stem))
 
 
 def _draw_curves(figure: SubFigure, laps: list[DrivenLap]) -> None:
