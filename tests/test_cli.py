@@ -675,12 +675,15 @@ def test_a_training_in_processes_that_is_ended_from_outside_keeps_what_it_learne
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True,
     )  # fmt: skip
     folder = tmp_path / "logs" / "ddpg" / "TorcsLite-v0_1"
-    while not (folder / "best_model.zip").is_file():
-        assert process.poll() is None, process.stdout.read()
-        time.sleep(0.1)
-    process.stdout.close()
-    (os.killpg if by == signal.SIGINT else os.kill)(process.pid, by)
-    process.wait(60)
+    try:
+        while not (folder / "best_model.zip").is_file():
+            assert process.poll() is None, process.stdout.read()
+            time.sleep(0.1)
+        process.stdout.close()
+        (os.killpg if by == signal.SIGINT else os.kill)(process.pid, by)
+        process.wait(60)
+    finally:
+        process.kill()
     assert models.saved_timesteps(folder / "TorcsLite-v0.zip") >= 200
     assert models.find_model(folder, prefer_last=True).name == "TorcsLite-v0.zip"
 

@@ -708,10 +708,11 @@ class TestGoodManners:
         code = BEGIN + (
             "import locale, signal\n"
             "locale.setlocale(locale.LC_ALL, 'C.UTF-8')\n"
+            "MASKS = ('SigBlk', 'SigIgn', 'SigCgt')\n"
             "def around():\n"
             "    signals = [signal.getsignal(s) for s in signal.valid_signals()]\n"
             "    status = open('/proc/self/status').read()\n"
-            "    blocked = status.split('Sig', 1)[1].split('Seccomp')[0]\n"
+            "    blocked = [line for line in status.splitlines() if line[:6] in MASKS]\n"
             "    return (os.getcwd(), locale.setlocale(locale.LC_ALL), dict(os.environ),\n"
             "            signals, blocked, os.umask(0o22))\n"
             "before = around()\n"

@@ -158,7 +158,7 @@ def test_a_silent_server_is_told_too():
 
 
 def test_a_host_without_an_address_is_told():
-    with pytest.raises(ServerNotFound, match="no way to no such host:3001"):
+    with pytest.raises(ServerNotFound, match="no such host:3001 cannot be reached"):
         ScrClient("no such host", 3001, ANGLES)
 
 

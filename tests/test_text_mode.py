@@ -140,7 +140,7 @@ class TestRefusals:
     @pytest.mark.parametrize(
         ("robots", "changes", "message"),
         [
-            ([("racer", 3), ("racer", 10)], {}, r"a practice is for one robot, 2 are named"),
+            ([("racer", 3), ("racer", 10)], {}, r"a practice is for one robot, but 2 are named"),
             ([], {"session": "race"}, r"robots are none; expected at least one"),
             ([("racer", 3)] * 2, {"session": "race"}, r"racer:3, racer:3; expected .* twice"),
             (
