@@ -8,14 +8,17 @@ import pytest
 import torch as th
 from conftest import car_state
 from stable_baselines3 import DDPG, PPO, SAC
+from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecNormalize
 from toy import ToyRace
 
 from sb3_torcs.callbacks import MirrorCallback
 from sb3_torcs.errors import InvalidOption
-from sb3_torcs.policies.mirror import mirror_actions, mirror_observations
+from sb3_torcs.policies.mirror import mirror_actions, mirror_half, mirror_observations
+from sb3_torcs.policies.replay import sample_mirrored
 from sb3_torcs.sensors import encode, feature_slices
 
 STRAIGHT = 4050.0  # [m] of forza, where nearly a kilometre of straight road begins
@@ -136,23 +139,46 @@ def test_half_of_what_is_learned_from_is_mirrored(algorithm, options):
     assert "sample" not in vars(buffer)
 
 
-def test_all_of_a_transition_is_mirrored(monkeypatch):
+def test_all_of_a_transition_is_mirrored():
     """Its action and what came of it, too; reward, end and discount stay."""
     model = make_model(n_steps=2)
     model.learn(12)
+    model.set_random_seed(0)
     stock = model.replay_buffer.sample(8)
-    monkeypatch.setattr(type(model.replay_buffer), "sample", lambda *_: stock)
-    callback = MirrorCallback()
-    callback.init_callback(model)
-    callback.on_training_start({}, {})
-    callback.on_rollout_end()
-    batch = model.replay_buffer.sample(8)
+    model.set_random_seed(0)
+    batch = sample_mirrored(model.replay_buffer, 8)
     assert batch.actions[:4].equal(mirror_actions(stock.actions[:4]))
     assert batch.next_observations[:4].equal(mirror_observations(stock.next_observations[:4]))
     for name in ("observations", "actions", "next_observations"):
         assert getattr(batch, name)[4:].equal(getattr(stock, name)[4:])
     for name in ("dones", "rewards", "discounts"):
-        assert getattr(batch, name) is getattr(stock, name)
+        assert getattr(batch, name).equal(getattr(stock, name))
+
+
+@pytest.mark.parametrize("n_steps", [1, 3])
+@pytest.mark.parametrize("kind", ["stock", "a subclass"])
+def test_batches_are_those_of_sb3_with_half_mirrored(n_steps, kind):
+    """The same random numbers and the same bits, over ends, timeouts and the oldest transition."""
+    rng = np.random.default_rng(n_steps)
+    stock = NStepReplayBuffer if n_steps > 1 else ReplayBuffer
+    buffer_class = stock if kind == "stock" else type("Own", (stock,), {})
+    steps = {"n_steps": n_steps, "gamma": 0.97} if n_steps > 1 else {}
+    env = make_vec_env(MirrorToy)
+    spaces = env.observation_space, env.action_space
+    buffer = buffer_class(60, *spaces, device="cpu", n_envs=2, **steps)
+    for added in range(50):
+        seen, then = rng.uniform(-1, 1, (2, 2, 29)).astype(np.float32)
+        ends = rng.random((2, 2)) < 0.2
+        infos = [{"TimeLimit.truncated": bool(end)} for end in ends[1]]
+        buffer.add(
+            seen, then, rng.uniform(-1, 1, (2, 3)), rng.uniform(-1, 1, 2), ends.any(0), infos
+        )
+        for seed in range(3 if added % 7 == 0 or buffer.full else 0):
+            set_random_seed(seed)
+            expected = mirror_half(buffer.sample(9))
+            set_random_seed(seed)
+            for one, two in zip(sample_mirrored(buffer, 9), expected, strict=True):
+                assert (one is None and two is None) or one.equal(two)
 
 
 def test_a_buffer_that_is_saved_while_the_algorithm_learns_is_a_stock_one(tmp_path):

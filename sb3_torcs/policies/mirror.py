@@ -13,7 +13,13 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_torcs.sensors import OBSERVATION_SIZE, feature_slices
 
-__all__ = ["mirror_actions", "mirror_half", "mirror_observations"]
+__all__ = [
+    "MIRROR_ORDER",
+    "MIRROR_SIGNS",
+    "mirror_actions",
+    "mirror_half",
+    "mirror_observations",
+]
 
 SIDED = ("heading_error", "track_position", "speed_y")
 """Sensors that are positive on one side."""
@@ -39,7 +45,7 @@ def _signs() -> th.Tensor:
     return th.from_numpy(signs)
 
 
-_ORDER, _SIGNS = _order(), _signs()
+MIRROR_ORDER, MIRROR_SIGNS = _order(), _signs()
 
 
 def mirror_observations(observations: th.Tensor) -> th.Tensor:
@@ -50,7 +56,7 @@ def mirror_observations(observations: th.Tensor) -> th.Tensor:
     :return: (n, 29)
     """
     device = observations.device
-    return observations[:, _ORDER.to(device)] * _SIGNS.to(device)
+    return observations[:, MIRROR_ORDER.to(device)] * MIRROR_SIGNS.to(device)
 
 
 def mirror_actions(actions: th.Tensor) -> th.Tensor:
