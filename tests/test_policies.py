@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from copy import deepcopy
 
 import numpy as np
 import pytest
@@ -12,18 +13,25 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3 import DDPG, PPO, TD3
 from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv
 from torch import nn
 from toy import ToyRace
 
 from sb3_torcs.bench.policy import PlainSplitHeadPolicy, measure, updater
+from sb3_torcs.callbacks import LeanUpdatesCallback
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.policies import SplitHeadPolicy, fast_matmul
 from sb3_torcs.policies.mirror import mirror_actions, mirror_observations
 from sb3_torcs.policies.optimizers import LeanAdam
+from sb3_torcs.policies.updates import LeanUpdates
 
 SMALL = [16, 24]
 OBSERVATIONS = np.random.default_rng(0).uniform(-1, 1, (5, 29)).astype(np.float32)
+
+
+class Extractor(FlattenExtractor):
+    """A features extractor that is not SB3's."""
 
 
 def make_model(algorithm=DDPG, policy="SplitHeadPolicy", **kwargs):
@@ -37,11 +45,11 @@ def make_model(algorithm=DDPG, policy="SplitHeadPolicy", **kwargs):
     return model
 
 
-def trained(policy, updates: int = 10, **policy_kwargs) -> list[th.Tensor]:
+def trained(policy, algorithm=DDPG, updates: int = 10, **policy_kwargs) -> dict[str, th.Tensor]:
     """Parameters of all four networks after some updates, from the same start and data."""
-    model = updater(policy, 32, **{"net_arch": SMALL, **policy_kwargs})
+    model = updater(policy, 32, algorithm, **{"net_arch": SMALL, **policy_kwargs})
     model.train(updates, 32)
-    return [parameter.detach() for parameter in model.policy.parameters()]
+    return model.policy.state_dict()
 
 
 def assert_same(one: list[th.Tensor], two: list[th.Tensor]) -> None:
@@ -75,7 +83,7 @@ def test_a_head_bias_starts_without_half_brake():
 def test_the_heads_are_tanh_and_sigmoid_in_environment_units(heads):
     """tanh(z) or 2 sigmoid(z) - 1, then scaled by SB3; within float32."""
     model = make_model(heads=heads, init_std=1.0)
-    mu = model.actor.mu
+    mu = model.actor.mu.plain()
     with th.no_grad():
         z = th.as_tensor(OBSERVATIONS)
         for layer in mu.hidden:
@@ -89,14 +97,15 @@ def test_the_heads_are_tanh_and_sigmoid_in_environment_units(heads):
 
 def test_the_heads_start_from_the_given_deviation():
     """N(0, init_std); four standard errors of 1800 weights."""
-    weights = make_model(net_arch=None, init_std=0.5).actor.mu.heads.weight
+    weights = make_model(net_arch=None, init_std=0.5).actor.mu.plain().heads.weight
     assert weights.std().item() == pytest.approx(0.5, rel=4 / np.sqrt(2 * 1800))
-    assert not make_model().actor.mu.heads.bias.any()
+    assert not make_model().actor.mu.plain().heads.bias.any()
 
 
 def test_the_action_joins_the_critic_at_the_second_layer():
     """relu(W3 (W2 relu(W1 s) + Wa a)), written out."""
-    network = make_model().critic.q_networks[0]
+    critic = make_model().critic
+    (network,) = critic.plain()
     state, action = th.rand(7, 29), th.rand(7, 3)
 
     def lin(layer, x):
@@ -105,6 +114,7 @@ def test_the_action_joins_the_critic_at_the_second_layer():
     joint = lin(network.state2, th.relu(lin(network.state1, state))) + lin(network.action2, action)
     expected = lin(network.value, th.relu(lin(network.joint3, joint)))
     th.testing.assert_close(network(state, action), expected)
+    th.testing.assert_close(critic(state, action)[0], expected)
     assert expected.shape == (7, 1)
 
 
@@ -138,7 +148,7 @@ def test_the_policy_trains_with_other_parts(kwargs):
 def test_layer_norm_is_in_the_hidden_layers_of_both_networks():
     """Two in the actor, and in the critic the first and the third layer."""
     policy = make_model(layer_norm=True).policy
-    for network in (policy.actor, policy.critic):
+    for network in (policy.actor.mu.plain(), *policy.critic.plain()):
         assert sum(isinstance(module, nn.LayerNorm) for module in network.modules()) == 2
 
 
@@ -174,19 +184,97 @@ def test_a_wrong_option_is_named_with_what_is_allowed(kwargs, message):
 # ------------------------------------------------------------------------------ shortcuts
 
 
-@pytest.mark.parametrize("kwargs", [{}, {"n_critics": 2}, {"critic_lr_scale": 10.0}])
-def test_the_shortcuts_change_no_bit_with_the_same_kernel_of_adam(kwargs):
-    """Against the plain networks: stock gradients, and each kernel of Adam against itself."""
-    for fused in (False, True):
-        plain = trained(PlainSplitHeadPolicy, optimizer_kwargs={"fused": fused}, **kwargs)
-        options = {} if fused else {"optimizer_kwargs": {"fused": False}}
-        assert_same(plain, trained(SplitHeadPolicy, **options, **kwargs))
+ALIKE = [
+    {}, {"n_critics": 2}, {"critic_lr_scale": 10.0}, {"layer_norm": True, "n_critics": 2},
+    {"net_arch": {"pi": [8, 12, 16], "qf": [8, 4]}, "layer_norm": True},
+]  # fmt: skip
 
 
-def test_the_fused_kernel_differs_by_rounding_only():
-    """One Adam step moves a weight by about 1e-3; ten steps of other rounding by far less."""
-    for one, two in zip(trained(PlainSplitHeadPolicy), trained(SplitHeadPolicy), strict=True):
-        th.testing.assert_close(one, two, rtol=0, atol=1e-5)
+@pytest.mark.parametrize("kwargs", ALIKE)
+@pytest.mark.parametrize("algorithm", [DDPG, TD3])
+def test_the_passes_by_hand_learn_as_the_plain_networks_do(algorithm, kwargs):
+    """Ten updates move a weight by 1e-2 or more; another order of sums, by a thousandth of that."""
+    plain, fused = (
+        trained(policy, algorithm, **{**kwargs, "init_std": 0.5})
+        for policy in (PlainSplitHeadPolicy, SplitHeadPolicy)
+    )
+    assert plain.keys() == fused.keys()
+    for name, weights in plain.items():
+        th.testing.assert_close(fused[name], weights, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("kwargs", ALIKE)
+def test_values_and_gradients_are_those_of_the_plain_networks(kwargs):
+    """The same weights and the same batch, in double precision."""
+    model = make_model(init_std=0.5, **kwargs)
+    policy = model.policy.double()
+    seen, actions = th.rand(7, 29).double(), th.rand(7, 3).double()
+    mu, networks = policy.actor.mu, policy.critic.plain()
+    plain = mu.plain().double()
+    th.testing.assert_close(mu(seen), plain(seen))
+    values = policy.critic(seen.float(), actions)
+    del values  # SB3 hands over single precision: the passes are called by themselves below
+    vectors = policy.critic.flat.view(len(networks), -1)
+    found = policy.critic.fused(vectors, seen, actions)
+    expected = [network.double()(seen, actions) for network in networks]
+    for one, two in zip(found, expected, strict=True):
+        th.testing.assert_close(one, two)
+    sum((value**2).sum() for value in found).backward()
+    sum((value**2).sum() for value in expected).backward()
+    (mu(seen) ** 2).sum().backward()
+    (plain(seen) ** 2).sum().backward()
+    for name, gradient in policy.critic.views(policy.critic.flat.grad):
+        number, _, rest = name.removeprefix("qf").partition(".")
+        th.testing.assert_close(gradient, networks[int(number)].get_parameter(rest).grad)
+    for name, gradient in mu.views(mu.flat.grad):
+        th.testing.assert_close(gradient, plain.get_parameter(name).grad)
+
+
+@pytest.mark.parametrize("layer_norm", [False, True])
+def test_the_gradients_by_hand_are_those_of_small_differences(layer_norm):
+    """PyTorch's own check, in double precision: of the weights, the features and the actions."""
+    kwargs = {"net_arch": [5, 4], "layer_norm": layer_norm, "n_critics": 2, "init_std": 0.5}
+    policy = make_model(**kwargs).policy.double()
+    generator = th.Generator().manual_seed(0)
+    seen, actions = (
+        th.rand(3, width, generator=generator, dtype=th.float64).requires_grad_()
+        for width in (29, 3)
+    )
+    vectors = policy.critic.flat.detach().view(2, -1).requires_grad_()
+    assert th.autograd.gradcheck(policy.critic.fused, (vectors, seen, actions))
+    assert th.autograd.gradcheck(policy.actor.mu.fused, (policy.actor.mu.flat, seen))
+    assert th.autograd.gradcheck(
+        lambda acted: policy.critic.fused.first(vectors, seen.detach(), acted), (actions,)
+    )
+
+
+def test_a_graph_that_is_kept_gives_the_same_gradient_again():
+    """What a pass writes to is used by later ones: the second time it has to pass anew."""
+    policy = make_model(n_critics=2, layer_norm=True).policy
+    seen, actions = th.rand(6, 29), th.rand(6, 3).requires_grad_()
+    loss = sum(value.sum() for value in policy.critic(seen, actions))
+    loss = loss + policy.actor(seen).sum() + policy.critic.q1_forward(seen, actions).sum()
+    inputs = [policy.critic.flat, policy.actor.mu.flat, actions]
+    first = th.autograd.grad(loss, inputs, retain_graph=True)
+    policy.critic(th.rand(6, 29), th.rand(6, 3))[0].sum().backward()
+    policy.actor(th.rand(6, 29)).sum().backward()
+    assert_same(first, th.autograd.grad(loss, inputs))
+
+
+@pytest.mark.parametrize("activation_fn", [nn.ELU, nn.ReLU])
+def test_where_the_passes_do_not_fit_the_plain_networks_compute(activation_fn, monkeypatch):
+    """Another activation, or another device: the same values, and gradients by PyTorch."""
+    model = make_model(activation_fn=activation_fn, layer_norm=True, n_critics=2)
+    for part in (model.actor.mu, model.critic):
+        monkeypatch.setattr(part, "fused", None)
+    seen, actions = th.rand(6, 29), th.rand(6, 3).requires_grad_()
+    expected = [network(seen, actions) for network in model.critic.plain()]
+    for one, two in zip(model.critic(seen, actions), expected, strict=True):
+        assert th.equal(one, two)
+    assert th.equal(model.critic.q1_forward(seen, actions), expected[0])
+    assert th.equal(model.actor(seen), model.actor.mu.plain()(seen))
+    model.learn(20)
+    assert model._n_updates > 0
 
 
 @pytest.mark.parametrize("layer_norm", [False, True])
@@ -199,7 +287,7 @@ def test_the_actors_loss_gives_the_critic_no_gradient_and_the_action_the_same(la
     value, expected = critic.q1_forward(state, one), critic(state, two)[0]
     assert th.equal(value, expected)
     (gradient,) = th.autograd.grad(value.sum(), one)
-    assert th.equal(gradient, th.autograd.grad(expected.sum(), two)[0])
+    th.testing.assert_close(gradient, th.autograd.grad(expected.sum(), two)[0])
     parameters = list(critic.parameters())
     again = critic.q1_forward(state, th.rand(7, 3).requires_grad_()).sum()
     assert th.autograd.grad(again, parameters, allow_unused=True) == (None,) * len(parameters)
@@ -217,7 +305,7 @@ def test_adam_is_fused_unless_somebody_chose_its_kernel():
 
 
 @pytest.mark.parametrize("options", [{}, {"amsgrad": True}, {"weight_decay": 0.1, "lr": 0.1}])
-def test_lean_adam_is_the_fused_adam_bit_for_bit(options):
+def test_lean_adam_is_the_fused_adam_but_for_rounding(options):
     """Also over its own saved state, and for parameters without a gradient."""
 
     def run(optimizer_class, **more):
@@ -230,7 +318,7 @@ def test_lean_adam_is_the_fused_adam_bit_for_bit(options):
             optimizer.load_state_dict(optimizer.state_dict())
         return used.detach()
 
-    assert th.equal(run(LeanAdam), run(th.optim.Adam, fused=True))
+    th.testing.assert_close(run(LeanAdam), run(th.optim.Adam, fused=True), rtol=1e-6, atol=1e-7)
 
 
 def test_lean_adam_obeys_a_closure():
@@ -347,7 +435,114 @@ def test_switching_the_mode_reaches_every_module():
     assert {module.training for module in policy.actor_target.modules()} == {False}
 
 
+# ------------------------------------------------------------------------------ lean updates
+
+
+@pytest.mark.parametrize("kwargs", [{}, {"ema_decay": 0.9}, *ALIKE[1:]])
+@pytest.mark.parametrize("algorithm", [DDPG, TD3])
+def test_lean_updates_learn_as_the_algorithm_does(algorithm, kwargs):
+    """TD3's noise and delay, too; the same random numbers, and the same counts in the state."""
+    states, logs = [], []
+    for lean in (False, True):
+        model = updater(SplitHeadPolicy, 32, algorithm, **{"net_arch": SMALL, **kwargs})
+        train = LeanUpdates(model).train if lean else model.train
+        for steps in (3, 7):
+            train(steps, 32)
+        states.append([
+            model.policy.state_dict(),
+            *(part.optimizer.state_dict() for part in (model.actor, model.critic)),
+        ])  # fmt: skip
+        logs.append({"updates": model._n_updates, **model.logger.name_to_value})
+        states[-1].append(th.get_rng_state())
+    th.testing.assert_close(*states, rtol=1e-5, atol=1e-5)
+    assert logs[0] == pytest.approx(logs[1], rel=1e-5)
+
+
+@pytest.mark.parametrize(("make", "found"), [
+    (lambda: PPO("MlpPolicy", ToyRace()), "a PPO with ActorCriticPolicy"),
+    (lambda: DDPG("MlpPolicy", ToyRace(), buffer_size=10), "a DDPG with TD3Policy"),
+])  # fmt: skip
+def test_a_model_without_the_policy_has_no_lean_updates(make, found):
+    with pytest.raises(InvalidOption, match=found):
+        make().learn(10, callback=LeanUpdatesCallback())
+
+
+@pytest.mark.parametrize("kwargs", [
+    {"activation_fn": nn.ELU}, {"optimizer_class": th.optim.SGD},
+    {"optimizer_kwargs": {"weight_decay": 0.1}}, {"features_extractor_class": Extractor},
+])  # fmt: skip
+def test_parts_that_lean_updates_do_not_know_learn_as_ever(kwargs):
+    """The algorithm's own ``train`` goes on: to the bit what it is without the callback."""
+    models = [make_model(**kwargs) for _ in range(2)]
+    for model, callback in zip(models, (None, LeanUpdatesCallback()), strict=True):
+        model.set_random_seed(1)
+        model.learn(20, callback=callback)
+        assert model._n_updates > 0
+    assert_same(*(list(model.policy.parameters()) for model in models))
+
+
+def test_a_model_is_a_stock_one_whenever_it_may_be_saved(tmp_path):
+    """Between updates, in them (Ctrl-C comes then, as a rule), and after them."""
+    model = make_model()
+    found = []
+    sample = model.replay_buffer.sample
+
+    def noted(*args, **kwargs):
+        found.append("train" in vars(model))
+        return sample(*args, **kwargs)
+
+    model.replay_buffer.sample = noted
+    model.learn(20, callback=LeanUpdatesCallback())
+    assert found == [False] * model._n_updates
+    assert found
+    assert "train" not in vars(model)
+
+
 # ------------------------------------------------------------------------------ files
+
+
+@pytest.mark.parametrize("lean", [False, True])
+def test_the_same_seed_makes_the_same_model(lean):
+    """To the bit, with the same number of threads."""
+    callback = LeanUpdatesCallback() if lean else None
+    one, two = (make_model(n_critics=2, layer_norm=True, ema_decay=0.9) for _ in range(2))
+    for model in (one, two):
+        model.set_random_seed(1)
+        model.learn(30, callback=callback)
+    for a, b in zip(one.policy.parameters(), two.policy.parameters(), strict=True):
+        assert th.equal(a, b)
+
+
+def test_files_know_each_parameter_by_its_own_name():
+    """What was saved before the parameters were one vector loads, and the other way round."""
+    plain, flat = (
+        updater(policy, 32, net_arch=SMALL, layer_norm=True, n_critics=2, init_std=0.5)
+        for policy in (PlainSplitHeadPolicy, SplitHeadPolicy)
+    )
+    plain.train(3, 32)
+    assert set(plain.policy.state_dict()) == set(flat.policy.state_dict())
+    assert plain.policy.state_dict()["critic.qf1.state1.weight"].shape == (16, 29)
+    flat.policy.load_state_dict(plain.policy.state_dict())
+    for ours, theirs in ((flat.actor, plain.actor), (flat.critic, plain.critic)):
+        state = theirs.optimizer.state_dict()
+        ours.optimizer.load_state_dict(deepcopy(state))
+        back = ours.optimizer.state_dict()
+        th.testing.assert_close(back["state"], state["state"], rtol=0, atol=0)
+        theirs.optimizer.load_state_dict(deepcopy(back))
+    for model in (plain, flat):
+        model.set_random_seed(3)
+        model.train(3, 32)
+    th.testing.assert_close(flat.policy.state_dict(), plain.policy.state_dict(), rtol=0, atol=1e-5)
+
+
+def test_a_file_of_another_network_is_refused():
+    """By the names of what does not fit and of what is missing."""
+    model = make_model()
+    state = model.actor.state_dict()
+    state["mu.heads.bias"] = th.zeros(4)
+    del state["mu.hidden.0.weight"]
+    with pytest.raises(RuntimeError, match=r"mu.hidden.0.weight[^$]*mu.heads.bias: \(4,\)"):
+        model.actor.load_state_dict(state)
 
 
 @pytest.mark.parametrize("algorithm", [DDPG, TD3])

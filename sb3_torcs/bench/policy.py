@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3 import DDPG
+from stable_baselines3 import DDPG, TD3
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.td3.policies import Actor, TD3Policy
-from torch import nn
 
 from sb3_torcs.policies import fast_matmul
-from sb3_torcs.policies.networks import HEAD_GAINS
+from sb3_torcs.policies.networks import LateActionQ
 from sb3_torcs.policies.split_head import SplitHeadPolicy
 
 __all__ = ["PlainSplitHeadPolicy", "measure", "updater"]
@@ -31,81 +29,21 @@ TRANSITIONS = 2000
 """Random transitions to learn from."""
 
 
-class PlainHeads(nn.Module):
-    """
-    The actor's network, written plainly.
-
-    :param features_dim: size of the input
-    :param kwargs: as in :class:`~sb3_torcs.policies.networks.SplitHeads`, two hidden layers
-    """
-
-    gain: th.Tensor
-
-    def __init__(self, features_dim: int, **kwargs: Any) -> None:
-        super().__init__()
-        first, second = kwargs["net_arch"]
-        self.hidden = nn.Sequential(
-            nn.Linear(features_dim, first), nn.ReLU(), nn.Linear(first, second), nn.ReLU()
-        )
-        self.heads = nn.Linear(second, len(kwargs["heads"]))
-        nn.init.normal_(self.heads.weight, std=kwargs["init_std"])
-        with th.no_grad():
-            self.heads.bias.copy_(th.tensor(kwargs["head_bias"]))
-        self.register_buffer("gain", th.tensor([HEAD_GAINS[head] for head in kwargs["heads"]]))
-
-    def forward(self, features: th.Tensor) -> th.Tensor:
-        """
-        Compute actions.
-
-        :param features: (batch, features_dim)
-        :return: (batch, actuators) in [-1, 1]
-        """
-        return th.tanh(self.gain * self.heads(self.hidden(features)))
-
-
-class PlainQ(nn.Module):
-    """
-    A value function, written plainly.
-
-    :param features_dim: size of the state's features
-    :param action_dim: number of actuators
-    :param net_arch: units of the first, and of the second and third layer
-    """
-
-    def __init__(self, features_dim: int, action_dim: int, net_arch: Sequence[int]) -> None:
-        super().__init__()
-        first, second = net_arch
-        self.state = nn.Sequential(
-            nn.Linear(features_dim, first), nn.ReLU(), nn.Linear(first, second)
-        )
-        self.action = nn.Linear(action_dim, second)
-        self.joint = nn.Sequential(nn.Linear(second, second), nn.ReLU(), nn.Linear(second, 1))
-
-    def forward(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
-        """
-        Compute the values of actions.
-
-        :param features: (batch, features_dim)
-        :param actions: (batch, action_dim) in [-1, 1]
-        :return: (batch, 1)
-        """
-        value: th.Tensor = self.joint(self.state(features) + self.action(actions))
-        return value
-
-
 class PlainCritic(ContinuousCritic):
     """
-    SB3's critic with :class:`PlainQ` for its value functions, and its gradients as they are.
+    SB3's critic with plain value functions, and its gradients as they are.
 
     :param n_critics: number of value functions
+    :param layer_norm: normalise their hidden layers
     :param kwargs: what SB3's ``ContinuousCritic`` takes
     """
 
-    def __init__(self, *, n_critics: int, **kwargs: Any) -> None:
+    def __init__(self, *, n_critics: int, layer_norm: bool, **kwargs: Any) -> None:
         super().__init__(n_critics=0, **kwargs)
         sizes = kwargs["features_dim"], get_action_dim(self.action_space), kwargs["net_arch"]
-        self.q_networks = [PlainQ(*sizes) for _ in range(n_critics)]
-        for index, network in enumerate(self.q_networks):
+        for index in range(n_critics):
+            network = LateActionQ(*sizes, kwargs["activation_fn"], layer_norm)
+            self.q_networks.append(network)
             self.add_module(f"qf{index}", network)
 
     def forward(self, obs: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, ...]:
@@ -152,10 +90,8 @@ class PlainSplitHeadPolicy(SplitHeadPolicy):
         :param features_extractor: the one to share, or ``None`` for one of its own
         :return: the actor, on the policy's device
         """
-        kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)
-        actor = Actor(**{**kwargs, "net_arch": [1]})
-        own = {**self.own_kwargs, "net_arch": kwargs["net_arch"]}
-        actor.mu = PlainHeads(kwargs["features_dim"], **own)  # type: ignore[assignment]
+        actor = super().make_actor(features_extractor)
+        actor.mu = actor.mu.plain()  # type: ignore[operator]
         return actor.to(self.device)
 
     def make_critic(
@@ -168,7 +104,8 @@ class PlainSplitHeadPolicy(SplitHeadPolicy):
         :return: the critic, on the policy's device
         """
         kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
-        return PlainCritic(**kwargs).to(self.device)
+        layer_norm = self.own_kwargs["layer_norm"]
+        return PlainCritic(layer_norm=layer_norm, **kwargs).to(self.device)
 
     def set_training_mode(self, mode: bool) -> None:
         """
@@ -188,16 +125,19 @@ class _Spaces(gym.Env[np.ndarray, np.ndarray]):
     )
 
 
-def updater(policy: type[TD3Policy], batch_size: int, **policy_kwargs: Any) -> DDPG:
+def updater(
+    policy: type[TD3Policy], batch_size: int, algorithm: type[TD3] = DDPG, **policy_kwargs: Any
+) -> TD3:
     """
     Make a DDPG that is ready to update: random transitions in its replay buffer, no output.
 
     :param policy: class of the policy
     :param batch_size: transitions per update
+    :param algorithm: or TD3
     :param policy_kwargs: arguments of the policy
     :return: the model; the same twice for the same arguments
     """
-    model = DDPG(
+    model = algorithm(
         policy,
         _Spaces(),
         buffer_size=TRANSITIONS,
@@ -256,7 +196,7 @@ def _measure(batch_size: int, seconds: float) -> dict[str, float | None]:
     return rates
 
 
-def _turn(model: DDPG, fast: bool) -> float:
+def _turn(model: TD3, fast: bool) -> float:
     if fast:
         fast_matmul.enable(model.batch_size)
     begin = time.process_time()

@@ -8,7 +8,11 @@ from sb3_torcs.callbacks.exploration import (
     NoiseDecayCallback,
     StochasticBrakeCallback,
 )
-from sb3_torcs.callbacks.learning import GradientStepsCallback, MirrorCallback
+from sb3_torcs.callbacks.learning import (
+    GradientStepsCallback,
+    LeanUpdatesCallback,
+    MirrorCallback,
+)
 from sb3_torcs.callbacks.lines import LinePicturesCallback
 from sb3_torcs.callbacks.metrics import MONITOR_KWARGS, DrivingMetricsCallback
 from sb3_torcs.callbacks.progress import RacingProgressCallback
@@ -18,6 +22,7 @@ __all__ = [
     "MONITOR_KWARGS",
     "DrivingMetricsCallback",
     "GradientStepsCallback",
+    "LeanUpdatesCallback",
     "LinePicturesCallback",
     "MirrorCallback",
     "NoiseCallback",

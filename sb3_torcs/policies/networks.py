@@ -1,15 +1,14 @@
 """The networks of the original post, as parts of SB3's TD3 policy.
 
 An actor with one output function per actuator, and a critic that the action joins at the second
-hidden layer. One update of a small network spends as much time around the matrix products as in
-them, so the forward passes here call the functions of PyTorch directly, and in place where that
-changes no bit of the result.
+hidden layer. :class:`SplitHeads` and :class:`LateActionQ` say what is computed. Where the hidden
+units are ReLU on a processor, :mod:`sb3_torcs.policies.fused` computes it.
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, cast
 
 import torch as th
@@ -17,14 +16,18 @@ from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.preprocessing import get_action_dim, preprocess_obs
 from stable_baselines3.td3.policies import Actor
 from torch import nn
-from torch.nn.functional import layer_norm as normalise
-from torch.nn.functional import linear
+from torch.func import functional_call
+from torch.optim.swa_utils import AveragedModel
 
+from sb3_torcs.policies import fused
+from sb3_torcs.policies.flat import FlatParameters
 from sb3_torcs.policies.mirror import mirror_actions, mirror_observations
 
 __all__ = [
     "HEAD_GAINS",
+    "ActorAverage",
     "ExactDriver",
+    "FlatHeads",
     "LateActionCritic",
     "LateActionQ",
     "SplitHeadActor",
@@ -35,15 +38,9 @@ HEAD_GAINS = {"tanh": 1.0, "sigmoid": 0.5}
 """[-] SB3 wants actions in [-1, 1], where a sigmoid is 2 sigmoid(z) - 1 = tanh(z / 2), exactly."""
 
 
-def _activation(activation_fn: type[nn.Module]) -> Callable[[th.Tensor], th.Tensor]:
-    # A linear layer and a layer norm keep their input for the backward pass, never their output:
-    # ReLU may overwrite it.
-    return th.relu_ if activation_fn is nn.ReLU else activation_fn()
-
-
 class Layer(nn.Linear):
     """
-    A linear layer, normalised if asked for. The networks call its methods without hooks.
+    A linear layer, normalised if asked for.
 
     :param in_features: size of the input
     :param out_features: size of the output
@@ -61,24 +58,8 @@ class Layer(nn.Linear):
         :param x: (batch, in_features)
         :return: (batch, out_features)
         """
-        # ``self.weight`` is a slow look-up, which small layers feel.
-        own: dict[str, Any] = self._parameters
-        x = linear(x, own["weight"], own["bias"])
+        x = super().forward(x)
         return x if self.norm is None else self.norm(x)
-
-    def frozen(self, x: th.Tensor) -> th.Tensor:
-        """
-        Apply the layer with a gradient for its input, but none for its weights.
-
-        :param x: (batch, in_features)
-        :return: (batch, out_features), the same bits as ``forward``
-        """
-        own: dict[str, Any] = self._parameters
-        x = linear(x, own["weight"].detach(), own["bias"].detach())
-        if self.norm is None:
-            return x
-        weight, bias = self.norm.weight.detach(), self.norm.bias.detach()
-        return normalise(x, self.norm.normalized_shape, weight, bias, self.norm.eps)
 
 
 class SplitHeads(nn.Module):
@@ -112,12 +93,11 @@ class SplitHeads(nn.Module):
         self.hidden = nn.ModuleList(
             Layer(n_in, n_out, layer_norm) for n_in, n_out in zip(inputs, net_arch, strict=True)
         )
-        self.activation = _activation(activation_fn)
+        self.activation = activation_fn()
         self.heads = Layer(net_arch[-1], len(heads))
         nn.init.normal_(self.heads.weight, std=init_std)
         with th.no_grad():
             self.heads.bias.copy_(th.tensor(head_bias))
-        self.chain = (*self.hidden, self.heads)
         gain = th.tensor([HEAD_GAINS[head] for head in heads])
         self.register_buffer("gain", gain, persistent=False)
 
@@ -128,11 +108,53 @@ class SplitHeads(nn.Module):
         :param features: (batch, features_dim)
         :return: (batch, actuators) in [-1, 1]
         """
-        *hidden, heads = self.chain
         x = features
-        for layer in hidden:
-            x = self.activation(layer.forward(x))
-        return th.tanh(self.gain * heads.forward(x))
+        for layer in self.hidden:
+            x = self.activation(layer(x))
+        return th.tanh(self.gain * self.heads(x))
+
+
+class FlatHeads(FlatParameters):
+    """
+    :class:`SplitHeads` with their parameters in one vector.
+
+    :param plain: the heads; they are left alone
+    """
+
+    gain: th.Tensor
+
+    def __init__(self, plain: SplitHeads) -> None:
+        super().__init__()
+        self._plain = (plain,)  # in a tuple, of which PyTorch does not see the parameters
+        self.adopt(dict(plain.named_parameters()))
+        self.register_buffer("gain", plain.gain.clone(), persistent=False)
+        layers = [cast(Layer, layer) for layer in (*plain.hidden, plain.heads)]
+        sizes = (layers[0].in_features, *(layer.out_features for layer in layers))
+        norm = layers[0].norm is not None
+        self.fused = (
+            fused.FusedActor(sizes, norm, plain.gain.numpy())
+            if isinstance(plain.activation, nn.ReLU)
+            else None
+        )
+
+    def forward(self, features: th.Tensor) -> th.Tensor:
+        """
+        Decide.
+
+        :param features: (batch, features_dim)
+        :return: (batch, actuators) in [-1, 1]
+        """
+        if self.fused is not None and self.flat.is_cpu:
+            return self.fused(self.flat, features)
+        own = {**dict(self.views(self.flat)), "gain": self.gain}
+        actions: th.Tensor = functional_call(self._plain[0], own, features)
+        return actions
+
+    def plain(self) -> SplitHeads:
+        """Return the heads that do the same, each parameter for itself."""
+        heads = copy.deepcopy(self._plain[0])
+        heads.load_state_dict(self.state_dict())
+        return heads
 
 
 class SplitHeadActor(Actor):
@@ -164,12 +186,38 @@ class SplitHeadActor(Actor):
             "init_std": init_std,
             "layer_norm": layer_norm,
         }
-        self.mu = SplitHeads(  # type: ignore[assignment]  # the parent's is an nn.Sequential
+        plain = SplitHeads(
             self.features_dim, self.net_arch, activation_fn=self.activation_fn, **self.head_kwargs
         )
+        self.mu = FlatHeads(plain)  # type: ignore[assignment]  # the parent's is an nn.Sequential
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {**super()._get_constructor_parameters(), **self.head_kwargs}
+
+
+class ActorAverage(AveragedModel):
+    """
+    A running average of an actor's weights. It begins with those of the first update.
+
+    :param actor: to average
+    :param decay: what each update leaves of the average, a share
+    """
+
+    def __init__(self, actor: Actor, decay: float) -> None:
+        super().__init__(actor)
+        self.decay = decay
+
+    @th.no_grad()
+    def update_parameters(self, model: nn.Module) -> None:
+        """
+        Follow the actor.
+
+        :param model: the actor
+        """
+        share = 1.0 - self.decay if self.n_averaged > 0 else 1.0
+        for average, new in zip(self.module.parameters(), model.parameters(), strict=True):
+            average.lerp_(new, share)
+        self.n_averaged += 1
 
 
 class ExactDriver(nn.Module):
@@ -190,7 +238,8 @@ class ExactDriver(nn.Module):
         self.normalize_images = actor.normalize_images
         # Copies of the parts: the actor itself carries its optimizer and the hooks of a noise.
         self.features_extractor = copy.deepcopy(actor.features_extractor)
-        self.mu = copy.deepcopy(actor.mu).double()
+        heads = actor.mu.plain() if isinstance(actor.mu, FlatHeads) else copy.deepcopy(actor.mu)
+        self.mu = heads.double()
         self.symmetric = symmetric
 
     def forward(self, observation: th.Tensor) -> th.Tensor:
@@ -240,8 +289,7 @@ class LateActionQ(nn.Module):
         self.action2 = Layer(action_dim, second)
         self.joint3 = Layer(second, second, layer_norm)
         self.value = Layer(second, 1)
-        self.chain = (self.state1, self.state2, self.action2, self.joint3, self.value)
-        self.activation = _activation(activation_fn)
+        self.activation = activation_fn()
 
     def forward(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """
@@ -251,31 +299,15 @@ class LateActionQ(nn.Module):
         :param actions: (batch, action_dim) in [-1, 1]
         :return: (batch, 1)
         """
-        state1, state2, action2, joint3, value = self.chain
-        state = state2.forward(self.activation(state1.forward(features)))
-        joint = joint3.forward(state.add_(action2.forward(actions)))
-        return value.forward(self.activation(joint))
-
-    def for_actor(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
-        """
-        Value the actions with a gradient for them, but none for the weights.
-
-        Stock DDPG computes the weights' gradient of the actor's loss and then deletes it.
-
-        :param features: (batch, features_dim)
-        :param actions: (batch, action_dim) in [-1, 1]
-        :return: (batch, 1), the same bits as ``forward``
-        """
-        state1, state2, action2, joint3, value = self.chain
-        with th.no_grad():
-            state = state2.forward(self.activation(state1.forward(features)))
-        joint = joint3.frozen(state + action2.frozen(actions))
-        return value.frozen(self.activation(joint))
+        state = self.state2(self.activation(self.state1(features)))
+        joint = self.joint3(state + self.action2(actions))
+        value: th.Tensor = self.value(self.activation(joint))
+        return value
 
 
-class LateActionCritic(ContinuousCritic):
+class LateActionCritic(FlatParameters, ContinuousCritic):
     """
-    SB3's critic with :class:`LateActionQ` for its value functions.
+    SB3's critic with :class:`LateActionQ` for its value functions, all parameters in one vector.
 
     :param n_critics: number of value functions
     :param layer_norm: as in :class:`LateActionQ`
@@ -285,16 +317,22 @@ class LateActionCritic(ContinuousCritic):
     def __init__(self, *, n_critics: int, layer_norm: bool, **kwargs: Any) -> None:
         super().__init__(n_critics=0, **kwargs)
         self.n_critics = n_critics
-        for index in range(n_critics):
-            network = LateActionQ(
-                kwargs["features_dim"],
-                get_action_dim(self.action_space),
-                kwargs["net_arch"],
-                kwargs["activation_fn"],
-                layer_norm,
-            )
-            self.add_module(f"qf{index}", network)
-            self.q_networks.append(network)
+        first, second = kwargs["net_arch"]
+        features_dim, action_dim = kwargs["features_dim"], get_action_dim(self.action_space)
+        activation_fn = kwargs["activation_fn"]
+        plain = [
+            LateActionQ(features_dim, action_dim, (first, second), activation_fn, layer_norm)
+            for _ in range(n_critics)
+        ]
+        self._plain = tuple(plain)  # in a tuple, of which PyTorch does not see the parameters
+        self.adopt({
+            f"qf{number}.{name}": parameter
+            for number, network in enumerate(plain)
+            for name, parameter in network.named_parameters()
+        })  # fmt: skip
+        fuses = issubclass(activation_fn, nn.ReLU)
+        sizes = features_dim, action_dim, first, second
+        self.fused = fused.FusedValues(sizes, layer_norm) if fuses else None
 
     def forward(self, obs: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, ...]:
         """
@@ -307,11 +345,18 @@ class LateActionCritic(ContinuousCritic):
         # As in SB3: shared features learn from the actor's loss only.
         with th.set_grad_enabled(th.is_grad_enabled() and not self.share_features_extractor):
             features = self.extract_features(obs, self.features_extractor)
-        return tuple(network(features, actions) for network in self.q_networks)
+        if self.fused is not None and self.flat.is_cpu:
+            return self.fused(self.flat.view(self.n_critics, -1), features, actions)
+        return tuple(
+            functional_call(network, own, (features, actions))
+            for network, own in zip(self._plain, self._own(self.flat), strict=True)
+        )
 
     def q1_forward(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """
         Value the actions by the first value function, for the actor's loss.
+
+        Stock DDPG computes the weights' gradient of this loss, too, and then deletes it.
 
         :param obs: (batch, observation)
         :param actions: (batch, action_dim) in [-1, 1]
@@ -319,6 +364,25 @@ class LateActionCritic(ContinuousCritic):
         """
         with th.no_grad():
             features = self.extract_features(obs, self.features_extractor)
-        network = self.q_networks[0]
-        assert isinstance(network, LateActionQ)
-        return network.for_actor(features, actions)
+        if self.fused is not None and self.flat.is_cpu:
+            vectors = self.flat.detach().view(self.n_critics, -1)
+            return self.fused.first(vectors, features, actions)
+        value: th.Tensor = functional_call(
+            self._plain[0], self._own(self.flat.detach())[0], (features, actions)
+        )
+        return value
+
+    def plain(self) -> list[LateActionQ]:
+        """Return value functions that do the same, each parameter for itself."""
+        networks = copy.deepcopy(list(self._plain))
+        for network, own in zip(networks, self._own(self.flat.detach()), strict=True):
+            network.load_state_dict(own)
+        return networks
+
+    def _own(self, vector: th.Tensor) -> list[dict[str, th.Tensor]]:
+        """Find the parameters of each value function by their names in it."""
+        own: list[dict[str, th.Tensor]] = [{} for _ in self._plain]
+        for name, view in self.views(vector):
+            number, _, rest = name.removeprefix("qf").partition(".")
+            own[int(number)][rest] = view
+        return own

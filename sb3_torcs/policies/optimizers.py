@@ -1,18 +1,40 @@
-"""Optimizers for small networks, with less Python code per step."""
+"""Optimizers for networks whose parameters are one vector."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import torch as th
+
+from sb3_torcs.policies import kernels
 
 __all__ = ["LeanAdam", "with_lr_scale"]
 
 
-class LeanAdam(th.optim.Adam):
+class _LrScale:
+    """Mixin for an optimizer: each group's rate is multiplied by its ``lr_scale`` for a step."""
+
+    param_groups: list[dict[str, Any]]
+
+    def step(self, closure: Callable[[], float] | None = None) -> Any:
+        rates = [group["lr"] for group in self.param_groups]
+        try:
+            for group, rate in zip(self.param_groups, rates, strict=True):
+                group["lr"] = rate * group.get("lr_scale", 1.0)
+            return super().step(closure)  # type: ignore[misc]
+        finally:
+            # SB3 writes the schedule's rate into the groups and logs it: it must find its own.
+            for group, rate in zip(self.param_groups, rates, strict=True):
+                group["lr"] = rate
+
+
+class LeanAdam(_LrScale, th.optim.Adam):
     """
-    ``Adam(fused=True)``: the same kernel and the same bits, with less Python around it.
+    ``Adam(fused=True)`` with a kernel of its own on a processor, equal but for rounding.
+
+    A group of parameters may have an ``lr_scale``, by which its learning rate is multiplied.
 
     :param params: as in ``Adam``
     :param kwargs: as in ``Adam``
@@ -42,62 +64,47 @@ class LeanAdam(th.optim.Adam):
         :param closure: as in ``Adam``
         :return: as in ``Adam``
         """
-        if closure is not None or not all(map(self._is_lean, self.param_groups)):
+        if closure is not None or not self.is_usual():
             return super().step(closure)
         for group in self.param_groups:
-            self._step_group(group)
+            for param in group["params"]:
+                if param.grad is not None:
+                    self.step_of(param, param.grad.contiguous().view(-1).numpy())
         return None
 
-    def _is_lean(self, group: dict[str, Any]) -> bool:
-        # The first step, which makes the state, and whatever is unusual go the usual way.
-        unusual = group["amsgrad"] or group.get("decoupled_weight_decay")
-        return (
-            not unusual
-            and bool(group["fused"])
-            and isinstance(group["lr"], float)
-            and all(p in self.state for p in group["params"] if p.grad is not None)
-            and not hasattr(self, "grad_scale")
+    def is_usual(self) -> bool:
+        """Whether it is Adam without the options that the kernel does not know."""
+        unusual = ("amsgrad", "weight_decay", "maximize", "decoupled_weight_decay")
+        return all(
+            not any(map(group.get, unusual))
+            and all(param.is_cpu and param.is_contiguous() for param in group["params"])
+            for group in self.param_groups
         )
 
-    def _step_group(self, group: dict[str, Any]) -> None:
-        params = [param for param in group["params"] if param.grad is not None]
-        if not params:
-            return
-        states = [self.state[param] for param in params]
-        steps = [state["step"] for state in states]
-        th._foreach_add_(steps, 1)
-        th._fused_adam_(
-            params,
-            [param.grad for param in params],
-            [state["exp_avg"] for state in states],
-            [state["exp_avg_sq"] for state in states],
-            [],
-            steps,
-            lr=group["lr"],
-            beta1=group["betas"][0],
-            beta2=group["betas"][1],
-            weight_decay=group["weight_decay"],
-            eps=group["eps"],
-            amsgrad=False,
-            maximize=group["maximize"],
-        )
+    def step_of(self, param: th.Tensor, gradient: np.ndarray) -> None:
+        """
+        Make one update of one parameter.
 
+        :param param: contiguous, on the CPU
+        :param gradient: its gradient, flat
+        """
+        (group,) = (g for g in self.param_groups if any(param is own for own in g["params"]))
+        step, mean, square = self._state_arrays(param)
+        step += 1
+        count, (beta1, beta2), real = step.item(), group["betas"], gradient.dtype.type
+        rate = group["lr"] * group.get("lr_scale", 1.0)
+        kernels.adam(
+            param.detach().numpy().reshape(-1), gradient, mean, square, (real(beta1), real(beta2)),
+            real(rate / (1 - beta1**count)), real((1 - beta2**count) ** -0.5), real(group["eps"]),
+        )  # fmt: skip
 
-class _LrScale:
-    """Mixin for an optimizer: each group's rate is multiplied by its ``lr_scale`` for a step."""
-
-    param_groups: list[dict[str, Any]]
-
-    def step(self, closure: Callable[[], float] | None = None) -> Any:
-        rates = [group["lr"] for group in self.param_groups]
-        try:
-            for group, rate in zip(self.param_groups, rates, strict=True):
-                group["lr"] = rate * group["lr_scale"]
-            return super().step(closure)  # type: ignore[misc]
-        finally:
-            # SB3 writes the schedule's rate into the groups and logs it: it must find its own.
-            for group, rate in zip(self.param_groups, rates, strict=True):
-                group["lr"] = rate
+    def _state_arrays(self, param: th.Tensor) -> list[np.ndarray]:
+        """Look at the state of a parameter, which is that of PyTorch's Adam; begin it if needed."""
+        state = self.state[param]
+        if not state:
+            state["step"] = th.zeros((), dtype=th.float32)
+            state["exp_avg"], state["exp_avg_sq"] = th.zeros_like(param), th.zeros_like(param)
+        return [state[name].numpy().reshape(-1) for name in ("step", "exp_avg", "exp_avg_sq")]
 
 
 def with_lr_scale(optimizer_class: type[th.optim.Optimizer]) -> type[th.optim.Optimizer]:

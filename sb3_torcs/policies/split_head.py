@@ -20,13 +20,20 @@ from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.td3.policies import Actor, TD3Policy
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+from torch import nn
 
 from sb3_torcs.actions import layout_of_width
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.policies import fast_matmul as matmul
 from sb3_torcs.policies.export import export_actor
-from sb3_torcs.policies.networks import HEAD_GAINS, ExactDriver, LateActionCritic, SplitHeadActor
+from sb3_torcs.policies.flat import FlatParameters, keep_plain_state
+from sb3_torcs.policies.networks import (
+    HEAD_GAINS,
+    ActorAverage,
+    ExactDriver,
+    LateActionCritic,
+    SplitHeadActor,
+)
 from sb3_torcs.policies.optimizers import LeanAdam, with_lr_scale
 from sb3_torcs.sensors import OBSERVATION_SIZE
 
@@ -115,22 +122,36 @@ class SplitHeadPolicy(TD3Policy):
     def _build(self, lr_schedule: Schedule) -> None:
         self._exact: tuple[list[int], ExactDriver] | None = None
         super()._build(lr_schedule)
-        self.average = self._averaged()
         scale = self.own_kwargs["critic_lr_scale"]
-        if scale == 1.0:
-            return
-        self.critic.optimizer = with_lr_scale(self.optimizer_class)(
-            [{"params": list(self.critic.parameters()), "lr_scale": scale}],
-            lr=lr_schedule(1),  # type: ignore[call-arg]
-            **self.optimizer_kwargs,
-        )
+        self.actor.optimizer = self._optimizer(self.actor, 1.0, lr_schedule)
+        self.critic.optimizer = self._optimizer(self.critic, scale, lr_schedule)
+        self.average = self._averaged()
 
-    def _averaged(self) -> AveragedModel | None:
+    def _optimizer(
+        self, network: nn.Module, scale: float, lr_schedule: Schedule
+    ) -> th.optim.Optimizer:
+        """Make an optimizer, whose state is that of the plain network's."""
+        flat = [part for part in network.modules() if isinstance(part, FlatParameters)]
+        last = [part.flat for part in flat]
+        others = [param for param in network.parameters() if all(param is not p for p in last)]
+        group: dict[str, Any] = {"params": [*others, *last]}
+        optimizer_class = self.optimizer_class
+        if scale != 1.0:
+            group["lr_scale"] = scale
+            if not issubclass(optimizer_class, LeanAdam):
+                optimizer_class = with_lr_scale(optimizer_class)
+        rate = lr_schedule(1)
+        optimizer = optimizer_class([group], lr=rate, **self.optimizer_kwargs)  # type: ignore[call-arg]
+        for part in flat:
+            keep_plain_state(optimizer, part)
+        return optimizer
+
+    def _averaged(self) -> ActorAverage | None:
         """Begin the average of the actor's weights; its optimizer keeps it up to date."""
         decay = self.own_kwargs["ema_decay"]
         if decay is None:
             return None
-        average = AveragedModel(self.actor, multi_avg_fn=get_ema_multi_avg_fn(decay))
+        average = ActorAverage(self.actor, decay)
         average.requires_grad_(False)
         self.actor.optimizer.register_step_post_hook(
             lambda *_: average.update_parameters(self.actor)
@@ -141,6 +162,12 @@ class SplitHeadPolicy(TD3Policy):
     def driver(self) -> Actor:
         """The actor that drives when ``predict`` is deterministic."""
         return self.actor if self.average is None else cast(Actor, self.average.module)
+
+    @property
+    def fuses(self) -> bool:
+        """Whether the networks pass by hand, see :mod:`sb3_torcs.policies.fused`."""
+        critic = cast(LateActionCritic, self.critic)
+        return critic.fused is not None and critic.flat.is_cpu
 
     def exact_driver(self) -> ExactDriver:
         """Return a copy of the actor that drives when ``predict`` is deterministic."""
