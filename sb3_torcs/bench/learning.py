@@ -13,8 +13,11 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from sb3_torcs.bench.torcs import Figures
 
-__all__ = ["training_share"]
+__all__ = ["training_rate", "training_share"]
 
+
+AT_THE_BEGINNING = "sb3_torcs.callbacks.GradientStepsCallback"
+"""Makes more updates per timestep at the beginning of a training than later."""
 
 WARM_UP = 50  # training timesteps before the clock starts
 
@@ -45,7 +48,9 @@ class _TimedCallbacks(CallbackList):
         self._start = start
         self._spent = 0.0
         self._began = 0.0
-        self.share = 0.0
+        self._first = 0
+        self.share = 0.0  # of the environment and the callbacks
+        self.rate = 0.0  # [1/s] timesteps
 
     def on_step(self) -> bool:
         begin = time.process_time()
@@ -54,8 +59,10 @@ class _TimedCallbacks(CallbackList):
         self._spent += end - begin
         if self.num_timesteps <= self._start:  # the clock runs from the end of this call on
             self._began, self._spent, self._timed_env.spent = end, 0.0, 0.0
+            self._first = self.num_timesteps
         else:
             self.share = (self._spent + self._timed_env.spent) / (end - self._began)
+            self.rate = (self.num_timesteps - self._first) / (end - self._began)
         return go_on
 
 
@@ -63,25 +70,40 @@ def training_share(steps: int) -> Figures:
     """
     Measure what part of a DDPG training timestep the environment and the callbacks take.
 
-    The shipped hyperparameters are used, with a short warm-up and a small replay buffer;
-    evaluations are no training timesteps and are left out.
+    The shipped hyperparameters for ``TorcsLite-v0`` are used.
 
     :param steps: training timesteps to measure
     :return: ``training_env_share``, in [0, 1]
     """
+    return {"training_env_share": _learn("TorcsLite-v0", steps).share}
+
+
+def training_rate(steps: int) -> Figures:
+    """
+    Measure how fast the default DDPG entry learns ``Torcs-v0``, after its beginning.
+
+    :param steps: training timesteps to measure
+    :return: ``ddpg_timesteps_per_s``
+    """
+    return {"ddpg_timesteps_per_s": _learn("Torcs-v0", steps).rate}
+
+
+def _learn(env_id: str, steps: int) -> _TimedCallbacks:
+    """Learn with a short warm-up and a small replay buffer, on one thread."""
     import torch as th
 
     from sb3_torcs.training.manager import build
     from sb3_torcs.training.zoo import config_file, read_entry
 
-    entry = read_entry(config_file("ddpg"), "TorcsLite-v0")
+    entry = read_entry(config_file("ddpg"), env_id)
     start = int(entry["batch_size"]) + WARM_UP
     entry.update(learning_starts=int(entry["batch_size"]), buffer_size=start + steps)
     entry.update(n_timesteps=start + steps)
+    entry["callback"] = [own for own in entry["callback"] if AT_THE_BEGINNING not in own]
     threads = th.get_num_threads()
     th.set_num_threads(1)
     try:
-        model, chosen, _ = build("ddpg", "TorcsLite-v0", entry)
+        model, chosen, _ = build("ddpg", env_id, entry)
         env = _TimedVecEnv(model.env)
         model.env = env
         callbacks = _TimedCallbacks(chosen, env, start)
@@ -90,4 +112,4 @@ def training_share(steps: int) -> Figures:
         env.close()
     finally:
         th.set_num_threads(threads)
-    return {"training_env_share": callbacks.share}
+    return callbacks

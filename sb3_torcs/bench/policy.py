@@ -20,7 +20,7 @@ from sb3_torcs.policies import fast_matmul
 from sb3_torcs.policies.networks import LateActionQ
 from sb3_torcs.policies.split_head import SplitHeadPolicy
 
-__all__ = ["PlainSplitHeadPolicy", "measure", "updater"]
+__all__ = ["PlainSplitHeadPolicy", "SpacesOnly", "fill", "measure", "updater"]
 
 UPDATES_PER_TURN = 10
 """Updates between two readings of the clock; short, so that all variants meet the same machine."""
@@ -116,7 +116,7 @@ class PlainSplitHeadPolicy(SplitHeadPolicy):
         TD3Policy.set_training_mode(self, mode)
 
 
-class _Spaces(gym.Env[np.ndarray, np.ndarray]):
+class SpacesOnly(gym.Env[np.ndarray, np.ndarray]):
     """The spaces of a racing environment, and nothing behind them."""
 
     observation_space = spaces.Box(-1.0, 1.0, (29,), np.float32)
@@ -139,13 +139,23 @@ def updater(
     """
     model = algorithm(
         policy,
-        _Spaces(),
+        SpacesOnly(),
         buffer_size=TRANSITIONS,
         batch_size=batch_size,
         policy_kwargs=policy_kwargs,
         seed=0,
         device="cpu",
     )
+    fill(model)
+    return model
+
+
+def fill(model: TD3) -> None:
+    """
+    Let a model of one environment be ready to update: random transitions, and no output.
+
+    :param model: with an empty replay buffer
+    """
     model.set_logger(Logger(None, []))
     rng = np.random.default_rng(0)
     assert model.replay_buffer is not None
@@ -153,7 +163,6 @@ def updater(
         obs, next_obs = rng.uniform(-1, 1, (2, 1, 29))
         action, reward = rng.uniform(-1, 1, (1, 3)), rng.uniform(-1, 1, 1)
         model.replay_buffer.add(obs, next_obs, action, reward, np.zeros(1), [{}])
-    return model
 
 
 def measure(batch_size: int = 64, seconds: float = 10.0) -> dict[str, float | None]:

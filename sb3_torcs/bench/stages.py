@@ -6,9 +6,10 @@ from collections.abc import Callable
 
 from sb3_torcs.bench import scr, torcs
 from sb3_torcs.bench.environments import environments, resets
-from sb3_torcs.bench.learning import training_share
+from sb3_torcs.bench.learning import training_rate, training_share
 from sb3_torcs.bench.policy import measure
 from sb3_torcs.bench.torcs import Figures
+from sb3_torcs.bench.updates import default_updates
 from sb3_torcs.bench.vec_env import vec_env
 from sb3_torcs.errors import BackendUnavailable
 
@@ -34,6 +35,10 @@ KEYS = (
     "policy_updates_per_s",
     "policy_plain_updates_per_s",
     "policy_fast_updates_per_s",
+    "core_gflops",
+    "ddpg_updates_per_s",
+    "ddpg_update_gflop",
+    "ddpg_timesteps_per_s",
     "training_env_share",
 )
 """All figures, in the order they are shown; those of worlds that are not here stay empty."""
@@ -62,6 +67,8 @@ def stages(seconds: float) -> dict[str, Callable[[], Figures]]:
         "SCR resets": _where_it_is(scr.resets),
         "pictures": _where_it_is(scr.pictures),
         "policy": lambda: _policy(share),
+        "updates": lambda: default_updates(share),
+        "learning": _where_it_is(lambda: training_rate(max(int(400.0 * share), 100))),
         "training": lambda: training_share(max(int(40.0 * share), 100)),
     }
 

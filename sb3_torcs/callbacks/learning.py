@@ -115,7 +115,7 @@ class LeanUpdatesCallback(_WhileLearning):
 
     def _on_rollout_end(self) -> None:
         if self._updates is not None:
-            self._algorithm.train = self._train  # type: ignore[assignment,method-assign]
+            self._algorithm.train = self._train  # type: ignore[method-assign]
 
     def _train(self, gradient_steps: int, batch_size: int = 100) -> None:
         assert self._updates is not None

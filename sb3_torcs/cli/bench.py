@@ -29,6 +29,10 @@ scr_ticks_per_s           env.step with backend="scr", five ticks per timestep
 scr_reset_ms              resets with backend="scr"
 game_frames_per_s         render_mode="game" at 640x480
 policy_*                  updates of a DDPG with SplitHeadPolicy, batch size 64
+core_gflops               matrix products of 64 x 256 x 256, best turn
+ddpg_updates_per_s        updates of the default DDPG entry of Torcs-v0, best turn
+ddpg_update_gflop         arithmetic of such an update, its matrix products alone
+ddpg_timesteps_per_s      timesteps of a training with that entry, after its beginning
 training_env_share        share of a DDPG training (shipped hyperparameters) that the environment
                           and the callbacks take
 
