@@ -35,6 +35,8 @@ ALLOWED = (
     r"--film", r"grid_place", r"[\"'`(]frames\b", r"in frames,",
     # Python's, NumPy's, C++'s, the operating system's
     r"memoryview", r"MemoryError", r"shares_memory", r"<memory>", r"memory_order_\w+",
+    # SB3's
+    r"optimize_memory_usage",
     # RAM
     r"test_torcs_memory", r"\b(in|of|no|other|own|copy|has the|fills the|filling the) memory\b",
     r"_memory\b", r"\bmemory\(", r"\bmemory (of|in)\b",
