@@ -32,7 +32,8 @@ def test_the_strings_of_the_zoos_own_files_are_read_as_data(text, value):
 
 
 @pytest.mark.parametrize("text", [
-    "dict(activation_fn=nn.ReLU)", "__import__('os').mkdir('x')", "dict(**{})", "dict([])", "1 +",
+    "dict(activation_fn=nn.modules.ReLU)", "nn.ReLU()", "dict(a=nn.Module)",
+    "__import__('os').mkdir('x')", "dict(**{})", "dict([])", "1 +",
     "os.dict(a=1)", "[x for x in ()]", "(" * 10_000, "{**{}}", "'a' * 10**9",
 ])  # fmt: skip
 @pytest.mark.parametrize("key", zoo_data.EVALUATED)
@@ -41,8 +42,12 @@ def test_a_string_that_is_code_is_never_evaluated(tmp_path, text, key):
         study(tmp_path, **{key: text})
 
 
+def test_an_activation_may_be_named_as_in_the_zoos_own_files():
+    zoo_data.check_data({"policy_kwargs": "dict(activation_fn=nn.ReLU, net_arch=[4])"}, "here")
+
+
 def test_a_training_evaluates_strings_of_a_file_that_is_trusted(tmp_path, capsys):
-    entry = {**ENTRY, "policy_kwargs": "dict(activation_fn=nn.ELU, net_arch=[4])", "buffer_size": 9}
+    entry = {**ENTRY, "policy_kwargs": "dict(activation_fn=nn.modules.ELU)", "buffer_size": 9}
     file = tmp_path / "own.yml"
     file.write_text(yaml.safe_dump({"TorcsLite-v0": entry}))
     words = ["train", "--conf-file", str(file), "--folder", str(tmp_path / "logs"), "--no-progress"]

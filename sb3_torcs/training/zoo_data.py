@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import gymnasium as gym
+from torch.nn.modules import activation
 
 from sb3_torcs.errors import ZooConfigError
 
@@ -40,14 +41,19 @@ def as_data(entry: Mapping[str, Any]) -> dict[str, Any]:
 
 def check_data(entry: Mapping[str, Any], place: str) -> None:
     """
-    Make sure that the zoo evaluates no string of an entry.
+    Make sure that the zoo evaluates no string of an entry as code.
+
+    ``policy_kwargs`` may be a string of data and activations, as in the zoo's own files:
+    ``dict(net_arch=[64], activation_fn=nn.ReLU)``.
 
     :param entry: of :func:`as_data`
     :param place: where it stands, for the message
     :raises ZooConfigError: if a string is more than data
     """
     for key in EVALUATED:
-        if isinstance(entry.get(key), str):
+        if not isinstance(entry.get(key), str):
+            continue
+        if key != "policy_kwargs" or not _names_activations(entry[key]):
             raise ZooConfigError(
                 f"{place}: the zoo would evaluate {key}, {entry[key]!r:.80}, as Python; write a "
                 "mapping, as in the shipped files, or train from a file of your own with --trust"
@@ -94,6 +100,22 @@ def plain_python(text: str) -> Any:
         return _value(ast.parse(text.strip(), mode="eval").body)
     except TOO_MUCH as error:
         raise ValueError(f"{text!r:.80} is not plain data") from error
+
+
+def _names_activations(text: str) -> bool:
+    """Say whether an expression is plain data once ``nn.ReLU`` and its like are replaced."""
+
+    class Named(ast.NodeTransformer):
+        def visit_Attribute(self, node: ast.Attribute) -> ast.expr:
+            owner, _, name = ast.unparse(node).rpartition(".")
+            known = owner == "nn" and name in activation.__all__
+            return ast.Constant(name) if known else node
+
+    try:
+        _value(Named().visit(ast.parse(text.strip(), mode="eval")).body)
+    except (ValueError, *TOO_MUCH):
+        return False
+    return True
 
 
 def _value(node: ast.expr) -> Any:
