@@ -200,8 +200,6 @@ def test_a_damaged_checkpoint_is_told_once(begun, capsys):
     assert "1 of 2 agents trained and measured" in out
 
 
-# Where the algorithm cannot be built, the zoo drops the environments that it has made unclosed.
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize(
     ("change", "told"),
     [

@@ -65,8 +65,11 @@ def build(algo: str, env_id: str, entry: Mapping[str, Any], *, seed: int = 0) ->
             said, algo, env_id, scratch, eval_freq=-1, seed=seed, verbose=0, device="cpu",
             config=str(conf_file),
         )  # fmt: skip
-        with _command_as_text():
-            model, _ = manager.setup_experiment()
+        with contextlib.ExitStack() as unless_built:
+            unless_built.callback(manager.close_envs)
+            with _command_as_text():
+                model, _ = manager.setup_experiment()
+            unless_built.pop_all()
         folder = Path(manager.params_path)
         records = {name: (folder / name).read_bytes() for name in RECORDS}
     return Built(model, manager.callbacks, records)
@@ -126,6 +129,10 @@ class _Threaded(ExperimentManager):
 
     vec_env_class: type[VecEnv]
 
+    def __init__(self, *arguments: Any, **keywords: Any) -> None:
+        self._made: list[VecEnv] = []
+        super().__init__(*arguments, **keywords)
+
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
         """
         Make environments as the zoo does; where threads can drive them, in :class:`TorcsVecEnv`.
@@ -139,9 +146,15 @@ class _Threaded(ExperimentManager):
         if own is DummyVecEnv and n_envs > 1 and self._on_threads():
             self.vec_env_class = TorcsVecEnv
         try:
-            return super().create_envs(n_envs, eval_env, no_log)
+            self._made.append(super().create_envs(n_envs, eval_env, no_log))
+            return self._made[-1]
         finally:
             self.vec_env_class = own
+
+    def close_envs(self) -> None:
+        """Close all environments, which the zoo leaves open where it cannot build the algorithm."""
+        for env in self._made:
+            env.close()
 
     def _on_threads(self) -> bool:
         """Say whether the entry has nothing that would have to see each timestep of a race."""
