@@ -1,14 +1,14 @@
 // How a race looks at one moment: what the engine hands out and the game's window shows.
 //
-// The records travel between two programs of one machine that are built together, as they lie in
-// memory. They are the game's own, without addresses: those would mean nothing to the other side.
+// Two programs on one machine exchange the records as they lie in memory; they are built together.
+// The records are the game's own, without addresses, which would mean nothing to the other program.
 #pragma once
 
 #include "layout.h"
 
 namespace torcs {
 
-// First the scene, then as many cars, in the order of the race.
+// The scene comes first, then the cars it counts, in the order of the race.
 struct SceneAppearance {
     double time;  // [s] since the start
     std::int32_t cars_number;

@@ -29,7 +29,7 @@ std::size_t class_size(std::size_t size_class) {
 }
 
 // The collision library orders its objects by address: cars on the heap, walls among the module's
-// variables. In the game the heap lies below the libraries, so arenas are asked for down there.
+// variables. In the game the heap lies below the libraries, so arenas are reserved there, too.
 constexpr std::uintptr_t FIRST_ARENA = 0x200000000000;
 
 constexpr int MOST_ARENAS = 4096;
@@ -39,8 +39,8 @@ struct Range {
     const char* end;
 };
 
-// Only grows, so that it can be read without a lock, and is never destroyed: modules free memory
-// while the process ends.
+// It only grows, so that it can be read without a lock. It is never destroyed, because modules free
+// memory while the process ends.
 Range ranges[MOST_ARENAS];
 std::atomic<int> ranges_number{0};
 std::uintptr_t next_arena = FIRST_ARENA;
@@ -125,7 +125,8 @@ std::vector<char> Arena::save() const { return {base_, base_ + head().used}; }
 void Arena::restore(const std::vector<char>& saved) {
     const std::size_t used = head().used;
     std::memcpy(base_, saved.data(), saved.size());
-    // What was allocated since was zero then, and code that reads before it writes must find that.
+    // Memory that was allocated since the snapshot was zero then, and code that reads before it
+    // writes must find zeros again.
     if (used > saved.size()) std::memset(base_ + saved.size(), 0, used - saved.size());
 }
 

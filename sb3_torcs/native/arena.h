@@ -12,7 +12,7 @@ namespace torcs {
 
 class Arena {
 public:
-    // Memory is only reserved, and used page by page. To be made under the game's lock.
+    // Memory is only reserved, and used page by page. Construct it under the game's lock.
     explicit Arena(std::size_t reserve);
     Arena(const Arena&) = delete;
     Arena& operator=(const Arena&) = delete;
@@ -20,14 +20,15 @@ public:
     void* allocate(std::size_t size);
     void release(void* memory);
 
-    // The same with room before it, as much as in it, that is nobody else's.
+    // The same, with as much unused room before it as the block is large.
     void* allocate_roomy(std::size_t size);
     void release_roomy(void* memory);  // takes any block
 
     std::size_t size_of(const void* memory) const;
     bool owns(const void* memory) const { return memory >= base_ && memory < base_ + reserve_; }
 
-    // Forget everything and give the pages back; what comes next lies where it lay the first time.
+    // Free everything and give the pages back. Later allocations get the same addresses as the
+    // first.
     void clear();
 
     std::vector<char> save() const;
@@ -39,7 +40,7 @@ private:
         void* memory;
         void* block;  // with the room
     };
-    // In the arena itself, so that a snapshot has it.
+    // This lies in the arena itself, so that a snapshot holds it.
     struct Head {
         std::size_t used;
         void* free[64];  // lists of released blocks, by size class

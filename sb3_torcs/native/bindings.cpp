@@ -21,8 +21,8 @@ namespace torcs {
 
 namespace {
 
-// Lets other threads of Python run. A thread that comes back while the interpreter ends waits for
-// the end, since it could neither go on nor be unwound.
+// Lets other threads of Python run. A thread that returns while the interpreter ends waits until
+// the process ends, because it can neither continue nor be unwound.
 class WithoutPython {
 public:
     WithoutPython() : state_(PyEval_SaveThread()) {}
@@ -50,7 +50,7 @@ py::array_t<double> read_only(const std::array<double, n>& values) {
     return array;
 }
 
-// Makes the named tuple itself, which is a tuple with a class of its own.
+// Makes the named tuple directly: it is a tuple of another class.
 py::object as_state(const Reading& reading) {
     static PyTypeObject* type = reinterpret_cast<PyTypeObject*>(
         py::object(py::module_::import("sb3_torcs.car").attr("CarState")).release().ptr());
@@ -94,9 +94,8 @@ std::unique_ptr<Fleet> make_fleet(const std::vector<Engine*>& engines, int threa
     return std::make_unique<Fleet>(engines, threads);
 }
 
-// Reads orders from arrays with a row for each: controls are those of sb3_torcs.car.Controls, a
-// gear that is no number leaves it to the gearbox. Arrivals are written straight into the rows of
-// `cars`.
+// Reads orders from arrays with one row per order. Controls are those of sb3_torcs.car.Controls; a
+// gear of NaN leaves the choice to the gearbox. Arrivals are written into the rows of `cars`.
 std::vector<Fleet::Order> orders_of(const py::array_t<std::int64_t, py::array::c_style>& indices,
                                     const py::array_t<double, py::array::c_style>& controls,
                                     const py::array_t<std::int64_t, py::array::c_style>& ticks,
@@ -122,7 +121,7 @@ std::vector<Fleet::Order> orders_of(const py::array_t<std::int64_t, py::array::c
     return orders;
 }
 
-// The game's side of the SCR protocol, so that its client can be held to it.
+// The game's side of the SCR protocol, so that tests can compare the Python client with it.
 void bind_scr(py::module_& module) {
     module.def(
         "scr_format_state",
@@ -170,7 +169,7 @@ PYBIND11_MODULE(_engine, module) {
         } catch (const Error& error) {
             const py::object type =
                 py::module_::import("sb3_torcs.errors").attr(error.python_class);
-            // A path in it need not be a text.
+            // A path in the message may not be valid UTF-8.
             PyErr_SetObject(
                 type.ptr(),
                 py::reinterpret_steal<py::object>(PyUnicode_DecodeFSDefault(error.what())).ptr());

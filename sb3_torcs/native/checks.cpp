@@ -17,7 +17,7 @@ namespace {
 constexpr float PI = 3.14159265f;
 constexpr float HALF_CIRCLE = PI + 1e-3f;  // [rad] and what rounding adds
 
-// Reads memory that may not be mapped: writing it into a pipe fails politely then.
+// Reads memory that may not be mapped: if it is not, writing it into a pipe returns an error.
 class Probe {
 public:
     Probe() {
@@ -148,7 +148,7 @@ void check_track(const TrackData* track, const Params& file, const std::string& 
             throw Error("TrackFileError",
                         path + " has a segment that is " + std::to_string(next.length) + " m long");
         check_strips(probe, next, path);
-        // Range finders would look past its other end.
+        // Range finders would see past its other end.
         if (next.type != STRAIGHT && !(next.arc <= HALF_CIRCLE))
             throw Error("TrackFileError", path + " has a segment that turns by " +
                                               std::to_string(std::lround(next.arc * 180.0f / PI)) +

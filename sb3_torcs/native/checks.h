@@ -1,4 +1,4 @@
-// Whether the installed game lays things out as layout.h says; reads nothing that is not there.
+// Whether the structures of the installed game are those of layout.h. Reads only mapped memory.
 #pragma once
 
 #include <string>
@@ -8,10 +8,10 @@
 
 namespace torcs {
 
-// Throws LayoutMismatch, or TrackFileError if the file is what is wrong.
+// Throws LayoutMismatch, or TrackFileError if the track's file is the cause.
 void check_track(const TrackData* track, const Params& file, const std::string& path);
 
-// After the cars have stood for a while: the simulation's own records agree with the shared ones.
+// After the cars have stood for a while: the simulation's own records equal the shared ones.
 void check_simulation(const SimulatedCar* simulated, const CarElement* cars, int number);
 
 }  // namespace torcs

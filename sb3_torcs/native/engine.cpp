@@ -30,7 +30,7 @@ void append(std::string& to, const Record& record) {
 
 CarAppearance appearance_of(const CarElement& car) {
     CarAppearance looks;
-    std::memset(&looks, 0, sizeof looks);  // also what lies between the members
+    std::memset(&looks, 0, sizeof looks);  // also the padding between the members
     looks.index = car.index;
     looks.segment = car.pub.track.segment->id;
     looks.pub = car.pub;
@@ -61,7 +61,7 @@ Engine::Engine(Game& game, RaceOptions options, std::array<double, RANGE_FINDERS
 }
 
 Engine::~Engine() {
-    // In a child process the locks may be held by threads that stayed in the parent.
+    // In a child process, threads that exist only in the parent may hold the locks for ever.
     if (forks_ != forks) (void)race_.release();
 }
 

@@ -1,4 +1,4 @@
-// A race as Python holds it: guarded against what a language with threads and forks can do.
+// A race as Python holds it, guarded against use by two threads at once and after a fork.
 #pragma once
 
 #include <array>
@@ -33,8 +33,8 @@ struct Moment {
     std::optional<Generator> noise;
 };
 
-// Libraries of the process may have set how numbers are rounded, or that tiny ones become zero: a
-// race is computed as in a process of its own.
+// Other libraries of the process may have changed the rounding mode, or made tiny numbers zero.
+// This sets the defaults while a race is computed.
 class PlainRounding {
 public:
     PlainRounding() {
@@ -71,11 +71,11 @@ public:
     std::string appearance();
     void close();
 
-    // Drives what a list of controls says, one tick each, with or without sensors; for measuring.
+    // Drives a list of controls, one tick each, with or without sensors; for benchmarks.
     void replay(const std::vector<Controls>& controls, bool sensors);
     void update_physics(int steps);
 
-    // Checks, and then gives access for as long as it lives.
+    // Checks that the engine may be used, and gives access to it for as long as this object lives.
     class Access {
     public:
         explicit Access(Engine& engine);

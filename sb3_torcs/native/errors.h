@@ -5,14 +5,14 @@
 
 namespace torcs {
 
-// Becomes the exception of that name in sb3_torcs.errors.
+// This becomes the exception of that name in sb3_torcs.errors.
 struct Error : std::runtime_error {
     Error(const char* python_class, const std::string& message)
         : std::runtime_error(message), python_class(python_class) {}
     const char* python_class;
 };
 
-// What to do about EMFILE.
+// The remedy for EMFILE.
 constexpr const char* MORE_FILES =
     "; each module of a race keeps a file open: raise the limit with ulimit -n";
 

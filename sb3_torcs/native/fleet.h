@@ -1,4 +1,4 @@
-// Several engines that are driven at once, each by one of a few threads.
+// Several engines that a few threads drive at once.
 #pragma once
 
 #include <cstddef>
@@ -12,26 +12,25 @@ namespace torcs {
 
 class Fleet {
 public:
-    // The engines have to outlive this object; each is named once.
+    // The engines have to outlive this object; none may be in the list twice.
     Fleet(const std::vector<Engine*>& engines, int threads);
 
-    // Begin to drive one of them, and return at once. It must be waited for before anything else
-    // is done with it.
+    // Begin to drive one engine, and return at once. Call `wait` for it before any other use of it.
     void begin(std::size_t index, const Controls& controls, int ticks);
-    // Drive until one of them has arrived; throws what stopped it.
+    // Drive until this engine has arrived. Throws the error that stopped it.
     const Reading& wait(std::size_t index);
     // Drive until all have arrived.
     void finish() { pool_.finish(); }
 
-    // What one of several engines shall do, and where the car that has arrived is written down.
+    // What one engine drives, and where its car is written when it has arrived.
     struct Order {
         std::size_t index;
         Controls controls;
         int ticks;
         Reading* arrival;
     };
-    // Drive several until all have arrived. Returns which of the orders have failed, and have no
-    // arrival: `wait` throws what stopped them.
+    // Drive several engines until all have arrived. Returns the indices of the orders that failed;
+    // their arrivals are not written, and `wait` throws their errors.
     std::vector<std::size_t> step(const std::vector<Order>& orders);
 
 private:
@@ -40,7 +39,7 @@ private:
         Controls controls;
         int ticks;
         Reading* arrival;
-        Reading reading;  // of those who give no other place for it
+        Reading reading;  // where an order names no other record
         std::exception_ptr failure;
     };
 

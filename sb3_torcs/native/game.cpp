@@ -25,7 +25,7 @@ std::string with_slash(std::string folder) {
 }
 
 void preload(const std::string& path) {
-    // What later libraries need by this name is then found.
+    // The loader then finds this library when later ones need it by name.
     if (!dlopen(path.c_str(), RTLD_NOW | RTLD_LOCAL))
         throw Error("BackendUnavailable", path + " will not load: " + dlerror());
 }
@@ -33,7 +33,8 @@ void preload(const std::string& path) {
 }  // namespace
 
 void Game::watch_forks() {
-    // Otherwise a child could inherit a lock that a thread of its parent will never give back.
+    // Otherwise a child could inherit a lock that a thread of its parent holds, and nobody would
+    // release it.
     static const auto lock = [] {
         opening.lock();
         if (*opened) (*opened)->mutex.lock();
@@ -62,7 +63,7 @@ Game::Game(const std::string& data, const std::string& libraries, const std::str
         preload(with_slash(plib) + "libplibul.so.1");
         preload(with_slash(plib) + "libplibsg.so.1");
     }
-    // The order matters: none of them names what it needs.
+    // The order matters: none of these libraries names those that it needs.
     Library::shared(libraries + "lib/libtxml.so", false);
     Library& params = Library::shared(libraries + "lib/libtgf.so", false);
     Library& tools = Library::shared(libraries + "lib/librobottools.so", false);
@@ -88,7 +89,7 @@ Game::Game(const std::string& data, const std::string& libraries, const std::str
     params.require<SetFolder>("_Z10SetDataDirPc")(folder.data());
     folder = this->libraries;
     params.require<SetFolder>("_Z9SetLibDirPc")(folder.data());
-    // Nothing of the user's is read, and nothing is ever written: no such folder.
+    // The folder does not exist: no file of the user is read, and none is written.
     folder = "/nonexistent/";
     params.require<SetFolder>("_Z11SetLocalDirPc")(folder.data());
 }

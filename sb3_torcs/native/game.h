@@ -14,16 +14,16 @@ class Params;
 
 class Game {
 public:
-    // `libraries` holds lib/, modules/ and drivers/; `plib` is where its PLIB lies if the system's
-    // loader does not find it, else empty. One game per process.
+    // `libraries` holds lib/, modules/ and drivers/; `plib` is the folder of its PLIB library if
+    // the system's loader does not find that, else empty. One game per process.
     static Game& open(const std::string& data, const std::string& libraries,
                       const std::string& plib);
 
     const std::string data;  // each ends in a slash
     const std::string libraries;
 
-    // Held while races are loaded and closed: parameter files are one list for all of them, and so
-    // are spare libraries and arenas. A fork waits for it.
+    // This lock is held while races are loaded and closed: all races share one list of parameter
+    // files, one of spare libraries and one of arenas. A fork waits for the lock.
     std::mutex mutex;
     static void watch_forks();  // once, before any race
 
@@ -56,9 +56,9 @@ private:
 class Params {
 public:
     static Params read(Game& game, const std::string& path);  // empty if it cannot be read
-    // A handle that belongs to somebody else.
+    // Borrows a handle; the caller releases it.
     static Params view(Game& game, void* handle) { return {game, handle, false}; }
-    // Takes the handle over.
+    // Owns the handle, and releases it.
     Params(Game& game, void* handle) : Params(game, handle, true) {}
     Params(Params&& other) noexcept
         : game_(other.game_), handle_(other.handle_), owned_(other.owned_) {
@@ -69,14 +69,14 @@ public:
 
     explicit operator bool() const { return handle_ != nullptr; }
     void* handle() const { return handle_; }
-    void* release();  // whoever calls it owns the handle
+    void* release();  // the caller owns the handle
 
     std::string text(const char* section, const char* name, const char* fallback = "") const;
     float number(const char* section, const char* name, float fallback) const;
     int elements(const char* section) const;     // number of its subsections
     int misfits(const Params& reference) const;  // values outside the reference's limits
 
-    // Both are consumed; `own` changes what `reference` has and adds to it.
+    // Releases both. Values of `own` replace those of `reference`, or are added.
     static Params merge(Params reference, Params own);
 
 private:

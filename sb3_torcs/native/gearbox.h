@@ -9,9 +9,9 @@ constexpr float SHIFT_UP = 8500.0f / LIMITER;
 // Below which the lower gear would turn the motor.
 constexpr float SHIFT_DOWN = 7500.0f / LIMITER;
 
-// Of a standing car. The game's clutch passes all torque up to two thirds, and less from there on.
+// Of a standing car. Up to two thirds the game's clutch passes all torque, beyond that less.
 constexpr float LAUNCH_CLUTCH = 0.8f;
-// So that a client who reads the speed in six digits presses the very same.
+// The value is rounded, so that a client that reads the speed in six digits gets the same.
 constexpr float CLUTCH_STEPS = 128.0f;
 
 }  // namespace torcs

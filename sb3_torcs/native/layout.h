@@ -1,8 +1,8 @@
-// What the game's modules exchange, as TORCS 1.3.7 lays it out on 64-bit Linux.
+// The structures that the game's modules exchange, in the layout of TORCS 1.3.7 on 64-bit Linux.
 //
 // Only the members used here have names, in this project's own words; what lies between is
-// `Unused`. The offsets are asserted below, and `check_layout` in game.cpp holds them to the
-// installed libraries before anything is driven.
+// `Unused`. The offsets are asserted below, and `check_layout` compares them with the installed
+// libraries before the first race.
 #pragma once
 
 #include <cstddef>

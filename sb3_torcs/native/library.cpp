@@ -48,10 +48,10 @@ void release(void* memory) {
         free(memory);
 }
 
-// The plans of some robots (inferno, lliaw, tita) are rings of 25 kB, whose index gets below zero
-// when the car is pushed back over the ring's beginning: the remainder of a negative number. In the
-// game they then use what lies before, and crash it sooner or later. With room there the ring is
-// whole.
+// Some robots (inferno, lliaw, tita) plan in ring buffers of 25 kB. When the car is pushed back
+// over the ring's beginning, the index is the remainder of a negative number, and so negative. In
+// the game the robot then overwrites the memory before the buffer, which crashes the game sooner or
+// later. Here that memory is unused room.
 constexpr std::size_t SMALLEST_RING = 4 << 10, LARGEST_RING = 64 << 10;
 
 void* allocate_array(std::size_t size) {
@@ -98,17 +98,19 @@ void seed_random(unsigned seed) {
     if (current) srandom_r(seed, &current->random->state);
 }
 
-// One robot ends its planning by the clock; without one it plans to the end on every machine.
+// One robot stops planning after a time by the clock. With a clock that stands still, it plans to
+// the end on every machine.
 long no_time_passes() { return 0; }
 
-// Robots' names for files are relative to the game's data; what they learn is not kept, since a
-// second run would then not equal the first.
+// Robots name files relative to the game's data. What they learn is not kept: with it, a second run
+// would differ from the first.
 FILE* open_file(const char* path, const char* mode) {
     if (std::strpbrk(mode, "wa+")) return fopen("/dev/null", mode);
     if (!current) return fopen(path, mode);
     if (path[0] != '/') return fopen((current->data + path).c_str(), mode);
     FILE* file = fopen(path, mode);
-    // A track names what all tracks share relative to itself; it may lie outside of the game.
+    // A track names the files that all tracks share relative to itself, and it may lie outside of
+    // the game's folder.
     const char* common = file ? nullptr : std::strstr(path, "/data/tracks/");
     return common ? fopen((current->data + (common + 1)).c_str(), mode) : file;
 }
@@ -234,7 +236,7 @@ std::string loader_message() {
     return text ? text : "unknown reason";
 }
 
-// The loader trusts its headers: a file that ends before them would end the process.
+// The loader trusts the headers of a file: one that ends too early would kill the process.
 void check_whole(const std::vector<char>& bytes, const std::string& path, const char* error) {
     const auto* header = reinterpret_cast<const ElfW(Ehdr)*>(bytes.data());
     bool whole = bytes.size() >= sizeof(ElfW(Ehdr)) &&
@@ -257,7 +259,8 @@ std::vector<char> read_library(const std::string& path, const char* error) {
 }
 
 // A module may need one of the game's own libraries, by a name that only the game's wrapper script
-// lets the loader find. Those are loaded with global symbols already; the copy forgets the need.
+// lets the loader find. Those are already loaded with global symbols, so the need is removed from
+// the copy.
 void forget_needs(std::vector<char>& bytes, const std::string& folder) {
     const auto at = [&bytes](std::size_t offset, std::size_t size) -> char* {
         return offset + size <= bytes.size() ? bytes.data() + offset : nullptr;
@@ -286,7 +289,7 @@ void forget_needs(std::vector<char>& bytes, const std::string& folder) {
         for (std::size_t j = 0; j < number && first[j].d_tag != DT_NULL; j++) {
             const char* name = at(begin + first[j].d_un.d_val, 1);
             if (first[j].d_tag == DT_NEEDED && name && access((folder + name).c_str(), F_OK) == 0)
-                first[j].d_tag = DT_DEBUG;  // says nothing in a library
+                first[j].d_tag = DT_DEBUG;  // has no meaning in a library
         }
     }
 }
@@ -317,8 +320,8 @@ void* open_copy(const std::string& path, const std::string& folder, const char* 
         }
         done += static_cast<std::size_t>(written);
     }
-    // The descriptor stays open: the loader knows libraries by their names, and a number that was
-    // given out again would name two.
+    // The descriptor stays open. The loader knows libraries by their names, and a number that is
+    // used again would name two libraries.
     const std::string name = "/proc/self/fd/" + std::to_string(copy);
     void* handle = dlopen(name.c_str(), RTLD_NOW | RTLD_LOCAL);
     if (!handle) {
@@ -329,7 +332,7 @@ void* open_copy(const std::string& path, const std::string& folder, const char* 
     return handle;
 }
 
-// Both are under the game's lock.
+// Both are guarded by the game's lock.
 std::map<std::string, std::vector<std::unique_ptr<Library>>>& pool() {
     static auto* libraries = new std::map<std::string, std::vector<std::unique_ptr<Library>>>;
     return *libraries;
@@ -347,8 +350,8 @@ bool defines(void* handle, void* symbol) {
            reinterpret_cast<ElfW(Addr)>(info.dli_fbase) == map->l_addr;
 }
 
-// What all races share - parameter files and their parser - outlives each of them, so it keeps the
-// process's own memory.
+// All races share the parameter files and their parser. These outlive each race, so they use the
+// process's own heap.
 bool is_memory(const std::string& import) {
     return import == "malloc" || import == "calloc" || import == "realloc" || import == "free" ||
            import == "strdup" || import.compare(0, 4, "_Zna") == 0 ||
@@ -407,7 +410,7 @@ Library::Library(std::string path, void* handle, bool race_memory)
         [](dl_phdr_info* info, std::size_t, void* data) {
             auto* search = static_cast<Search*>(data);
             if (info->dlpi_addr != search->base) return 0;
-            // Relocated data are read-only once loaded; what is behind them can change.
+            // Relocated data are read-only after loading; only what follows them can change.
             ElfW(Addr) sealed_end = 0;
             for (int i = 0; i < info->dlpi_phnum; i++) {
                 const auto& part = info->dlpi_phdr[i];
@@ -466,8 +469,8 @@ void Library::redirect_imports(bool race_memory) const {
         const auto ours = replacements().find(import);
         if (ours != replacements().end())
             return is_memory(import) && !race_memory ? nullptr : ours->second;
-        // The game's own libraries come before others of the process with the same symbols: an
-        // XML parser, for one, is in many a Python.
+        // The game's own libraries come before others of the process with the same symbols; many
+        // Pythons, for example, contain the same XML parser.
         for (const auto& [path, library] : shared_libraries()) {
             void* found = library ? library->find(import.c_str()) : nullptr;
             if (found && defines(library->handle_, found)) return found;
@@ -483,7 +486,8 @@ void Library::redirect_imports(bool race_memory) const {
             void* target = replacement(names + symbol.st_name);
             if (!target) continue;
             const auto slot = static_cast<std::uintptr_t>(map->l_addr + relocation.r_offset);
-            // The loader has sealed these pages; the copy is ours, so they stay open.
+            // The loader has made these pages read-only. The copy is ours, so they become writable
+            // again.
             mprotect(reinterpret_cast<void*>(slot - slot % page), page, PROT_READ | PROT_WRITE);
             std::memcpy(reinterpret_cast<void*>(slot), &target, sizeof target);
         }

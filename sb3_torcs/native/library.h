@@ -16,10 +16,10 @@ namespace torcs {
 
 using Variables = std::vector<std::vector<char>>;
 
-// Libraries are taken and given back under the game's lock.
+// Hold the game's lock when a library is taken or given back.
 class Library {
 public:
-    // A copy of the module; one that an earlier race gave back is taken first, since libraries
+    // A copy of the module. A copy that an earlier race gave back is used first, because libraries
     // with C++ templates can never be unloaded. `folder` holds the libraries that all share;
     // `error` is the exception if it does not load.
     static std::unique_ptr<Library> take(const std::string& path, const std::string& folder,
@@ -55,7 +55,7 @@ private:
     Variables pristine_;
 };
 
-// What a redirected import does depends on whose race is being driven on this thread.
+// A redirected import acts on the race that this thread drives.
 class Arena;
 struct Random;
 
@@ -79,7 +79,7 @@ private:
 
 Random* new_random(Arena& arena);  // in the state in which a process begins
 
-// What modules would have printed on this thread since `forget_printed`: the game explains its
+// What modules would have printed on this thread since `forget_printed`; the game explains its
 // failures there.
 std::string printed();
 void forget_printed();

@@ -12,8 +12,8 @@
 
 namespace torcs {
 
-// Ends the game when its owner is gone, and removes its private folder: nobody else would.
-// A game that a user started has no owner, and is left alone.
+// Ends the game when its owner is gone, and removes its private folder, which nobody else would do.
+// A game that a user started has no owner, and goes on.
 class Owner {
 public:
     Owner() {
@@ -23,7 +23,7 @@ public:
 
     bool gone() const { return owner_ > 0 && getppid() != owner_; }
 
-    // To be called often: it looks only now and then.
+    // Call it often; it checks only now and then.
     void check() {
         const auto now = std::chrono::steady_clock::now();
         if (now - checked_ < std::chrono::milliseconds(500)) return;
@@ -31,8 +31,8 @@ public:
         if (gone()) end();
     }
 
-    // To be called when something is lost that goes with the owner, like the display of a session
-    // that ends: the owner may be gone a little later.
+    // Call it when something is lost that is often lost together with the owner, such as the
+    // display of a session that ends. The owner may end a little later.
     void await_end(std::chrono::milliseconds patience) {
         constexpr auto pause = std::chrono::milliseconds(10);
         for (; patience.count() > 0 && owner_ > 0 && !gone(); patience -= pause)
@@ -40,8 +40,8 @@ public:
         if (gone()) end();
     }
 
-    // The other end of a pipe or socket was closed. Of a process that is killed these go first,
-    // its children notice a little later.
+    // The other end of a pipe or socket was closed. When a process is killed, these close first,
+    // and its children notice its end a little later.
     [[noreturn]] void lost_contact() {
         await_end(std::chrono::seconds(2));
         _exit(1);

@@ -32,7 +32,7 @@ int gear_for(const Field& field, const CarElement& car, double speed) {
 }  // namespace
 
 bool is_valid(const Start& start, double track_length) {
-    // A car may stand a little beyond the last centimetre: lengths are added up in other ways.
+    // A car may stand a little beyond the end, because the game adds lengths up in several ways.
     return start.distance >= 0.0 && start.distance <= track_length + 1.0 &&
            std::fabs(start.track_position) <= 5.0 && std::fabs(start.heading_error) <= 2.0 * PI &&
            start.speed >= 0.0 && start.speed <= 200.0;
@@ -104,7 +104,7 @@ void come_to_rest(const Field& field, Situation& situation) {
     settle(field, situation, SETTLING_STEPS, true);
 }
 
-// The collision library finds no way out of what was never apart: not a number comes of it.
+// The collision library cannot separate objects that were never apart: it returns NaN.
 const CarElement* stuck_car(const Field& field) {
     for (int i = 0; i < field.number; i++) {
         const CarElement& car = field.cars[i];

@@ -40,8 +40,8 @@ float height_over_road(const Field& field, const CarElement& car);  // [m] of th
 void settle(const Field& field, Situation& situation, int steps, bool in_gear);
 
 // Puts down cars that are on the grid, each at the height at which it stands, in the gear for the
-// speed. Returns where each is on the road [m], without rounds taken off: it can be before the
-// start line, or a lap further. Drivers are to be told of the race then, and not before.
+// speed. Returns where each is along the road [m], not wrapped: it can be before the start line, or
+// a lap further. Tell drivers of the race after this, not before.
 std::vector<double> put_down(const Field& field, const Start& start,
                              const std::vector<float>& rest_heights);
 

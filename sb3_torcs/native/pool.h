@@ -40,14 +40,14 @@ public:
     }
     ~Pool() {
         if (forked())
-            (void)shared_.release();  // its threads stayed in the parent, perhaps with the lock
+            (void)shared_.release();  // its threads exist only in the parent, perhaps locking
         else
             shared_->stop();
     }
     Pool(const Pool&) = delete;
     Pool& operator=(const Pool&) = delete;
 
-    // Queue a job. It has to be waited for before it is begun again.
+    // Queue a job. Wait for it before you begin it again.
     void begin(std::size_t job) {
         check();
         {
@@ -58,7 +58,7 @@ public:
         shared_->added.notify_one();
     }
 
-    // Work until a job is done, by whomever.
+    // Work until a job is done, on whichever thread.
     void wait(std::size_t job) {
         check();
         std::unique_lock<std::mutex> lock(shared_->mutex);
@@ -72,8 +72,7 @@ public:
     }
 
 private:
-    // Looks at a job before sleeping: it is done within about the time that falling asleep and
-    // being woken take.
+    // Poll a job before sleeping: most jobs end within the time that sleeping and waking take.
     static constexpr int PATIENCE = 200;
 
     struct Shared {

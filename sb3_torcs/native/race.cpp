@@ -46,7 +46,7 @@ void copy_name(char (&to)[NAME_LENGTH], const std::string& from) {
     std::strncpy(to, from.c_str(), NAME_LENGTH - 1);
 }
 
-// The function that a module exports under its own name fills this table.
+// A module exports a function under its own name, which fills this table.
 ModuleInfo module_info(const Library& library, const std::string& name, int index) {
     ModuleInfo modules[MODULE_INTERFACES] = {};
     library.require<int (*)(ModuleInfo*)>(name.c_str())(modules);
@@ -116,7 +116,7 @@ void Race::close() {
             try {
                 if (i < set_up_ && car.robot->shutdown) car.robot->shutdown(car.robot->index);
             } catch (const Error&) {  // NOLINT(bugprone-empty-catch)
-                // Its memory goes with the race all the same.
+                // Its memory is freed with the race in any case.
             }
             const Params car_params(game_, car.priv.car_params);  // releases it
             const Params driver_params(game_, car.priv.driver_params);
@@ -142,7 +142,7 @@ void Race::load_track() {
     const Params file = Params::read(game_, options_.track);
     if (!file) refuse_file("TrackFileError", options_.track);
     std::string path = options_.track;
-    // The game's loader lays pits until the end of the lane, however short they are.
+    // The game's loader fills the pit lane with pits, however short they are.
     if (!(file.number("Main Track", "pit length", PIT_LENGTH) >= SHORTEST_PIT &&
           file.number("Main Track/Pits", "length", PIT_LENGTH) >= SHORTEST_PIT))
         throw Error("TrackFileError", path + " has pits of no length; 15 m are usual");
@@ -172,7 +172,7 @@ Params Race::load_car(const std::string& name) {
         throw Error("CarFileError", game_.data + path + " does not fit its category " + category +
                                         ": " + printed());
     Params whole = Params::merge(std::move(limits), std::move(car));
-    // Without these the simulation reads what is not there, or divides by nothing.
+    // Without these the simulation reads memory that is not there, or divides by zero.
     const auto require = [&](bool has, const char* what) {
         if (!has) throw Error("CarFileError", game_.data + path + " has no " + what);
     };
@@ -311,7 +311,7 @@ void Race::set_rules() {
 
 // ---- The grid -----------------------------------------------------------------------------------
 
-// A track's own settings come before the session's.
+// A track's own settings override the session's.
 float Race::grid_number(const char* name, float fallback) const {
     const std::string section = race_name_ + "/Starting Grid";
     return Params::view(game_, track_->params)
@@ -397,8 +397,8 @@ void Race::assign_pits() {
 
 // ---- The start ----------------------------------------------------------------------------------
 
-// Robots look here where on the road they are, and later only around where they have been: the cars
-// must stand where the race begins, and a robot that was told of one race bears no second one.
+// Robots find their place on the road here, and later search only around their last place. So the
+// cars must stand where the race begins, and a robot can be told of one race only.
 void Race::announce() {
     for (int i = 0; i < cars_number(); i++) {
         CarElement& car = world_->cars[i];
@@ -435,7 +435,7 @@ void Race::start(const Start& start) {
     try {
         start_elsewhere(start);
     } catch (...) {
-        this->start();  // what was begun cannot be driven
+        this->start();  // the race that was begun cannot be driven
         throw;
     }
 }
@@ -483,7 +483,7 @@ void Race::drive(const Controls& controls, int ticks) {
                     "ticks is " + std::to_string(ticks) + "; expected a whole number >= 0");
     Hosted hosted(host_);
     world_->controls = controls;
-    // Who has an agent decides himself when it is over.
+    // In a race with an agent, its environment decides when the race is over.
     const auto over = [this] { return agent_ < 0 && ended(); };
     for (int i = 0; i < ticks && !over(); i++) {
         step();
@@ -524,8 +524,8 @@ void Race::step() {
     sort();
 }
 
-// A wheel that moves sideways, and forwards by exactly nothing, divides by zero in the game's tyre
-// model. That is rare, and ends the game's drive; here such a car rolls by a hair.
+// The game's tyre model divides by zero if a wheel moves sideways and its forward speed is exactly
+// 0. That is rare, and would end the drive; here such a car gets a tiny forward speed.
 void Race::keep_rolling() {
     constexpr float HAIR = 1e-5f;  // [m/s]
     for (int i = 0; i < world_->situation.cars_number; i++) {
@@ -559,8 +559,9 @@ void Race::drive_agent(CarElement& car) {
     if (controls.gear == AUTOMATIC_GEAR) shift(car);
 }
 
-// Gears by motor speed hunt while wheels spin. By road speed, they go by how fast the motor would
-// turn if no wheel slipped; and in first gear the clutch lets the motor turn faster than the car.
+// A gearbox that shifts by motor speed hunts while wheels spin. By road speed, it shifts by the
+// speed that the motor would have if no wheel slipped. In first gear the clutch slips, so that the
+// motor can turn faster than the wheels.
 void Race::shift(CarElement& car) const {
     const CarPrivate& priv = car.priv;
     const float* ratio = priv.gear_ratio + priv.gear_offset;

@@ -25,7 +25,7 @@ struct Entry {
     int index = 0;
 };
 
-// By what the agent's gears are chosen, where it leaves that to the gearbox.
+// How the gearbox chooses the agent's gears, where the agent does not.
 enum class Gearbox { ENGINE_SPEED, ROAD_SPEED };
 
 struct RaceOptions {
@@ -67,7 +67,7 @@ struct Snapshot {
     std::vector<Variables> variables;
 };
 
-// Memory that comes from a race that is closed, if there is one, and goes to a later one.
+// Memory of an earlier, closed race if there is one; a later race uses it again.
 class LentArena {
 public:
     LentArena(Game& game, std::size_t size);
@@ -90,9 +90,9 @@ public:
     Race(const Race&) = delete;
     Race& operator=(const Race&) = delete;
 
-    // The field on the grid, at the moment before drivers are called for the first time.
+    // Puts the field on the grid, at the moment before drivers are called for the first time.
     void start();
-    // The field moved along the road so that the agent is at a place, all at a speed.
+    // Moves the field along the road, so that the agent is at a place; all cars get a speed.
     void start(const Start& start);
 
     // Hold the agent's controls for some intervals between two calls of drivers.
@@ -106,7 +106,7 @@ public:
 
     std::uint64_t number() const { return number_; }
 
-    // What follows is read between two calls; index counts the starting list.
+    // Read what follows between two calls; `index` counts the starting list.
     const TrackData& track() const { return *track_; }
     const Situation& situation() const { return world_->situation; }
     const CarElement& car(int index) const { return world_->cars[index]; }

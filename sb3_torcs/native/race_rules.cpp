@@ -101,7 +101,7 @@ bool Race::cross_line(CarElement& car, Record& record) {
         record.lap_began = static_cast<float>(situation.time);
     }
     record.top_speed = record.lowest_speed = race.lowest_speed = car.pub.local.vel.x;
-    // With an agent nobody is flagged off: its environment says when it is over.
+    // No car is flagged off in a race with an agent: its environment decides when the race is over.
     if (agent_ < 0 && (race.remaining_laps < 0 || situation.state == FINISHING)) {
         car.pub.status |= FINISHED;
         situation.state = FINISHING;
@@ -207,7 +207,7 @@ void Race::stop_in_pit(CarElement& car, Record& record) {
 // ---- Rules --------------------------------------------------------------------------------------
 
 void Race::apply_rules(CarElement& car, Record& record) {
-    // Whoever hangs about is taken out; ten metres a second and a long pit stop are allowed.
+    // Takes out who is too slow: a lap may take its length at 10 m/s, and a long pit stop.
     if (car.race.lap_time > 84.5 + track_->length / 10.0) {
         car.pub.status |= ELIMINATED;
         return;
@@ -303,8 +303,8 @@ void Race::check_pit_lane(CarElement& car, Record& record) {
 
 namespace {
 
-// Penalties that were not served cost what serving them would have: the time to stop, and the
-// time lost at the limit along the pits.
+// A penalty that was not served costs the time that serving it would have cost: the stop, and the
+// time lost at the speed limit along the pits.
 float unserved(const CarElement& car, const Pits& pits) {
     if (pits.type != 1) return 0.0f;
     constexpr float FAST = 84.0f, LANE = 10.0f, STOP = 6.0f + LANE;
@@ -335,7 +335,7 @@ std::vector<Result> Race::results() const {
     const auto laps_of = [&](const CarElement& car) {
         return std::min(car.race.crossings, situation.laps + 1) - 1;
     };
-    // A penalty moves a car down past those whose time, stretched to its number of laps, is less.
+    // A penalty moves a car down behind the cars whose time is less, scaled to its number of laps.
     bool comparable = situation.type == RACE;
     for (std::size_t i = 1; comparable && i < standings.size(); i++) {
         for (std::size_t j = i; j > 0; j--) {

@@ -1,4 +1,4 @@
-// The road as the game's loader has laid it, to be held to what was read of its file.
+// The road as the game's loader built it, for comparison with what Python read from its file.
 #pragma once
 
 #include <array>
@@ -15,7 +15,7 @@ namespace torcs {
 constexpr int ROAD_COLUMNS = 13;
 using RoadSegment = std::array<double, ROAD_COLUMNS>;
 
-// From the start line on. The track has passed `check_track`.
+// Segments begin at the start line. The track has passed `check_track`.
 std::vector<RoadSegment> road_of(const TrackData& track);
 
 }  // namespace torcs

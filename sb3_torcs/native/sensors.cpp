@@ -47,15 +47,15 @@ Vector place(const TrackPosition& track, Vector left) {
 
 // ---- Range finders -----------------------------------------------------------------------------
 
-// A ray that follows the road one way, from border to border between segments, until an edge
-// stops it. It never turns round: who crosses one border forwards crosses the next one forwards,
-// since on a straight its direction and in a turn its angular momentum about the centre is
-// constant. So which side of a border's corners it passes tells all, without any trigonometry;
-// that holds for turns of up to half a circle, and the game's tracks turn by 90 degrees at most in
-// one segment.
+// A ray that follows the road one way, from border to border between segments, until an edge stops
+// it. It never turns back: a ray that crosses one border forwards crosses the next one forwards,
+// because its direction is constant on a straight, and its angular momentum about the centre in a
+// turn. So it is enough to know on which side of a border's corners the ray passes, which needs no
+// trigonometry. This holds for turns of up to half a circle; a segment of the game's tracks turns
+// by 90 degrees at most.
 //
-// The game's loaders give the road one width from start to end, so that corners and radii say the
-// same as the start width, which is what the SCR server takes.
+// The game's loader gives the road of a segment one width from start to end. So corners and radii
+// agree with the width at the start, which the SCR server uses.
 class Ray {
 public:
     // `direction` is a unit vector.
@@ -77,7 +77,7 @@ public:
             if (std::min(ahead(left), ahead(right)) >= SENSOR_RANGE) break;
             entry = left;
             segment = forwards_ ? segment->next : segment->prev;
-        } while (segment != &first);  // one round at most, whatever the track is
+        } while (segment != &first);  // one lap at most, on any track
         return SENSOR_RANGE;
     }
 
@@ -86,7 +86,7 @@ private:
 
     static double limited(double distance) { return std::clamp(distance, 0.0, SENSOR_RANGE); }
 
-    // A corner by its place along the ray's way, not the road's.
+    // A corner, named in the direction of the ray, not of the road.
     Vector corner(const Segment& segment, Side side, Border border) const {
         if ((border == EXIT) == forwards_) {
             return ground(segment.vertex[(side == LEFT) == forwards_ ? END_LEFT : END_RIGHT]);
@@ -101,8 +101,8 @@ private:
         return leftwards(left) > 0.0 && leftwards(right) < 0.0;
     }
 
-    // Not everything that leaves a segment comes into the next one: tracks close at the start line
-    // with gaps of up to 0.3 m. There the corner that stands out stops the ray.
+    // A ray that leaves a segment may miss the next one: tracks have gaps of up to 0.3 m at the
+    // start line. There the corner that stands out stops the ray.
     bool comes_in(const Segment& segment) const {
         return passes_between(corner(segment, LEFT, ENTRY), corner(segment, RIGHT, ENTRY));
     }

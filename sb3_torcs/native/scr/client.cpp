@@ -26,7 +26,7 @@ constexpr auto DEADLINE = 10ms;  // the server's usual one
 constexpr auto SILENCE = 2s;     // after which a client may be gone: most ask again every second
 constexpr auto WATCH = 500ms;    // how often a wait looks for the game's owner
 constexpr auto AWAKE = 100us;    // how long a wait looks for an answer before it sleeps
-constexpr int MANY_NOTES = 100;  // for who runs the server; more would only fill the disk
+constexpr int MANY_NOTES = 100;  // for the user of the server; more would only fill the disk
 // A wait begins by polling. Polls that find an answer add 1 to a score of at most FULL_LUCK, others
 // take 2 off; when it is used up, the next -NO_LUCK waits sleep at once.
 constexpr int FULL_LUCK = 8;
@@ -108,7 +108,7 @@ bool Client::await_introduction() {
 void Client::hear_introduction() {
     const bool vacant = !identified_;
     bool introduced = false;
-    // Of several that wait the newest is the one that still listens.
+    // If several clients wait, the newest one is the one that still listens.
     while (const auto text = receive()) {
         if (is_init(*text)) {
             if ((vacant && !was_refused()) || is_admitted()) {
@@ -137,8 +137,8 @@ std::optional<Action> Client::ask(const State& state) {
     owed_++;
     const bool forever = deadline_ == Clock::duration::zero();
     const Clock::time_point until = Clock::now() + deadline_;
-    // Who answers state after state, and was late, answers the older ones first. Taken for the
-    // answer to this one, they would keep him behind for the rest of the race.
+    // A late client answers the older states first. If these were taken as the answer to this
+    // state, the client would stay behind for the rest of the race.
     while (!ending() && !wants_restart() && (!answer_ || (owed_ > 0 && !forever))) {
         watch_owner();
         const Clock::time_point next = Clock::now() + WATCH;
@@ -167,8 +167,9 @@ void Client::dismiss(std::string_view reason) {
 
 // ---- Datagrams ----------------------------------------------------------------------------------
 
-// To be woken takes longer than many a client thinks, so an answer is looked for a little while
-// before the game sleeps; but not where that is in vain, as with more processes than processors.
+// Waking up takes longer than many clients need for an answer. So the game polls for the answer a
+// little while before it sleeps, unless polling does not help, as with more processes than
+// processors.
 bool Client::look(Clock::time_point until) {
     if (luck_ < 0) {
         ++luck_;
@@ -210,8 +211,8 @@ bool Client::is_from_client() const {
 
 bool Client::wants_restart() const { return answer_ && answer_->restart; }
 
-// What comes after the wish for a restart is for the race that follows: a client that introduces
-// itself at once would else be taken into the one that ends.
+// Datagrams after a wish for a restart are for the next race. Otherwise a client that introduces
+// itself at once would join the race that ends.
 void Client::read_all(bool answers) {
     while (!wants_restart()) {
         const auto text = receive();
@@ -287,7 +288,7 @@ void Client::refuse() {
 }
 
 // A client of another server introduces itself by another word. Actions of a client that is gone,
-// or has another socket now, are none of that.
+// or that now has another socket, are not introductions.
 void Client::hear_stranger(std::string_view text) {
     if (text.empty() || text.front() == '(') return;
     std::string said(text.substr(0, 20));
@@ -308,7 +309,7 @@ void Client::note(const std::string& what) {
 // ---- What is sent -------------------------------------------------------------------------------
 
 void Client::send(std::string_view text) const {
-    // The texts are literals: the zero that closes them goes along.
+    // The texts are literals, and are sent with their closing zero.
     sendto(socket_, text.data(), text.size() + 1, MSG_DONTWAIT,
            reinterpret_cast<const sockaddr*>(&client_), client_size_);
 }

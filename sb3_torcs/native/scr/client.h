@@ -1,9 +1,9 @@
 // The conversation with one client, over UDP.
 //
-// Datagrams get lost, doubled and late. A client that comes back introduces itself again and is
-// taken up where the race is; but not while another one drives, see `is_admitted`. One that missed
-// a state says its last action again; if it tells which state that was for (see Action::lap_time),
-// the newest state is sent once more.
+// Datagrams get lost, doubled and late. A client that comes back introduces itself again and joins
+// the race as it is, unless another client drives; see `is_admitted`. A client that missed a state
+// repeats its last action. If it says which state that action was for (see Action::lap_time), the
+// newest state is sent again.
 #pragma once
 
 #include <netinet/in.h>
@@ -30,23 +30,25 @@ public:
     // last one was dismissed.
     bool await_introduction();
 
-    // As that, without waiting: for the others, who want an answer, too.
+    // The same without waiting, for the other clients, which want an answer, too.
     void hear_introduction();
 
-    // Sends a state and waits for what the client answers. Past the deadline that is nothing, or
-    // its late answer to an older state. Who wants a restart gets no more states before.
+    // Sends a state and waits for the client's answer. After the deadline the result is nothing, or
+    // the late answer to an older state. A client that wants a restart gets no more states before
+    // it.
     std::optional<Action> ask(const State& state);
 
     // Sends a state that needs no answer.
     void tell(const State& state);
 
-    // Says why no more states come. Only the first time after it was identified.
+    // Tells the client why no more states come. Only the first call after it was identified does
+    // so.
     void dismiss(std::string_view reason);
 
-    // How the client that is there now introduced itself.
+    // How the present client introduced itself.
     const Init& init() const { return init_; }
 
-    // What it calls itself, else its address; empty before there was one.
+    // The name it gave itself, else its address; empty before the first client.
     const std::string& name() const { return name_; }
 
     // Name and address, where both are known.
@@ -63,20 +65,21 @@ private:
     std::optional<std::string_view> receive();  // the next one that has come
     bool is_from_client() const;
     bool wants_restart() const;
-    // Whether the client has owed an answer for so long that it may be gone; or its introduction,
-    // since it was dismissed.
+    // Whether the client may be gone: it has owed an answer, or its introduction since it was
+    // dismissed, for too long.
     bool is_silent() const;
     // Whether the sender wanted to drive while the client did.
     bool was_refused() const;
-    // Whether who introduces itself now may drive: it is the same one, or that one may be gone, or
-    // nobody drives. A restart is no chance for who was refused: the client comes back.
+    // Whether the client that introduces itself now may drive: it is the one that drives, or that
+    // one may be gone, or nobody drives. A refused client does not get in at a restart, because the
+    // driving one comes back.
     bool is_admitted() const;
     void refuse();
     void hear_stranger(std::string_view text);
     void note(const std::string& what);  // for who runs the server
     void await_client();
-    // Everything that has come, up to the wish for a restart; `answers` is whether to the state
-    // that was sent last.
+    // Reads all datagrams up to a wish for a restart; `answers` tells whether one answers the last
+    // state.
     void read_all(bool answers);
     void read(std::string_view text, bool answers);
     void adopt(std::string_view text);
@@ -104,7 +107,7 @@ private:
     long timesteps_ = 0, late_ = 0;
 };
 
-// Ends the game when nobody is left for whom it runs. Looks only now and then.
+// Ends the game when its owner is gone. Checks only now and then.
 void watch_owner();
 
 }  // namespace torcs::scr

@@ -21,7 +21,8 @@ void Driver::new_track(int index, const TrackData* track) {
     index_ = index;
     track_ = track;
     client_.open(index);
-    // It goes on over restarts: each race has other noise, each session the same.
+    // The generator is not seeded anew at a restart: each race has other noise, each session the
+    // same.
     if (options().noisy && !noise_) noise_.emplace(static_cast<std::uint64_t>(index));
 }
 
@@ -40,7 +41,7 @@ void Driver::new_race(CarElement* car, const Situation* situation) {
     name_car();
 }
 
-// On the game's boards and in its results stands who drives, not which port it came to.
+// The game's boards and results show the client's name, not its port.
 void Driver::name_car() {
     if (!client_.name().empty())
         std::snprintf(car_->info.name, NAME_LENGTH, "%s", client_.name().c_str());

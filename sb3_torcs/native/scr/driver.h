@@ -20,7 +20,8 @@ public:
     // Asks the client, and does what it says. Returns whether it wants the race restarted.
     bool drive();
 
-    // As `drive`, but only for a car that is out of the race or in its pit: nobody else asks then.
+    // As `drive`, for a car that is out of the race or in its pit, whose driver the game does not
+    // call.
     bool watch();
 
     // Tells the client that the race is over, or that it begins anew.

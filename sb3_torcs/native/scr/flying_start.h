@@ -1,9 +1,9 @@
 // A race that begins where a client asks for, not on the grid: as Race::start does it.
 //
 // The engine puts the cars on the grid, tells the drivers of the race, lets the cars settle and
-// counts down. What a client asks for is known when its driver is told; but all drivers have to be
-// told where they stand. So the race is begun once more, with the field moved before they are told,
-// and drives off instead of the countdown.
+// counts down. A client's wish is known when its driver is told of the race, but all drivers must
+// be told where they stand. So the race begins once more: the field is moved before the drivers are
+// told, and drives off without the countdown.
 #pragma once
 
 #include <vector>
@@ -24,20 +24,20 @@ public:
     // Whether the field was moved and waits to drive off.
     bool stands() const { return stands_; }
 
-    // Whether the cars are not where the race shall begin, so that it has to be begun once more. To
-    // be asked when they have settled: it also learns how high they stand.
+    // Whether the cars are not where the race shall begin, so that it has to begin once more. Call
+    // it when they have settled: it also measures how high they stand.
     bool misses_grid();
 
     void drive_off(Situation& situation);
 
-    // The first crossing of the line starts the clock. To be called before the engine counts laps.
+    // The first crossing of the line starts the clock. Call it before the engine counts laps.
     void start_clocks(const Situation& situation);
 
     // A place that was refused may be free when the next race begins.
     void forget_refusal() { refused_ = false; }
 
 private:
-    // Finds who asks for a start, if it is one that can be had.
+    // Finds the car whose client asks for a start that is possible.
     bool find_start();
     void refuse(const char* reason);
 

@@ -24,7 +24,7 @@ void restart(Leaving reason) {
     restart_wanted = false;
     why = reason;
     clean_race_up();
-    // No menu before a start that nobody has asked for by hand.
+    // Skip the menu before a start that no user asked for.
     set_text(ReInfo->params, ReInfo->race_name, "splash menu", "no");
     prepare_race();
     start_race();

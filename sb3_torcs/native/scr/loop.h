@@ -1,28 +1,28 @@
-// A place of ours in the race engine's loop, from which a race can begin anew or elsewhere.
+// Our hook in the race engine's loop, from which a race can begin anew or elsewhere.
 //
-// The engine calls its simulation through pointers that it exports, in whose place ours stand. The
-// one for steps is called at every step after the drivers were, and passes the step on. Instead of
-// that it can do what the game's own "Restart Race" does; the engine then goes on as after any
-// start.
+// The engine calls its simulation through pointers that it exports; we replace them by ours. Ours
+// for steps is called at every step, after the drivers, and passes the step on. Instead it can do
+// what the game's own "Restart Race" does; the engine then continues as after any start.
 #pragma once
 
 namespace torcs::scr {
 
-// To be called whenever a race is loaded, before its cars are put on the grid: the engine gets its
-// simulation anew for each.
+// Call it whenever a race is loaded, before its cars are put on the grid: the engine loads its
+// simulation again for each race.
 void enter_loop();
 
 // At the next step.
 void request_restart();
 
-// From now on SIGTERM ends the race, as if all had come to its end. Only of a game that has an
-// owner: that of a user ends as it always did.
+// From now on SIGTERM ends the race, as if all cars had finished. This is so only in a game that
+// has an owner; a user's game ends as before.
 void hear_owner();
 
 // Whether that has come.
 bool ending();
 
-// Whether this race is still driven: nobody is asked any more once it is to end or to begin anew.
+// Whether this race is still driven: no driver is called any more when it is about to end or to
+// begin anew.
 bool goes_on();
 
 // Why drivers are shut down.

@@ -82,8 +82,8 @@ std::size_t numbers(std::string_view text, std::array<double, n>& values) {
     return n;
 }
 
-// Calls `use(tag, rest)` for each "(tag rest)" of a message. Brackets do not nest: what a second
-// one opens begins anew.
+// Calls `use(tag, rest)` for each "(tag rest)" of a message. Brackets do not nest: a second opening
+// bracket begins a new tag.
 template <typename Use>
 void for_each_tag(std::string_view text, Use use) {
     text = text.substr(0, text.find('\0'));
@@ -96,7 +96,7 @@ void for_each_tag(std::string_view text, Use use) {
     }
 }
 
-// As the game can draw it, and write it to its files.
+// Keeps the characters that the game can draw and write to its files.
 std::string plain(std::string_view text) {
     std::string name(text.substr(0, NAME_LENGTH - 1));
     for (char& c : name) {

@@ -1,5 +1,5 @@
-// The texts of the SCR protocol (Loiacono, Cardamone and Lanzi 2013, arXiv:1304.1672): what they
-// say in, what they mean out. Nothing here knows of sockets or of the game.
+// The texts of the SCR protocol (Loiacono, Cardamone and Lanzi 2013, arXiv:1304.1672): functions
+// between texts and what they mean. Nothing here uses sockets or the game.
 //
 // Everything is SI; the protocol's km/h, degrees and revolutions stay inside messages.cpp.
 #pragma once
@@ -45,8 +45,8 @@ struct State {
 };
 static_assert(sizeof(State) == STATE_NUMBERS * sizeof(double));
 
-// What a client wants; defaults are those of tags that it leaves out. All numbers are finite and
-// within their ranges.
+// What a client wants. A tag that it leaves out has the default given here. All numbers are finite
+// and within their ranges.
 struct Action {
     double throttle = 0.0;  // [0, 1]
     double brake = 0.0;     // [0, 1]
@@ -74,12 +74,12 @@ std::size_t format_state(const State& state, bool exact, char (&text)[LONGEST_ST
 // What a client reads where a number is written.
 double as_written(double number, bool exact);
 
-// Every text has a meaning: tags in any order, what is missing or no number takes its default,
-// what is out of range is clipped, what is unknown is ignored.
+// Every text is valid. Tags can have any order; a missing value or one that is no number becomes
+// the default, one out of range is clipped, and an unknown tag is ignored.
 Action parse_action(std::string_view text);
 Init parse_init(std::string_view text);
 
-// The server has always looked at the first three characters only.
+// As in the original server, only the first three characters count.
 inline bool is_init(std::string_view text) { return text.substr(0, 3) == "SCR"; }
 
 }  // namespace torcs::scr

@@ -66,7 +66,7 @@ void Mercy::before(const Situation& situation) {
         CarElement& car = *situation.cars[i];
         Kept& kept = kept_[static_cast<std::size_t>(car.index)];
         if (const SimulatedCar* own = simulated(car)) kept.fuel = own->fuel;
-        // The engine judges by the lap time of the step before: also where a slow lap ends.
+        // The engine judges by the lap time of the previous step, also at the end of a slow lap.
         const bool was_slow = kept.slow;
         kept.slow = is_slow(car);
         if (options().no_lap_limit && (was_slow || kept.slow)) car.pub.status &= ~ELIMINATED;

@@ -1,5 +1,5 @@
-// What the server's options take out of a race, or add to it: as -nofuel, -nodamage, -nolaptime and
-// -noisy of patched servers. They hold for all cars.
+// The server's options, which are those of patched servers: -nofuel, -nodamage, -nolaptime and
+// -noisy. They hold for all cars.
 #pragma once
 
 #include <vector>
@@ -15,7 +15,8 @@ struct Options {
     bool noisy = false;         // sensors err
 };
 
-// As SB3_TORCS_SCR_OPTIONS names them, between commas. Ends the game if it names another.
+// Reads SB3_TORCS_SCR_OPTIONS, whose names are separated by commas. Ends the game if one is
+// unknown.
 const Options& options();
 
 // Keeps from the cars what the options take out of the race.

@@ -1,5 +1,5 @@
-// The game's clock. Real time, but for videos: there it goes from frame to frame, however long
-// the drawing takes.
+// The game's clock. It shows real time, except for a video: there it goes on by one frame at a
+// time, however long the drawing takes.
 
 #include <cmath>
 #include <cstdlib>
@@ -14,7 +14,7 @@ constexpr double RUN_OUT = 1.0;       // [s] after the end: the last crossing of
 
 double now = 0;               // [s] what the game's clock shows
 double origin = 0;            // [s] simulated time of the first frame
-long frame = 0;               // number of the last one; -1 is drawn, but nobody gets it
+long frame = 0;               // number of the last one; frame -1 is drawn, but not sent
 double last_time = HUGE_VAL;  // [s] simulated, of the last frame
 double over_since = 0;        // [s] simulated time of the race's end
 
@@ -24,8 +24,8 @@ double frame_time() {
     return seconds;
 }
 
-// Frames are counted, not summed up: the error of one never reaches the next. A camera that flies
-// knows where it is only from its second picture on.
+// The time of a frame is computed from its number, so that rounding errors do not add up. A flying
+// camera finds its place only with its second picture.
 double time_of_next_frame(double time) {
     if (time < last_time) {  // a race that begins, or begins again
         origin = std::fmax(FIRST_FRAME, time);

@@ -39,8 +39,8 @@ std::string base_name(const std::string& file) {
 
 int (*original_init_view)(int, int, int, int, int, void*) = nullptr;
 
-// The map of the track is painted here. Lights and hidden sides, left from before, would make it
-// invisible.
+// The game paints the map of the track here. Lighting or culling that is still on would make the
+// map invisible.
 int init_view(int x, int y, int width, int height, int flag, void* screen) {
     for (const unsigned capability : {LIGHTING, CULL_FACE, ALPHA_TEST}) glDisable(capability);
     return original_init_view(x, y, width, height, flag, screen);
@@ -58,7 +58,7 @@ void start_race() {
     ReInfo->file_name = strdup(base_name(file).c_str());
     ReInfo->name = GfParmGetStr(ReInfo->params, "Header", "name", "");
     ReInitResults();
-    // Nobody is asked whether to start, nor shown results only.
+    // Skip the question whether to start, and the screen that shows only results.
     const char* race = ReGetCurrentRaceName();
     if (!race) give_up(std::string("no race in ") + file);
     GfParmSetStr(ReInfo->params, race, "splash menu", "no");
@@ -91,7 +91,7 @@ torcs::Owner& owner() {
 // The program calls this one after it has opened its window.
 INSTEAD void TorcsEntry() {
     std::signal(SIGPIPE, SIG_IGN);
-    std::setvbuf(stdout, nullptr, _IOLBF, 0);  // a crash shall not swallow what was said
+    std::setvbuf(stdout, nullptr, _IOLBF, 0);  // so that a crash loses no output
     window::owner();  // made before what is called at the exit, and so there for it
     // Without its display the program ends at once.
     std::atexit([] { window::owner().await_end(std::chrono::milliseconds(500)); });
@@ -122,7 +122,7 @@ INSTEAD int ReRaceEnd() {
 
 INSTEAD int ReDisplayResults() { return window::AT_ONCE_NEXT_STEP; }
 
-// The game would be back in its menus. Its libraries are not tidied up, which can crash.
+// Here the game would return to its menus. Its libraries are not closed, because that can crash.
 INSTEAD int ReRacemanMenu() {
     std::fflush(nullptr);
     _exit(0);

@@ -83,8 +83,8 @@ void send_picture() {
     ++header.number;
 }
 
-// The game draws its messages only before the next picture, over this one: here they come at once,
-// so that a frame is of one time.
+// The game draws its messages over this picture only just before the next one. Here it draws them
+// at once, so that a frame shows one moment.
 int draw_and_send(torcs::Situation* situation) {
     const int result = draw(situation);
     header.time = situation->time;
@@ -103,7 +103,7 @@ void send_frames() { draw = std::exchange(ReInfo->graphics.refresh, draw_and_sen
 
 }  // namespace window
 
-// Nobody looks at the window of a video: it is not shown, which takes time.
+// The window of a video is not shown: nobody looks at it, and showing takes time.
 extern "C" INSTEAD void glutSwapBuffers() {
     static auto* const real = window::original<void()>("glutSwapBuffers");
     if (!window::recording()) {

@@ -1,8 +1,8 @@
-// Pictures of a race that goes on elsewhere: the cars are put where they are there, and nothing
-// of the game's own moves them.
+// Pictures of a race that another process drives: the cars are put where they are in that race, and
+// the game itself does not move them.
 //
-// A picture shows a moment and nothing of what was before it, so that it does not matter which
-// moments were drawn before: see also the settings in rendering/game_camera.py.
+// A picture depends on its moment only, not on moments that were drawn before; see also the
+// settings in rendering/game_camera.py.
 
 #include <poll.h>
 
@@ -25,8 +25,8 @@ using namespace torcs;
 constexpr int LOOK_AROUND = 500;    // [ms] between two looks after the owner
 constexpr int MANY_LAPS = 1 << 30;  // of a race without an end
 
-// Of the game's graphics, what remembers the picture before: some of the cameras, and the needles
-// of a car's instruments.
+// The parts of the game's graphics that remember the previous picture: some of the cameras, and the
+// needles of a car's instruments.
 struct Camera {
     const std::type_info* const* methods;  // behind them: what kind of camera it is
     Unused<36> a_;
@@ -87,13 +87,13 @@ static_assert(offsetof(DirectedCamera, last_event) == 168 && offsetof(DirectedCa
 static_assert(offsetof(Instrument, needle) == 56 && sizeof(Instrument) == 72);
 static_assert(sizeof(DrawnCar) == 728);
 
-// The camera turns by a share of what is left per picture. In the game's usual 60 pictures a
-// second that leaves it behind in a steady turn by what the car turns in this time.
+// In each picture the camera turns by a share of the angle that is left. At the game's usual 60
+// pictures a second, it lags in a steady turn by the angle that the car turns in this time.
 constexpr float TURN_PER_PICTURE = 0.1f;
 constexpr float CAMERA_LAG = 0.15f;     // [s]
 constexpr float MAX_CAMERA_LAG = 0.5f;  // [rad] when the car spins
 
-// The helicopter stands where it would come to rest. It moves only if time has passed.
+// The helicopter is put where it would come to rest. It moves only if time has passed.
 constexpr float ABOVE_CAR[3] = {-15, -15, 30};  // [m]
 constexpr double JUST_BEFORE = 1.0 / 256;       // [s] never a whole number of physics steps
 constexpr float LONG = 10;                      // [s]
@@ -130,7 +130,7 @@ Segment* segment(int id) {
     return segments.at(static_cast<std::size_t>(id));
 }
 
-// Addresses, and what names the car here, stay.
+// Addresses, and what names the car here, are not overwritten.
 void put(CarElement& car, const CarAppearance& looks) {
     const CarRace race = car.race;
     const CarPrivate priv = car.priv;
@@ -146,7 +146,7 @@ void put(CarElement& car, const CarAppearance& looks) {
     car.priv.driver_index = priv.driver_index;
     std::copy(std::begin(priv.module), std::end(priv.module), car.priv.module);
     for (int i = 0; i < 4; i++) car.priv.wheel[i].segment = priv.wheel[i].segment;
-    // A body would keep its dents in pictures of earlier moments.
+    // Without this, a body would keep its dents in pictures of earlier moments.
     car.priv.dents = 0;
 }
 
@@ -191,7 +191,7 @@ void stay(DirectedCamera& camera, double time) {
     camera.car = -1;
 }
 
-// As if the pictures before had been of a drive that led to this moment.
+// Sets the cameras as if the previous pictures had been of a drive to this moment.
 void pretend_a_past(const CarElement& car, Screen& screen, double time) {
     Camera& camera = *screen.camera;
     if (is(camera, "15cGrCarCamBehind")) turn(reinterpret_cast<CameraBehind&>(camera), car);
@@ -224,11 +224,11 @@ void take_appearance() {
         put(car, looks);
         situation.cars[i] = &car;
     }
-    // Shining lights are drawn turned at random.
+    // The game draws lights that shine at random angles.
     std::srand(1);  // NOLINT(bugprone-random-generator-seed): the same each time
     Screen& screen = *drawn<Screen*>("grScreens");
     pretend_a_past(*screen.car, screen, scene.time);
-    // Without an end the board counts up to the lap that is driven.
+    // In a race without an end, the board shows the present lap as the last one.
     if (endless) situation.laps = std::max(situation.cars[0]->race.crossings, 1);
 }
 

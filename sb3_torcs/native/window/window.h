@@ -1,5 +1,5 @@
-// What the parts of this library share: it is loaded before the game's own libraries, and stands
-// in for those of their functions that are marked `INSTEAD`.
+// What the parts of this library share. It is loaded before the game's own libraries; functions
+// marked `INSTEAD` replace those of the same name there.
 #pragma once
 
 #include <dlfcn.h>
@@ -29,7 +29,7 @@ torcs::Owner& owner();
 
 // ---- clock.cpp: how fast the game runs ----------------------------------------------------------
 
-// Let the clock go on by exactly as much as there is between two frames.
+// Advance the clock by exactly the time between two frames.
 void advance_clock();
 
 // Whether the picture that is drawn now belongs to the video.
@@ -40,7 +40,7 @@ bool run_out();
 
 // ---- frames.cpp: what comes out -----------------------------------------------------------------
 
-// Whether frames are sent to somebody, not shown.
+// Whether frames are sent to another process, not shown.
 bool recording();
 
 // Send a frame after every picture of the race that is drawn.
@@ -48,10 +48,10 @@ void send_frames();
 
 // ---- puppet.cpp: a race that goes on elsewhere --------------------------------------------------
 
-// Whether the cars are put where somebody says, and not moved by the game.
+// Whether another process says where the cars are, and the game does not move them.
 bool acting();
 
-// Wait for a moment of that race, and put the cars where they are in it.
+// Wait for a moment of that race, and put the cars where they are in this moment.
 void take_appearance();
 
 }  // namespace window
