@@ -30,7 +30,7 @@ from sb3_torcs.files import writable_folder
 from sb3_torcs.training.run import TrainOptions, train_run
 
 TRACK = "aalborg"
-ALGO, ENTRY = "ppo", "Torcs-v0"  # on TorcsLite-v0, too: nothing else laps there as soon
+ALGO, ENTRY = "ppo", "Torcs-v0"  # also on TorcsLite-v0, where no other entry learns to lap as fast
 TIMESTEPS = 1_024_000
 EVALUATIONS = 25  # of a whole training
 ROLLOUT = 2048  # timesteps that PPO learns from at once
@@ -100,7 +100,7 @@ def read_state(folder: Path) -> tuple[int | None, int]:
         return None, 0
     try:
         wanted = int(json.loads((folder / STATE).read_text())["timesteps"])
-    except (ValueError, KeyError, TypeError):  # a full disk took half of it
+    except (ValueError, KeyError, TypeError):  # a full disk cut the file off
         wanted = TIMESTEPS
     return wanted, sum(saved_timesteps(find_model(run, prefer_last=True)) for run in runs(folder))
 
@@ -114,7 +114,7 @@ class Course(NamedTuple):
 
 
 def course_of(folder: Path) -> Course:
-    """Return what was begun in this folder, or else the best that this machine can do."""
+    """Return the course that was begun in this folder, or else the best one for this machine."""
     begun = runs(folder)
     if begun:
         algo, env = begun[0].parent.name, begun[0].name.rpartition("_")[0]
@@ -158,7 +158,7 @@ def train(folder: Path, wanted: int, done: int, seed: int) -> bool:
         entry=course.entry,
         track=TRACK,
         timesteps=wanted - done,
-        seed=seed + len(before),  # the same chance twice would teach the same twice
+        seed=seed + len(before),  # the same seed again would repeat the same episodes
         folder=folder / RUNS,
         tensorboard=folder / TENSORBOARD,
         eval_freq=max(wanted // EVALUATIONS, ROLLOUT),
@@ -167,7 +167,7 @@ def train(folder: Path, wanted: int, done: int, seed: int) -> bool:
     )
     print("\n".join(first_words(folder, course, wanted - done, bool(before))), flush=True)
     try:
-        # The zoo's tables would run through the progress bar.
+        # The zoo's tables would break the progress bar.
         with (folder / LOG).open("a", buffering=1) as log, contextlib.redirect_stdout(log):
             interrupted = train_run(options).interrupted
     except KeyboardInterrupt:  # before the first timestep, or a third time
@@ -219,7 +219,7 @@ def show(folder: Path, interrupted: bool) -> bool:
 
 
 def attempt(name: str, step: Callable[[Path], str], folder: Path) -> bool:
-    """Do one part of the show; if it breaks, it must not take the others along."""
+    """Do one part of the show; if it fails, the others still run."""
     try:
         print(step(folder), flush=True)
     except KeyboardInterrupt:
@@ -276,7 +276,7 @@ def described(recorder: Recorder) -> str:
 
 
 def last_words(folder: Path) -> str:
-    """Say what there is, how to open it, and how to go on."""
+    """Say what the demo made, how to open it, and how to continue."""
     wanted, done = read_state(folder)
     lines = [""]
     sb3_torcs, env = tool("sb3-torcs"), course_of(folder).env
@@ -309,7 +309,7 @@ def last_words(folder: Path) -> str:
 
 
 def tool(name: str) -> str:
-    """Where a command of this Python is, as one types it here."""
+    """Return a command of this Python as one types it here."""
     path = Path(sys.executable).parent / name
     relative = os.path.relpath(path)
     return name if not path.exists() else str(path) if relative.startswith("..") else relative

@@ -28,7 +28,7 @@ NO_LIMIT = 1 << 62
 
 class RaceInfo(MutableMapping[str, Any]):
     """
-    The ``info`` of a race whose episode goes on. Its values are made when one is read.
+    The ``info`` of a race whose episode goes on. It computes its values when one is first read.
 
     :param timestep: the outcome of a timestep of all races
     :param race: index of the race
@@ -85,8 +85,8 @@ class TorcsVecEnv(DummyVecEnv):
     It returns what ``DummyVecEnv`` over the same environments in ``Monitor`` returns, to the bit,
     in less time. ``make_vec_env`` and the RL Zoo can use it in the place of ``DummyVecEnv``.
 
-    :param races: how many; or functions that make the environments, wrapped in no more than
-        ``Monitor``, ``TimeLimit`` and ``OrderEnforcing``
+    :param races: their number, or functions that make the environments. Wrappers may be
+        ``Monitor``, ``TimeLimit`` and ``OrderEnforcing`` only
     :param agents: cars that learn in each race: 1
     :param threads: that share the work, at least 1; ``None`` is one per core, and one per race at
         most
@@ -148,8 +148,8 @@ class TorcsVecEnv(DummyVecEnv):
         Hold an action in each race.
 
         :return: observations, rewards, dones and infos
-        :raises InvalidAction: if there is not one action per race, or one is none; then nobody has
-            driven
+        :raises InvalidAction: if there is not one action per race, or one is invalid; then no
+            race has been driven
         """
         if self._batch is None:
             raise EnvClosed("step after close; make a new environment")
@@ -174,7 +174,7 @@ class TorcsVecEnv(DummyVecEnv):
         if self._watched or failures:
             self._leave()
         for i in self._watched:
-            if not over[i]:  # who has ended has been drawn by its environment
+            if not over[i]:  # an environment whose episode ended has drawn itself
                 self._races[i].racing.render()
         if failures:
             raise failures[0]
@@ -228,7 +228,7 @@ class _Race:
     The wrappers of one environment, which count timesteps and sum rewards.
 
     :param env: the outermost wrapper
-    :raises InvalidOption: if there is another wrapper, which would have to see every timestep
+    :raises InvalidOption: if there is another wrapper, which would not see every timestep
     """
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
@@ -246,7 +246,9 @@ class _Race:
                 "call; use DummyVecEnv"
             )
         while isinstance(env, gym.Wrapper):
-            names = {kind.__name__ for kind in type(env).__mro__}  # the RL Zoo has one of its own
+            names = {
+                kind.__name__ for kind in type(env).__mro__
+            }  # the RL Zoo has its own TimeLimit
             if type(env) is Monitor and self._monitor is None:
                 self._monitor = env
             elif "TimeLimit" in names and self._limit is None:

@@ -1,4 +1,4 @@
-"""What a terminal shows of a training: a bar, and curves of what its evaluations drove."""
+"""What a terminal shows of a training: a progress bar, and curves of its evaluations."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def bars(values: Sequence[float | None], low: float, high: float, width: int) ->
     :param values: the oldest first; ``None`` leaves a gap
     :param low: value of no bar
     :param high: value of a full bar
-    :param width: columns; of more values than that, some are left out
+    :param width: columns; with more values than columns, some values are left out
     :return: :data:`CURVE_HEIGHT` lines, the top one first
     """
     if len(values) > width:
@@ -66,7 +66,7 @@ class Display:
         )
         self._live.start()
         self._console.show_cursor(True)
-        # A training that an error ends does not say so to its callbacks.
+        # SB3 does not tell callbacks when an error ends the training.
         self.close = weakref.finalize(self, self._live.stop)
 
     def say(self, text: str, style: str = "") -> None:

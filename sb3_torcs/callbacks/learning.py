@@ -51,7 +51,7 @@ class GradientStepsCallback(_WhileLearning):
     """
     Take more gradient steps at the beginning of a training, when there are few timesteps.
 
-    A training that resumes with its replay buffer is past its beginning. Models that callbacks
+    A resumed training with its replay buffer counts as past its beginning. Models that callbacks
     save keep their own ``gradient_steps``.
 
     :param gradient_steps: replace the model's own at the beginning
@@ -92,9 +92,9 @@ class LeanUpdatesCallback(_WhileLearning):
     """
     Update DDPG or TD3 with a ``SplitHeadPolicy`` without PyTorch's record of each operation.
 
-    The updates are equal but for rounding, and take about half of the time. Where the policy is on
-    a GPU, or has an optimizer, an activation or a features extractor other than the default, the
-    algorithm's own ``train`` goes on.
+    The updates are equal but for rounding, and take about half of the time. If the policy is on a
+    GPU, or has an optimizer, an activation or a features extractor other than the default, the
+    algorithm's own ``train`` updates it.
 
     :param verbose: as in ``BaseCallback``
     """
@@ -119,7 +119,7 @@ class LeanUpdatesCallback(_WhileLearning):
 
     def _train(self, gradient_steps: int, batch_size: int = 100) -> None:
         assert self._updates is not None
-        self._undo()  # a model that is saved after Ctrl-C is a stock one
+        self._undo()  # so that a model that is saved after Ctrl-C is a stock one
         self._updates.train(gradient_steps, batch_size)
 
     def _undo(self) -> None:
@@ -130,7 +130,7 @@ class MirrorCallback(_WhileLearning):
     """
     Mirror half of each batch from left to right, so that its bends go the other way.
 
-    The replay buffer holds the transitions as they were driven, and is saved as the stock one.
+    The replay buffer holds the transitions as they were driven, and saved files are those of SB3.
 
     :param verbose: as in ``BaseCallback``
     """

@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 __all__ = ["DrivenLap", "LinePicturesCallback", "draw_learning", "driven_laps"]
 
 TABLE = "laps.csv"
-SHOWN, COLUMNS = 6, 3  # pictures of a series, at most, in the picture of the learning; in a row
+SHOWN = 6  # pictures of a series in the picture of the learning, at most
+COLUMNS = 3  # of them in a row
 SIZE, ROW = 15.0, 4.4  # [in] its width, and the height of the curves and of each row
 FASTEST = 70.0  # [m/s] the end of the colours, the same in all pictures of a series
 
@@ -42,7 +43,7 @@ def driven_laps(folder: Path) -> list[DrivenLap]:
     Read the table of a series.
 
     :param folder: of a :class:`LinePicturesCallback`
-    :return: its rows; those that a full disk has broken are left out
+    :return: its rows, without those that a full disk cut off
     """
     if not (folder / TABLE).is_file():
         return []
@@ -63,12 +64,12 @@ def driven_laps(folder: Path) -> list[DrivenLap]:
 
 class LinePicturesCallback(BaseCallback):
     """
-    Keep pictures of the lines that are driven after evaluations, and a table of all of them.
+    Draw lines that are driven after evaluations, and write a table of all evaluations.
 
-    The folder gets ``001.png``, ``002.png``, ... and ``laps.csv``; a training that goes on
+    It writes ``001.png``, ``002.png``, ... and ``laps.csv`` into the folder; a resumed training
     continues the series. The first evaluation and the first whole lap are always drawn. The lines
-    come from the :class:`~sb3_torcs.callbacks.DrivingMetricsCallback` of the same training. A file
-    that cannot be written ends the series, and not the training.
+    come from the :class:`~sb3_torcs.callbacks.DrivingMetricsCallback` of the same training. If a
+    file cannot be written, the series ends, but the training continues.
 
     :param folder: is made
     :param every: seconds between two pictures, at least [s]

@@ -54,7 +54,7 @@ class Timestep(NamedTuple):
         """
         car = car_from_record(self.after[race])
         lap_time = car.last_lap_time if car.laps > self.before[race, LAPS] else 0.0
-        # A race with fewer terms than another has zeros behind its own.
+        # A race with fewer terms than another has zeros after its own.
         terms = dict(zip(self.names[race], self.terms[race], strict=False))
         terms["crash"] = 0.0
         return racing_info(car, lap_time, terms)
@@ -90,8 +90,8 @@ class Batch:
     """
     Racing environments that take their timesteps at once.
 
-    The state of a race is here while it is driven by :meth:`step`. :meth:`leave` gives it back to
-    the environment, before that is used by itself; :meth:`enter` takes it over again.
+    This object holds the state of a race while :meth:`step` drives it. Call :meth:`leave` before
+    the environment is used alone: it gives the state back. :meth:`enter` takes it over again.
 
     :param envs: of one kind and with the same layout of actions
     :param threads: that drive, at least 1; ``None`` is one per core, and one per race at most
@@ -175,8 +175,8 @@ class Batch:
 
         :param asked: (n, numbers of an action)
         :return: the outcome; a race that has ended or failed has to be finished
-        :raises InvalidAction: if there is not one action per race, or one is none; then nobody has
-            driven
+        :raises InvalidAction: if there is not one action per race, or one is invalid; then no race
+            has been driven
         """
         controls = self._read(asked)
         before, after = self._cars, np.empty_like(self._cars)
@@ -228,7 +228,7 @@ class Batch:
         :param timestep: the outcome of the latest ``step``
         :param act: steps the outermost wrapper
         :return: what ``act`` returns
-        :raises Exception: what has stopped the race; its state is that of before the timestep
+        :raises Exception: the error that stopped the race; its state is that before the timestep
         """
         env = self.envs[race]
         failure = timestep.failures.get(race)

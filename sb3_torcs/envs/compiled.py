@@ -30,7 +30,7 @@ COMPILED: tuple[rewards.Term, ...] = tuple(
 
 
 def _derived(name: str) -> None:
-    """Give a property of ``CarState`` to records of cars in compiled code."""
+    """Let compiled code read a property of ``CarState`` from records of cars."""
     formula = register_jitable(getattr(CarState, name).fget)
 
     @overload_attribute(types.Record, name)

@@ -1,4 +1,4 @@
-"""Matrix products inside compiled functions, by the fastest library that is loaded anyway.
+"""Matrix products inside compiled functions, by the fastest library that is already loaded.
 
 PyTorch brings a BLAS of its own, as a rule Intel's MKL, half again as fast here as SciPy's, which
 numba takes by itself.
@@ -49,8 +49,8 @@ def _compile_product(a: Any, turn_a: Any, b: Any, turn_b: Any, out: Any) -> Any:
     gemm = _GEMM[a.dtype]
 
     def compiled(a: Any, turn_a: Any, b: Any, turn_b: Any, out: Any) -> Any:
-        # Fortran's arrays are ours turned, so it multiplies b and a. It takes all by address; the
-        # low half of a 64-bit number is that number where it expects 32 bits.
+        # Fortran's arrays are ours transposed, so it multiplies b and a. It takes all arguments by
+        # address; where it expects 32 bits, the low half of a 64-bit number is that number.
         rows, columns = out.shape
         inner = a.shape[0] if turn_a else a.shape[1]
         sizes = np.array([columns, rows, inner, b.shape[1], a.shape[1], columns], np.int64)
@@ -71,9 +71,9 @@ def product(a: Any, turn_a: bool, b: Any, turn_b: bool, out: Any) -> None:
     """
     Multiply two matrices.
 
-    :param a: (n, k), or (k, n) if turned
+    :param a: (n, k), or (k, n) if transposed
     :param turn_a: transpose it
-    :param b: (k, m), or (m, k) if turned
+    :param b: (k, m), or (m, k) if transposed
     :param turn_b: transpose it
     :param out: (n, m), overwritten
     """

@@ -110,7 +110,7 @@ def export_actor(model: Any, path: str | os.PathLike[str]) -> Path:
     path = Path(path)
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        part.touch()  # what cannot be written is known at once
+        part.touch()  # a path that cannot be written raises here, before the work
         part.write_bytes(_graph(_RawDriver(policy, statistics), policy.observation_space))
         part.replace(path)
     except OSError as error:
@@ -125,7 +125,7 @@ def export_actor(model: Any, path: str | os.PathLike[str]) -> Path:
 
 
 def _parts(model: Any) -> tuple[Any, Any]:
-    """Find the policy, and the statistics that stand before it."""
+    """Find the policy, and the statistics that normalise its observations."""
     statistics = getattr(model, "statistics", None)
     model = getattr(model, "model", model)
     if statistics is None and hasattr(model, "get_vec_normalize_env"):

@@ -3,8 +3,8 @@
 PyTorch's oneDNN kernels are much faster than its default ones on some processors. The setting
 that selects them also permits 16-bit products, which some processors really use. So it is kept
 only where a measurement on this machine finds it both accurate and faster. A virtual machine may
-list instructions that it does not allow, and then the kernel kills the process: a process of its
-own tries it first.
+list instructions that it does not allow, and then the kernel kills the process. So a separate
+process tries it first.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ def _tensors(batch_size: int, units: tuple[int, int]) -> list[th.Tensor]:
 
 
 def _trial(batch_size: int, units: tuple[int, int]) -> str | None:
-    # Why the other kernel cannot be used here at all, found out by a process that may be lost.
+    # Why the other kernel cannot be used here at all: a separate process tries it, and may die.
     code = f"from sb3_torcs import fast_matmul as m; m.run_once({batch_size}, {units})"
     call = [sys.executable, "-c", code]
     try:
@@ -164,7 +164,7 @@ def _relative_error(tensors: list[th.Tensor]) -> float:
 
 
 def _speedup(tensors: list[th.Tensor]) -> float:
-    # Interleaved, so that a change of the processor's clock meets both; the best of each counts.
+    # Interleaved, so that both see a change of the processor's clock rate; the best of each counts.
     best = {"none": float("inf"), "bf16": float("inf")}
     for _ in range(REPEATS):
         for value in best:

@@ -1,6 +1,6 @@
-"""Parameters of a network in one vector, of which files know nothing.
+"""Parameters of a network in one vector, without a change of saved files.
 
-An optimizer's step, a target network's and a running average's are then one operation each, instead
+A step of an optimizer, of a target network or of a running average is then one operation, instead
 of one per matrix and bias.
 """
 
@@ -94,7 +94,7 @@ def keep_plain_state(optimizer: th.optim.Optimizer, network: FlatParameters) -> 
     """
     Let an optimizer write and read its state as the optimizer of the plain network does.
 
-    :param optimizer: of other parameters, if any, and last of the network's vector
+    :param optimizer: its last parameter is the network's vector, after others if there are any
     :param network: to which the vector belongs
     """
     optimizer.register_state_dict_post_hook(lambda _, state: _split(state, network))
@@ -102,7 +102,7 @@ def keep_plain_state(optimizer: th.optim.Optimizer, network: FlatParameters) -> 
 
 
 def _split(state: dict[str, Any], network: FlatParameters) -> dict[str, Any]:
-    """From the vector's to those of its parameters."""
+    """Turn the state of the vector into those of its parameters."""
     (group,) = state["param_groups"]
     *others, last = group["params"]
     entries = {key: entry for key, entry in state["state"].items() if key != last}
@@ -117,7 +117,7 @@ def _split(state: dict[str, Any], network: FlatParameters) -> dict[str, Any]:
 
 
 def _joined(state: dict[str, Any], network: FlatParameters) -> dict[str, Any]:
-    """From those of the parameters to the vector's."""
+    """Turn the states of the parameters into that of the vector."""
     (group,) = state["param_groups"]
     first = len(group["params"]) - len(network.slots)
     entries = {key: entry for key, entry in state["state"].items() if key < first}
@@ -133,7 +133,7 @@ def _joined(state: dict[str, Any], network: FlatParameters) -> dict[str, Any]:
 
 
 def _is_product(name: str, parameter: th.Tensor) -> bool:
-    """Whether a matrix product meets the parameter."""
+    """Whether the parameter is a factor of a matrix product."""
     return parameter.dim() == 2 and not name.endswith(FEW_OUTPUTS)
 
 

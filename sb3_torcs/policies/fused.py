@@ -25,7 +25,7 @@ def array(tensor: th.Tensor) -> np.ndarray:
     Look at a tensor.
 
     :param tensor: on the CPU
-    :return: its numbers, contiguous; the same ones if they are already
+    :return: its numbers, contiguous; a view where they are already
     """
     return np.ascontiguousarray(tensor.detach().numpy())
 
@@ -34,16 +34,16 @@ _spare: dict[tuple[Any, ...], list[np.ndarray]] = {}
 
 
 def _take(*size: int, dtype: Any) -> np.ndarray:
-    """Take what a pass writes to."""
+    """Take a work space for a pass."""
     free = _spare.get((*size, dtype))
     return free.pop() if free else np.empty(size, dtype)
 
 
 def give(work: np.ndarray) -> None:
     """
-    Give back what a pass wrote to, for the next one.
+    Give back the work space of a pass, for the next one.
 
-    :param work: nobody reads it any more
+    :param work: that is not read any more
     """
     _spare.setdefault((*work.shape, work.dtype), []).append(work)
 

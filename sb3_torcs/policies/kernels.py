@@ -1,11 +1,11 @@
 """Passes of the actor and of value functions, forward and backward, compiled by numba.
 
-They compute what the plain networks do, but for rounding, at little more than the cost of the
-matrix products: nothing stands between these but what numba makes of the loops below.
+They compute what the plain networks compute, but for rounding. They cost little more than the
+matrix products, because numba compiles the loops between these.
 
-Each network's parameters stand in one vector: matrices as (inputs, outputs), each followed by its
-bias and, with a layer norm, by the norm's weight and bias; the weights of the last layer as
-(outputs, inputs). A backward pass reads what the forward pass left in ``work``, a vector per
+Each network's parameters are one vector. Its matrices are (inputs, outputs), each followed by its
+bias and, with a layer norm, by the norm's weight and bias. The weights of the last layer are
+(outputs, inputs). A backward pass reads what the forward pass wrote to ``work``, a vector per
 network.
 """
 
@@ -69,7 +69,7 @@ def actor_forward(
     :param norm: with layer norms
     :param features: (batch, features_dim)
     :param gain: (actuators,) before the output function
-    :param work: left for ``actor_backward``
+    :param work: written, for ``actor_backward``
     :param actions: (batch, actuators) in [-1, 1], written
     """
     start, at, x = 0, 0, features
@@ -159,7 +159,7 @@ def values_work(sizes: Any, batch: int) -> int:
 
 @compiled
 def _rooms(work: Any, sizes: Any, batch: int) -> Any:
-    """Look at what the first, the third and the second layer write to."""
+    """View the work space of the first, the third and the second layer."""
     first, second = sizes[2], sizes[3]
     x1, y1, d1, deviation1, at = layer(work, 0, batch, first)
     x3, y3, d3, deviation3, at = layer(work, at, batch, second)
@@ -180,7 +180,7 @@ def values_forward(
     :param norm: with layer norms
     :param features: (batch, features)
     :param actions: (batch, actuators) in [-1, 1]
-    :param work: (networks, ...), left for a backward pass
+    :param work: (networks, ...), written, for a backward pass
     :param values: (networks, batch, 1), written
     """
     n_features, _, first, second = sizes
@@ -269,7 +269,7 @@ def values_backward_to_actions(
     outputs_backward(own[value:], slope, y3, d3, unused)
     weight, bias = matrix(own, joint3, second, second)
     hidden_backward(own[bias:], norm, d3, x3, y3, deviation3, unused)
-    # From the actions on, two matrices follow each other: their product is a small one.
+    # Two matrices follow the actions: multiply them first, since their product is small.
     action2, _ = matrix(own, state2 + (first + 1) * second, n_actions, second)
     both = np.empty((n_actions, second), own.dtype)
     product(action2, False, weight, False, both)
@@ -284,7 +284,7 @@ def difference(
     values: Any, following: Any, rewards: Any, dones: Any, discounts: Any, slope: Any
 ) -> float:
     """
-    Compare values with what came of the actions.
+    Compare values with the rewards and the values of what followed.
 
     :param values: (networks, batch, 1)
     :param following: values of what followed, by the target network
@@ -321,7 +321,7 @@ def adam(
     :param gradient: of the loss
     :param mean: running average of the gradient; overwritten
     :param square: running average of its square; overwritten
-    :param betas: what a step leaves of both averages
+    :param betas: shares of both averages that a step keeps
     :param rate: learning rate, divided by 1 - beta1 ** step
     :param scale: 1 / sqrt(1 - beta2 ** step)
     :param epsilon: added to the root

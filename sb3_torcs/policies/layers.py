@@ -1,7 +1,7 @@
 """Layers of small networks between and around their matrix products, compiled by numba.
 
-What a layer owns begins where ``own`` begins: as a rule the bias, and then the weight and the bias
-of the norm.
+``own`` is the part of a vector that begins with a layer's own parameters: as a rule its bias, then
+the weight and the bias of its norm.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def matrix(vector: Any, start: int, rows: int, columns: int) -> Any:
 @compiled
 def hidden(own: Any, norm: bool, x: Any, y: Any, deviation: Any) -> None:
     """
-    Add the bias, normalise, cut off what is below 0.
+    Add the bias, normalise, and apply ReLU.
 
     :param own: bias, and with a norm its weight and bias
     :param norm: normalise
@@ -219,7 +219,7 @@ def join_backward(slope: Any, actions: Any, gradient: Any) -> None:
 @compiled
 def layer(work: Any, start: int, batch: int, units: int) -> Any:
     """
-    Look at what a hidden layer writes to.
+    View the work space of a hidden layer.
 
     :param work: in which it stands
     :param start: where

@@ -1,8 +1,7 @@
 """Mirror images of drives, with left and right exchanged.
 
-A car is built alike on both sides, so what was driven on a road is also a drive on the road that
-bends the other way. Learning from both gives twice the experience, with every bend in
-both directions.
+A car is the same on both sides, so the mirror image of a drive is a possible drive on the mirrored
+road. Learning from both gives twice the experience, with every bend in both directions.
 """
 
 from __future__ import annotations

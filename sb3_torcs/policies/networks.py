@@ -1,8 +1,8 @@
 """The networks of the original post, as parts of SB3's TD3 policy.
 
-An actor with one output function per actuator, and a critic that the action joins at the second
-hidden layer. :class:`SplitHeads` and :class:`LateActionQ` say what is computed. Where the hidden
-units are ReLU on a processor, :mod:`sb3_torcs.policies.fused` computes it.
+The actor has one output function per actuator. The critic gets the action at the second hidden
+layer. :class:`SplitHeads` and :class:`LateActionQ` define what is computed. Where the hidden units
+are ReLU on the CPU, :mod:`sb3_torcs.policies.fused` computes it.
 """
 
 from __future__ import annotations
@@ -151,7 +151,7 @@ class FlatHeads(FlatParameters):
         return actions
 
     def plain(self) -> SplitHeads:
-        """Return the heads that do the same, each parameter for itself."""
+        """Return heads that compute the same, with separate parameters."""
         heads = copy.deepcopy(self._plain[0])
         heads.load_state_dict(self.state_dict())
         return heads
@@ -200,7 +200,7 @@ class ActorAverage(AveragedModel):
     A running average of an actor's weights. It begins with those of the first update.
 
     :param actor: to average
-    :param decay: what each update leaves of the average, a share
+    :param decay: share of the average that each update keeps
     """
 
     def __init__(self, actor: Actor, decay: float) -> None:
@@ -225,18 +225,18 @@ class ExactDriver(nn.Module):
     A copy of an actor that drives in double precision.
 
     Processors round sums differently, and a car that is steered slightly differently is elsewhere
-    after a lap. Rounded from double to single precision, the actions are the same everywhere.
+    after a lap. Actions in double precision, rounded to single, are the same on all of them.
 
     :param actor: of SB3's DDPG or TD3
-    :param symmetric: drive the mean of what the actor does and the mirror image of what it does in
-        the mirror
+    :param symmetric: drive the mean of the actor's action and the mirror image of its action in
+        the mirrored drive
     """
 
     def __init__(self, actor: Actor, *, symmetric: bool = False) -> None:
         super().__init__()
         self.observation_space = actor.observation_space
         self.normalize_images = actor.normalize_images
-        # Copies of the parts: the actor itself carries its optimizer and the hooks of a noise.
+        # Copy the parts only: the actor itself holds its optimizer and the hooks of a noise.
         self.features_extractor = copy.deepcopy(actor.features_extractor)
         heads = actor.mu.plain() if isinstance(actor.mu, FlatHeads) else copy.deepcopy(actor.mu)
         self.mu = heads.double()
@@ -373,7 +373,7 @@ class LateActionCritic(FlatParameters, ContinuousCritic):
         return value
 
     def plain(self) -> list[LateActionQ]:
-        """Return value functions that do the same, each parameter for itself."""
+        """Return value functions that compute the same, with separate parameters."""
         networks = copy.deepcopy(list(self._plain))
         for network, own in zip(networks, self._own(self.flat.detach()), strict=True):
             network.load_state_dict(own)

@@ -25,14 +25,14 @@ class _LrScale:
                 group["lr"] = rate * group.get("lr_scale", 1.0)
             return super().step(closure)  # type: ignore[misc]
         finally:
-            # SB3 writes the schedule's rate into the groups and logs it: it must find its own.
+            # SB3 writes the schedule's rate into the groups and logs it: restore that value.
             for group, rate in zip(self.param_groups, rates, strict=True):
                 group["lr"] = rate
 
 
 class LeanAdam(_LrScale, th.optim.Adam):
     """
-    ``Adam(fused=True)`` with a kernel of its own on a processor, equal but for rounding.
+    ``Adam(fused=True)`` with our own kernel on the CPU, equal but for rounding.
 
     A group of parameters may have an ``lr_scale``, by which its learning rate is multiplied.
 

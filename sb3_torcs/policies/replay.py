@@ -81,7 +81,7 @@ def _fill(
             last = (row + step) % size
             total += rewards[last, column] * discounts[step]
             steps += 1
-            # Another episode, or the oldest transition, follows on these.
+            # After these follows another episode, or the oldest transition.
             if dones[last, column] or timeouts[last, column] or last == newest:
                 break
         returns[j, 0], factors[j, 0] = total, discounts[steps]

@@ -50,28 +50,28 @@ class SplitHeadPolicy(TD3Policy):
     """
     The networks of the original post for the stock ``DDPG`` and ``TD3``.
 
-    Of the keyword arguments of SB3's ``TD3Policy``, ``net_arch`` is by default ``[300, 600]`` (the
-    critic takes two numbers), and an Adam gets ``fused=True`` unless ``optimizer_kwargs`` choose
-    its kernel themselves, e.g. by ``{"fused": False}``.
+    Two defaults differ from SB3's ``TD3Policy``: ``net_arch`` is ``[300, 600]`` (the critic takes
+    two numbers), and an Adam gets ``fused=True`` unless ``optimizer_kwargs`` choose its kernel,
+    e.g. by ``{"fused": False}``.
 
     :param observation_space: as in ``TD3Policy``
     :param action_space: as in ``TD3Policy``
     :param lr_schedule: as in ``TD3Policy``
-    :param heads: output function of each action, ``"tanh"`` or ``"sigmoid"``; by default that which
-        fits its range: a tanh where it begins below 0, as steering and a signed pedal do, and a
-        sigmoid where it begins at 0, as throttle and brake do
+    :param heads: output function of each action, ``"tanh"`` or ``"sigmoid"``; by default the one
+        for its range: a tanh where the range begins below 0, as for steering and a signed pedal,
+        and a sigmoid where it begins at 0, as for throttle and brake
     :param head_bias: initial value before each output function, by default 0. A sigmoid of 0 is
         half throttle and half brake; ``(0, 0, -2)`` starts with 12 % brake
     :param init_std: standard deviation of the heads' initial weights
     :param layer_norm: normalise the hidden layers of both networks
     :param critic_lr_scale: learning rate of the critic divided by that of the actor
     :param ema_decay: if given, a running average of the actor's weights drives in its place
-        whenever ``predict`` is ``deterministic``, as in evaluations; each update leaves the average
-        this share of itself, e.g. 0.9995. Training is the same to the bit without it
-    :param symmetric: whenever ``predict`` is ``deterministic``, drive the mean of what the actor
-        does and the mirror image of what it does in the mirror, so that a bend to the left is
-        driven like one to the right. For observations whose middle is 0 (no ``VecNormalize``), with
-        range finders that look equally far to both sides. Training is the same to the bit without
+        whenever ``predict`` is ``deterministic``, as in evaluations; each update keeps this share
+        of the average, e.g. 0.9995. Training is the same to the bit without it
+    :param symmetric: whenever ``predict`` is ``deterministic``, drive the mean of the actor's
+        action and the mirror image of its action in the mirrored drive, so that left and right
+        bends are driven alike. It needs observations whose middle is 0 (no ``VecNormalize``), and
+        range finders with the same angles on both sides. Training is the same to the bit without it
     :param fast_matmul: allow another kernel for speed, see
         :mod:`sb3_torcs.policies.fast_matmul`; ``policy.fast_matmul_found`` says what was found
     :param kwargs: the other arguments of ``TD3Policy``
@@ -210,7 +210,7 @@ class SplitHeadPolicy(TD3Policy):
 
     def set_training_mode(self, mode: bool) -> None:
         """
-        Switch between training and prediction, without a walk over the modules if nothing changes.
+        Switch between training and prediction; visit the modules only if something changes.
 
         :param mode: ``True`` to train
         """

@@ -1,4 +1,4 @@
-"""Updates of DDPG and TD3 without PyTorch's record of them: equal but for rounding, and sooner."""
+"""Faster updates of DDPG and TD3, without PyTorch's record of operations; equal but for rounding."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class _Network:
 
 class LeanUpdates:
     """
-    What updates a model in the place of its ``train``.
+    Updates a model in the place of its ``train``.
 
     :param model: for which :func:`is_for` is true
     """
@@ -102,7 +102,7 @@ class LeanUpdates:
         passes: FusedActor = self.actor_target.passes
         actions, work = passes.forward(self.actor_target.vector, following)
         give(work)
-        # Drawn even where nothing is left of it: what is drawn later shall be the same.
+        # Drawn even if it is clipped to 0, so that later random numbers are the same.
         noise = th.empty(actions.shape).normal_(0, self.model.target_policy_noise).numpy()
         clip = self.model.target_noise_clip
         return np.clip(actions + np.clip(noise, -clip, clip), -1, 1) if clip else actions
@@ -123,7 +123,7 @@ class LeanUpdates:
     def _follow(self) -> None:
         """Let the targets, and the average that drives, follow by a share."""
         if self.average is not None:
-            # It begins with the actor of the first update.
+            # The average begins with the actor of the first update.
             kept = self.average.decay if self.average.n_averaged > 0 else 0.0
             kernels.follow(self.average_weights, self.actor.vector, np.float32(1.0 - kept))
             self.average.n_averaged += 1
@@ -137,7 +137,7 @@ def is_for(model: TD3) -> bool:
     Say whether lean updates are equal to those of a model.
 
     :param model: DDPG or TD3 with a :class:`~sb3_torcs.policies.SplitHeadPolicy`
-    :return: not if it is on a GPU, or if its parts are other than the default
+    :return: false on a GPU, or if a part is not the default
     """
     policy = cast(SplitHeadPolicy, model.policy)
     optimizers = policy.actor.optimizer, policy.critic.optimizer

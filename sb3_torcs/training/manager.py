@@ -1,7 +1,7 @@
 """The one place that starts the RL Zoo.
 
-:func:`train` runs the zoo's training and writes files completely or not at all. :func:`build` lets
-the zoo make an algorithm and its environments only, for studies.
+:func:`train` runs the zoo's training and writes each file completely or not at all. For studies,
+:func:`build` lets the zoo make an algorithm and its environments only.
 """
 
 from __future__ import annotations
@@ -135,7 +135,7 @@ class _Threaded(ExperimentManager):
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
         """
-        Make environments as the zoo does; where threads can drive them, in :class:`TorcsVecEnv`.
+        Make environments as the zoo does, but in :class:`TorcsVecEnv` where threads can drive them.
 
         :param n_envs: how many
         :param eval_env: whether they are for evaluations
@@ -157,7 +157,7 @@ class _Threaded(ExperimentManager):
             env.close()
 
     def _on_threads(self) -> bool:
-        """Say whether the entry has nothing that would have to see each timestep of a race."""
+        """Say whether no part of the entry has to see each timestep of a race."""
         world = self.env_kwargs.get("backend", "native")
         return self.env_name.gym_id in OURS and self.env_wrapper is None and world == "native"
 
@@ -173,8 +173,8 @@ class Manager(_Threaded):
     def __init__(self, *arguments: Any, **keywords: Any) -> None:
         log_folder = arguments[3]
         with _alone(Path(log_folder) / arguments[1]):
-            # The zoo numbers a run by the folders that exist: two that begin at the same time would
-            # write into one.
+            # The zoo numbers a run by the folders that exist. Two runs that begin at the same time
+            # would write into one folder.
             super().__init__(*arguments, **keywords)
             self.create_log_folder()
         self.files = WholeFiles(Path(self.save_path))
@@ -185,7 +185,7 @@ class Manager(_Threaded):
         """
         Read the hyperparameters, and keep them for the model's record.
 
-        :return: the same twice, the first to be changed
+        :return: two equal dicts, of which the zoo changes the first
         """
         hyperparameters, said = super().read_hyperparameters()
         self._asked = copy.deepcopy(dict(said))
@@ -257,9 +257,9 @@ class Manager(_Threaded):
 
     def hyperparameters_optimization(self) -> None:
         """
-        Search hyperparameters, which leaves reports and no model.
+        Search hyperparameters. This writes reports and no model.
 
-        :raises InvalidOption: if it ends before any trial does
+        :raises InvalidOption: if the search ends before its first trial
         """
         try:
             super().hyperparameters_optimization()

@@ -81,7 +81,7 @@ def _drive(
             car[WHEELS:BEAMS],
             car[BEAMS:OPPONENTS],
         )
-        car[physics.SCALARS] = 1.0  # nobody else is here
+        car[physics.SCALARS] = 1.0  # there are no opponents in this world
         car[OPPONENTS:] = RANGE
 
 
@@ -89,7 +89,7 @@ class LiteFleet:
     """
     Several worlds that are driven at once, by threads that live as long as this object.
 
-    :param backends: each only once; their cars are kept by this object from now on
+    :param backends: none may be in the list twice; this object keeps their cars from now on
     :param threads: that drive, with the calling one among them
     """
 
