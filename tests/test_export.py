@@ -16,7 +16,7 @@ from stable_baselines3 import DDPG, DQN, PPO, SAC, TD3
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 from toy import ToyRace
 
-from sb3_torcs.agents.models import Driver
+from sb3_torcs.agents.models import ModelDriver
 from sb3_torcs.errors import ModelMismatch, OutputNotWritable, PackageMissing
 from sb3_torcs.noise import SetPointNoise, bind
 from sb3_torcs.policies import export
@@ -88,7 +88,9 @@ def test_the_statistics_of_the_observations_are_in_the_graph(tmp_path):
     env = VecNormalize(race(), clip_obs=0.5)
     model = split_heads(env=env)
     expected, _ = model.predict(env.normalize_obs(OBSERVATIONS), deterministic=True)
-    for number, driver in enumerate((model, Driver(model, env), Driver(model.policy, env))):
+    for number, driver in enumerate(
+        (model, ModelDriver(model, env), ModelDriver(model.policy, env))
+    ):
         found = run(export_actor(driver, tmp_path / f"{number}.onnx"), OBSERVATIONS)
         np.testing.assert_allclose(found, expected, rtol=0.0, atol=ROUNDING)
 

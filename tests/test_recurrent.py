@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import sb3_torcs  # noqa: F401  (registers the environments)
 from sb3_torcs.agents import remote as driving
-from sb3_torcs.agents.models import Driver, load_driver
+from sb3_torcs.agents.models import ModelDriver, load_driver
 from sb3_torcs.callbacks.metrics import drive_lap
 from sb3_torcs.evaluation.protocol import evaluate
 from sb3_torcs.scr.protocol import RESTART
@@ -83,7 +83,7 @@ def test_a_saved_recurrent_model_drives_as_before(recurrent, tmp_path):
 
 def test_normalized_observations_leave_the_state_alone(recurrent):
     statistics = VecNormalize(DummyVecEnv([lite]))
-    driver = Driver(recurrent, statistics)
+    driver = ModelDriver(recurrent, statistics)
     observation = np.full(29, 0.5, np.float32)
     _, state = recurrent.predict(statistics.normalize_obs(observation))
     for start in ([False], [True]):

@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNorm
 
 import sb3_torcs  # noqa: F401  (registers the environments)
 from sb3_torcs.agents import remote as driving
-from sb3_torcs.agents.models import Driver, load_driver
+from sb3_torcs.agents.models import ModelDriver, load_driver
 from sb3_torcs.agents.wrapping import wrapped
 from sb3_torcs.cli import main
 from sb3_torcs.errors import ModelMismatch, ModelNotTrusted, PackageMissing
@@ -60,7 +60,7 @@ def test_stacked_frames_are_those_of_the_training():
     env = VecFrameStack(make_vec_env(lambda: lite(max_episode_steps=STEPS)), 3)
     model = ppo(env)
     with lite(max_episode_steps=STEPS) as bare:
-        races = evaluate(bare, Driver(model, frames=3), episodes=2)
+        races = evaluate(bare, ModelDriver(model, frames=3), episodes=2)
     assert [race.episode_return for race in races] == close_to(returns(model, env))
 
 
@@ -72,13 +72,13 @@ def test_frames_are_stacked_after_they_are_normalized():
     env = VecFrameStack(inner, 3)
     model = ppo(env)
     with lite(max_episode_steps=STEPS) as bare:
-        races = evaluate(bare, Driver(model, inner, 3), episodes=2)
+        races = evaluate(bare, ModelDriver(model, inner, 3), episodes=2)
     assert [race.episode_return for race in races] == close_to(returns(model, env))
 
 
 def test_each_car_of_several_has_its_own_frames():
     """An episode that begins has none yet."""
-    driver = Driver(PPO("MlpPolicy", VecFrameStack(DummyVecEnv([lite] * 2), 2)), frames=2)
+    driver = ModelDriver(PPO("MlpPolicy", VecFrameStack(DummyVecEnv([lite] * 2), 2)), frames=2)
     one, two = np.full((2, 29), 1.0, np.float32), np.full((2, 29), 2.0, np.float32)
     _, state = driver.predict(one, None, np.array([True, True]))
     _, (stack, _) = driver.predict(two, state, np.array([False, True]))
@@ -171,7 +171,7 @@ def test_what_only_ends_or_writes_down_a_training_is_left_out():
     names = ["gymnasium.wrappers.TimeLimit", "sb3_torcs.training.zoo.UninterruptedWorker"]
     entry = {"env_wrapper": [{names[0]: {"max_episode_steps": 3}}, names[1]]}
     with lite(max_episode_steps=9) as env:
-        (race,) = evaluate(wrapped(env, entry), Driver(PPO("MlpPolicy", env, device="cpu")))
+        (race,) = evaluate(wrapped(env, entry), ModelDriver(PPO("MlpPolicy", env, device="cpu")))
     assert race.end == "time_limit"
     assert wrapped(env, {}) is env
 
@@ -196,4 +196,4 @@ def test_a_vector_wrapper_that_passes_on_is_no_obstacle(tmp_path):
         PPO("MlpPolicy", env, device="cpu").save(tmp_path / "m.zip")
         entry = {"vec_env_wrapper": "stable_baselines3.common.vec_env.VecCheckNan"}
         (tmp_path / "config.yml").write_text(yaml.safe_dump(entry))
-        assert isinstance(load_driver(tmp_path / "m.zip", env), Driver)
+        assert isinstance(load_driver(tmp_path / "m.zip", env), ModelDriver)

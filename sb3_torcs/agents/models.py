@@ -35,7 +35,7 @@ from sb3_torcs.errors import (
 from sb3_torcs.sensors import range_finder_angles
 
 __all__ = [
-    "Driver",
+    "ModelDriver",
     "TrainingRecord",
     "check_resumable",
     "check_spaces",
@@ -59,7 +59,7 @@ UNTRUSTED = (
 )
 
 
-class Driver:
+class ModelDriver:
     """
     A saved model that drives, with the statistics of its training's observations.
 
@@ -375,7 +375,7 @@ def load_driver(
     seen = saved_spaces(file, trust=trust)
     check_spaces(file, seen, env, frames)
     model = _as_sb3_does(file, algo or record.algo) if trust else _policy(file, record, algo, seen)
-    return Driver(model, _statistics(file, record, trust), frames)
+    return ModelDriver(model, _statistics(file, record, trust), frames)
 
 
 def _policy(file: Path, record: TrainingRecord, algo: str | None, seen: Spaces) -> Any:

@@ -2,7 +2,7 @@
 
 The RL Zoo's order is: ``env_wrapper``, ``vec_env_wrapper``, ``normalize``, ``frame_stack``. The
 first changes the environment, and is put around it here. The last two change what a model sees, so
-they belong to the driver (:class:`sb3_torcs.agents.models.Driver`).
+they belong to the driver (:class:`sb3_torcs.agents.models.ModelDriver`).
 """
 
 from __future__ import annotations

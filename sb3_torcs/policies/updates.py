@@ -1,4 +1,4 @@
-"""Faster updates of DDPG and TD3, without PyTorch's record of operations; equal but for rounding."""
+"""Faster updates of DDPG and TD3 without PyTorch's record of operations, equal but for rounding."""
 
 from __future__ import annotations
 

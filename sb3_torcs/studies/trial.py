@@ -22,7 +22,7 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_torcs.agents.model_writing import recipe, write_record
-from sb3_torcs.agents.models import BEST_MODEL, Driver, load_driver
+from sb3_torcs.agents.models import BEST_MODEL, ModelDriver, load_driver
 from sb3_torcs.agents.wrapping import frames_of
 from sb3_torcs.car import DEFAULT_CAR
 from sb3_torcs.errors import StudyError
@@ -192,7 +192,7 @@ class Training:
     def _race(self, track: str) -> Episode:
         if track not in self._races:
             self._races[track] = _race_environment(self.trial, track)
-        driver = Driver(self.model, self.normalizer, frames_of(self.trial.entry))
+        driver = ModelDriver(self.model, self.normalizer, frames_of(self.trial.entry))
         (episode,) = evaluate(self._races[track], driver)
         return episode
 
