@@ -392,12 +392,13 @@ WRITTEN = {  # by runs and by people: files that docs name and that are not the 
     "laps.csv", "report.md", "results.csv",
 }  # fmt: skip
 TOOLS_FLAGS = {"--logdir"}  # of TensorBoard
-NOT_IN_THE_PACKAGE = {  # Python's, Gymnasium's, SB3's, the game's
+NOT_IN_THE_PACKAGE = {  # Python's, Gymnasium's, SB3's, PyTorch's, the game's
     "True", "False", "None", "Box", "DDPG", "PPO", "SAC", "TD3", "DummyVecEnv", "SubprocVecEnv",
     "SyncVectorEnv", "RecordVideo", "TimeLimit", "VecNormalize", "Monitor", "MlpPolicy",
     "TD3Policy", "RecurrentPPO", "SCR", "Graphic",
     "Wrapper", "RewardWrapper",
     "learn", "predict", "render", "reset", "env_method", "make", "load", "set_num_threads",
+    "parameters",
 }  # fmt: skip
 FILE = r"[\w./-]+\.(?:py|h|cpp|md|yml|csv|sha256|webp)|(?:sb3_torcs|native|examples|tests)/[\w/]*"
 DOTTED = r"(sb3_torcs(?:\.\w+)+)\b(?!/).*"
