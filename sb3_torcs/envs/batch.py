@@ -42,9 +42,9 @@ class Timestep(NamedTuple):
     terms: list[list[float]]  # of the rewards, in the order of `names`
     names: list[tuple[str, ...]]  # of the terms
     standing: Counts  # (n,) control ticks for which cars had been standing before
-    patience: Counts  # (n,) for which they might
+    patience: Counts  # (n,) control ticks for which they were allowed to stand
     ended: npt.NDArray[np.bool_]  # (n,) also if the race has failed; time limits are not known here
-    failures: dict[int, Exception]  # of races that have not arrived
+    failures: dict[int, Exception]  # the errors of races, by index
 
     def info(self, race: int) -> dict[str, Any]:
         """
@@ -77,7 +77,7 @@ class _Driven:
 
     def step(self, controls: Controls, ticks: int) -> CarState:
         """Return what the world has come to; see :class:`~sb3_torcs.backends.base.Backend`."""
-        del controls, ticks  # the same that were held
+        del controls, ticks  # the world has driven with these
         if self._race in self._timestep.failures:
             raise self._timestep.failures[self._race]
         return car_from_record(self._timestep.after[self._race])

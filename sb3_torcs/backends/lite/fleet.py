@@ -22,7 +22,7 @@ __all__ = ["LiteFleet"]
 Rows = npt.NDArray[np.int64]
 Road = tuple[FloatArray, Edges]
 
-WHEELS = physics.SCALARS + 1  # where they begin in a row, behind the place in the race
+WHEELS = physics.SCALARS + 1  # first column of the wheels, after the place in the race
 BEAMS = WHEELS + 4
 OPPONENTS = BEAMS + 19
 
@@ -102,7 +102,9 @@ class LiteFleet:
         self._gearboxes = np.zeros(len(self._backends), np.int64)
         self._flying = np.zeros(len(self._backends), np.bool_)
         self._threads = threads
-        self._others = ThreadPoolExecutor(max(threads - 1, 1))  # which begins one when it has work
+        self._others = ThreadPoolExecutor(
+            max(threads - 1, 1)
+        )  # its threads begin when they have work
         self._owner = os.getpid()
 
     def step(self, worlds: Rows, controls: FloatArray, ticks: Rows, cars: FloatArray) -> list[int]:
