@@ -102,9 +102,7 @@ class LiteFleet:
         self._gearboxes = np.zeros(len(self._backends), np.int64)
         self._flying = np.zeros(len(self._backends), np.bool_)
         self._threads = threads
-        self._others = ThreadPoolExecutor(
-            max(threads - 1, 1)
-        )  # its threads begin when they have work
+        self._others = ThreadPoolExecutor(max(threads - 1, 1))  # threads begin at need
         self._owner = os.getpid()
 
     def step(self, worlds: Rows, controls: FloatArray, ticks: Rows, cars: FloatArray) -> list[int]:
