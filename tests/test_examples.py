@@ -54,6 +54,12 @@ def test_own_reward_learns_from_it(monkeypatch, capsys):
     assert "the best return by this reward was" in capsys.readouterr().out
 
 
+def test_the_first_lap_is_waited_for_as_long_as_asked(monkeypatch, capsys):
+    words = ["--env", "TorcsLite-v0", "--seeds", "1", "--every", "1", "--limit", "0"]
+    run(monkeypatch, "first_lap.py", *words)
+    assert capsys.readouterr().out == "seed 0: first lap None; 3 laps None\n"
+
+
 def test_the_scripted_driver_laps_a_track(monkeypatch, capsys):
     run(monkeypatch, "scripted_driver.py", "--track", "g-track-1")
     out = capsys.readouterr().out
