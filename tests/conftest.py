@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import signal
+import tempfile
 
 import numpy as np
 import pytest
@@ -41,6 +42,16 @@ def game():
         return find_game()
     except BackendUnavailable as error:
         pytest.fail(f"this test needs the game: {error}")
+
+
+@pytest.fixture
+def nothing_is_left(tmp_path, monkeypatch):
+    """Whatever happens, the private folders of the game are gone afterwards."""
+    private = tmp_path / "private"
+    private.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(private))
+    yield
+    assert list(private.iterdir()) == []
 
 
 @pytest.fixture

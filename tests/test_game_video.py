@@ -7,7 +7,6 @@ import resource
 import signal
 import subprocess
 import sys
-import tempfile
 from itertools import islice
 from pathlib import Path
 from types import SimpleNamespace
@@ -33,15 +32,7 @@ from sb3_torcs.torcs.process import GameProcess
 from sb3_torcs.torcs.race_setup import RaceSetup
 from sb3_torcs.tracks.trial import check_track
 
-
-@pytest.fixture(autouse=True)
-def nothing_is_left(tmp_path, monkeypatch):
-    """Whatever happens, the private folders of the game are gone afterwards."""
-    private = tmp_path / "private"
-    private.mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(private))
-    yield
-    assert list(private.iterdir()) == []
+pytestmark = pytest.mark.usefixtures("nothing_is_left")
 
 
 @pytest.fixture(scope="module")

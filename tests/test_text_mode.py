@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import os
 import re
-import tempfile
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -31,21 +30,13 @@ from sb3_torcs.torcs.race_results import Lap
 from sb3_torcs.torcs.race_setup import RaceSetup
 from sb3_torcs.torcs.results import read_results
 
+pytestmark = pytest.mark.usefixtures("nothing_is_left")
+
 
 @pytest.fixture
 def tracks_that_nobody_reads(monkeypatch):
     """Those of the game that is made here are empty; whether they can be driven is not asked."""
     monkeypatch.setattr(text_mode, "check_track", lambda game, race, file: None)
-
-
-@pytest.fixture(autouse=True)
-def nothing_is_left(tmp_path, monkeypatch):
-    """Whatever happens, the private folders of the game are gone afterwards."""
-    private = tmp_path / "private"
-    private.mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(private))
-    yield
-    assert list(private.iterdir()) == []
 
 
 class TestTheGame:

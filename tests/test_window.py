@@ -8,7 +8,6 @@ import re
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from contextlib import contextmanager
 from pathlib import Path
@@ -26,15 +25,7 @@ from sb3_torcs.torcs.process import GameProcess
 from sb3_torcs.torcs.window import VIEWS, Window, window_arguments, window_files
 from sb3_torcs.tracks.trial import check_track
 
-
-@pytest.fixture(autouse=True)
-def nothing_is_left(tmp_path, monkeypatch):
-    """Whatever happens, the private folders of the game are gone afterwards."""
-    private = tmp_path / "private"
-    private.mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(private))
-    yield
-    assert list(private.iterdir()) == []
+pytestmark = pytest.mark.usefixtures("nothing_is_left")
 
 
 @contextmanager
