@@ -79,7 +79,7 @@ lint: install ## lint code and hyperparameter files
 	@includes="$$($(BIN)/python -c 'import pybind11, sysconfig; \
 	  print("-isystem", pybind11.get_include(), "-isystem", sysconfig.get_path("include"))')"; set -x; \
 	  printf '%s\n' $(filter %.cpp,$(NATIVE)) | \
-	  xargs -P "$$(nproc)" -I FILE $(BIN)/clang-tidy --quiet FILE -- -std=c++17 $$includes
+	  xargs -P "$$(env -u OMP_NUM_THREADS nproc)" -I FILE $(BIN)/clang-tidy --quiet FILE -- -std=c++17 $$includes
 
 type: install ## check types
 	$(BIN)/mypy
