@@ -59,9 +59,7 @@ default for the first is a tuple: hence the empty list. A ``best_lap_time`` of 0
 ENDS = ("off_track", "backwards", "stuck", "damage", "lost", "laps", "time_limit")
 
 BRAKING = 0.05  # [-] of the pedal's travel; networks seldom give exactly 0
-SATURATED = (
-    0.01  # [-] of an actuator's range; an action this near to a limit counts as at the limit
-)
+SATURATED = 0.01  # [-] of an actuator's range: an action so near to a limit counts as at it
 RECORD_EVERY = 100  # calls between two records of the means over timesteps
 TEXT_FORMATS = ("stdout", "log", "json", "csv")  # these formats refuse pictures
 
@@ -96,7 +94,9 @@ class DrivenLine(NamedTuple):
 
 class _FirstOf:
     """
-    A vector of environments and its model, as one of each: all drive, and the first one is told of.
+    The first environment of a vector, for :func:`~sb3_torcs.agents.rollout.drive`.
+
+    The model drives all environments of the vector; only what the first one does is returned.
 
     :param env: the vector
     :param model: drives all of them
