@@ -1,13 +1,19 @@
 """The sensor table, from which all that concerns observations is derived.
 
-Each row is one sensor of the SCR manual (arXiv:1304.1672, table 1). The observation space, the
-encoder, the documentation and the policy's view of the observation are all derived from it.
+Its rows stand in groups, which an environment's ``sensors`` names: ``"base"`` are sensors of the
+SCR manual (arXiv:1304.1672, table 1), and ``"preview"`` is the road ahead. The observation space,
+the encoder, the mirror image, the documentation and the policy's view of the observation are all
+derived from the table.
+
+To add a group, write its rows, put them into :data:`GROUPS`, and its function into ``_WRITERS``.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
+from itertools import accumulate, chain, combinations, pairwise
 from operator import attrgetter
 from typing import Any, Literal, NamedTuple
 
@@ -18,74 +24,143 @@ from numba.extending import overload
 
 from sb3_torcs.car import CarState, FloatArray
 from sb3_torcs.errors import InvalidOption
+from sb3_torcs.tracks.profile import INTERVALS, QUANTITIES, look_ahead
 
 __all__ = [
+    "GROUPS",
     "OBSERVATION_HIGH",
     "OBSERVATION_LOW",
     "OBSERVATION_SIZE",
     "RANGE_FINDERS",
     "SENSORS",
     "Sensor",
+    "SensorsName",
+    "View",
+    "checked_sensors",
     "encode",
     "encode_record",
     "feature_slices",
     "look_both_ways",
     "range_finder_angles",
     "sensor_table",
+    "sensors_of_size",
 ]
+
+SensorsName = Literal["base", "preview"]
+Mirror = Literal["same", "opposite", "reversed", "sides"]
 
 
 class Sensor(NamedTuple):
     """A row of the table. An observation holds ``clip(value, low, high) * scale``."""
 
-    name: str  # the field or property of CarState
-    key: str  # the SCR server's tag
+    name: str  # in the group "base" the field or property of CarState
+    key: str  # the SCR server's tag, empty for what it does not send
     size: int
     unit: str
     low: float  # in the unit
     high: float  # in the unit
     scale: float  # from the unit to the observation's number
+    mirror: Mirror = "same"  # what becomes of its numbers if left and right change places
 
 
 KMH = 3.6  # km/h per m/s
 SCR_RPM = 10.0  # the SCR server reports ten times rad/s as "rpm"
 
 SENSORS = (
-    Sensor("heading_error", "angle", 1, "rad", -math.pi, math.pi, 1.0 / math.pi),
-    Sensor("range_finders", "track", 19, "m", -1.0, 200.0, 1.0 / 200.0),
-    Sensor("track_position", "trackPos", 1, "-", -5.0, 5.0, 1.0),
+    Sensor("heading_error", "angle", 1, "rad", -math.pi, math.pi, 1.0 / math.pi, "opposite"),
+    Sensor("range_finders", "track", 19, "m", -1.0, 200.0, 1.0 / 200.0, "reversed"),
+    Sensor("track_position", "trackPos", 1, "-", -5.0, 5.0, 1.0, "opposite"),
     Sensor("speed_x", "speedX", 1, "m/s", -100.0, 150.0, KMH / 300.0),
-    Sensor("speed_y", "speedY", 1, "m/s", -100.0, 100.0, KMH / 300.0),
+    Sensor("speed_y", "speedY", 1, "m/s", -100.0, 100.0, KMH / 300.0, "opposite"),
     Sensor("speed_z", "speedZ", 1, "m/s", -100.0, 100.0, KMH / 300.0),
-    Sensor("wheel_speeds", "wheelSpinVel", 4, "rad/s", -500.0, 1000.0, 1.0 / 100.0),
+    Sensor("wheel_speeds", "wheelSpinVel", 4, "rad/s", -500.0, 1000.0, 1.0 / 100.0, "sides"),
     Sensor("engine_speed", "rpm", 1, "rad/s", 0.0, 2000.0, SCR_RPM / 10000.0),
 )
 """The 29 numbers of "300 lines of python code to demonstrate DDPG with Keras", in its order."""
 
 OBSERVATION_SIZE = sum(sensor.size for sensor in SENSORS)
 
+PREVIEW = (
+    Sensor("bends_ahead", "", INTERVALS, "-", -1.0, 1.0, 1.0, "opposite"),
+    Sensor("widths_ahead", "", INTERVALS, "m", 0.0, 40.0, 1.0 / 20.0),
+    Sensor("slopes_ahead", "", INTERVALS, "m/m", -0.4, 0.4, 5.0),
+)
+"""The road ahead, in the mean over intervals that are short near the car and long far from it.
+
+Of a bend with the radius R it shows 50 m / (50 m + R), positive to the left. So the whole range
+from a straight to a hairpin lies in (-1, 1), changes smoothly while the car moves on, and goes
+nearly with 1 / speed at which the bend can be driven.
+"""
+USUAL_BEND = 1.0 / 50.0  # [1/m] seen as 0.5
+
+GROUPS: Mapping[SensorsName, tuple[Sensor, ...]] = {"base": SENSORS, "preview": PREVIEW}
+"""The whole table. An observation has the groups that are named, in this order."""
+
+_TABLE = tuple(chain(*GROUPS.values()))
+_ENDS = tuple(accumulate(sum(sensor.size for sensor in rows) for rows in GROUPS.values()))
+_PARTS = dict(zip(GROUPS, map(slice, (0, *_ENDS), _ENDS), strict=True))
+"""The place of each group in an observation with all of them."""
+
 
 def _spread(column: str) -> FloatArray:
-    """One number per element of the observation, from a column of the table."""
+    """One number per element of an observation with all groups, from a column of the table."""
     return np.repeat(
-        [float(getattr(sensor, column)) for sensor in SENSORS],
-        [sensor.size for sensor in SENSORS],
+        [float(getattr(sensor, column)) for sensor in _TABLE],
+        [sensor.size for sensor in _TABLE],
     )
 
 
 _SCALE = _spread("scale")
 _LOW, _HIGH = _spread("low") * _SCALE, _spread("high") * _SCALE
-OBSERVATION_LOW = _LOW.astype(np.float32)
-OBSERVATION_HIGH = _HIGH.astype(np.float32)
+OBSERVATION_LOW = _LOW[:OBSERVATION_SIZE].astype(np.float32)
+OBSERVATION_HIGH = _HIGH[:OBSERVATION_SIZE].astype(np.float32)
 
 
-def feature_slices() -> dict[str, slice]:
-    """Return the slice of each sensor in an observation."""
+def checked_sensors(sensors: Sequence[SensorsName]) -> tuple[SensorsName, ...]:
+    """
+    Check a choice of groups.
+
+    :param sensors: names of groups, ``"base"`` among them
+    :return: the same in the order of the table
+    :raises InvalidOption: if one is unknown or missing
+    """
+    names = () if isinstance(sensors, str) else tuple(sensors)
+    if "base" not in names or len(set(names)) < len(names) or not GROUPS.keys() >= set(names):
+        others = ", ".join(repr(name) for name in GROUPS if name != "base")
+        raise InvalidOption(
+            f"sensors is {sensors!r}; expected a list with 'base', and any of {others}, each once"
+        )
+    return tuple(name for name in GROUPS if name in names)
+
+
+def feature_slices(sensors: Sequence[SensorsName] = ("base",)) -> dict[str, slice]:
+    """
+    Return the slice of each sensor in an observation.
+
+    :param sensors: names of its groups
+    """
     slices, start = {}, 0
-    for sensor in SENSORS:
+    for sensor in chain(*(GROUPS[name] for name in checked_sensors(sensors))):
         slices[sensor.name] = slice(start, start + sensor.size)
         start += sensor.size
     return slices
+
+
+@lru_cache
+def sensors_of_size(size: int) -> tuple[Sensor, ...]:
+    """
+    Find the sensors of observations by their size: no two choices of groups have the same.
+
+    :param size: of an observation
+    :return: its rows of the table; empty if there is no such choice
+    """
+    more = [rows for name, rows in GROUPS.items() if name != "base"]
+    for number in range(len(more) + 1):
+        for chosen in combinations(more, number):
+            rows = tuple(chain(SENSORS, *chosen))
+            if sum(sensor.size for sensor in rows) == size:
+                return rows
+    return ()
 
 
 _measure = attrgetter(*(sensor.name for sensor in SENSORS))
@@ -166,25 +241,121 @@ def encode(car: CarState) -> npt.NDArray[np.float32]:
     :return: (29,) numbers within ``OBSERVATION_LOW`` and ``OBSERVATION_HIGH``
     :raises ValueError: if the size of a sensor differs from the table's
     """
-    observation = np.empty(OBSERVATION_SIZE, np.float32)
+    return _encode(car, OBSERVATION_SIZE)
+
+
+def _encode(car: CarState, size: int) -> npt.NDArray[np.float32]:
+    """Make an observation of a size, of which the group ``"base"`` is filled."""
+    observation = np.empty(size, np.float32)
     done = _scale(_measure(car), observation)
     if done < len(SENSORS):
-        name, size = SENSORS[done].name, SENSORS[done].size
-        raise ValueError(f"{name} has {np.size(getattr(car, name))} numbers, expected {size}")
+        name, expected = SENSORS[done].name, SENSORS[done].size
+        raise ValueError(f"{name} has {np.size(getattr(car, name))} numbers, expected {expected}")
     return observation
 
 
-def sensor_table() -> str:
-    """The table as Markdown, for the documentation."""
+_PREVIEW_AT = _PARTS["preview"].start
+
+
+@njit(cache=True)
+def _scale_preview(
+    sums: FloatArray, step: float, distance: float, numbers: npt.NDArray[np.float32]
+) -> None:
+    """
+    Look ahead, scale and clip.
+
+    :param sums: of the road's profile
+    :param step: of the road's profile [m]
+    :param distance: of the car from the start line [m]
+    :param numbers: of the group ``"preview"``, filled
+    """
+    means = np.empty((QUANTITIES, INTERVALS))
+    look_ahead(sums, step, distance, means)
+    for i in range(INTERVALS):
+        means[0, i] /= abs(means[0, i]) + USUAL_BEND
+    for i in range(means.size):
+        numbers[i] = _scaled(means[i // INTERVALS, i % INTERVALS], _PREVIEW_AT + i)
+
+
+def _write_preview(world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> None:
+    profile = getattr(world, "profile", None) or world.track.profile
+    _scale_preview(profile.sums, profile.step, car.distance_from_start, numbers)
+
+
+_WRITERS: dict[str, Callable[[Any, CarState, npt.NDArray[np.float32]], None]] = {
+    "preview": _write_preview,
+}
+"""Of each group but ``"base"``: fills its numbers, from the world and the state of the car."""
+
+
+class View:
+    """
+    What an agent sees: some groups of the table.
+
+    :param sensors: names of the groups, ``"base"`` among them
+    :raises InvalidOption: if one is unknown or missing
+    """
+
+    def __init__(self, sensors: Sequence[SensorsName] = ("base",)) -> None:
+        self.sensors = checked_sensors(sensors)
+        parts = [_PARTS[name] for name in self.sensors]
+        low, high = ([bound[part] for part in parts] for bound in (_LOW, _HIGH))
+        self.low = np.concatenate(low).astype(np.float32)
+        self.high = np.concatenate(high).astype(np.float32)
+        self.size = len(self.low)
+        ends = accumulate(part.stop - part.start for part in parts)
+        self._more = [
+            (_WRITERS[name], slice(begin, end))
+            for name, (begin, end) in zip(self.sensors[1:], pairwise(ends), strict=True)
+        ]
+
+    @property
+    def has_more(self) -> bool:
+        """Whether there are groups besides ``"base"``."""
+        return len(self._more) > 0
+
+    def encode(self, car: CarState, world: Any) -> npt.NDArray[np.float32]:
+        """
+        Turn a state into an observation.
+
+        :param car: the agent's
+        :param world: in which it drives
+        :return: (size,) numbers within ``low`` and ``high``
+        """
+        observation = _encode(car, self.size)
+        self.add(car, world, observation)
+        return observation
+
+    def add(self, car: CarState, world: Any, observation: npt.NDArray[np.float32]) -> None:
+        """
+        Fill the groups of an observation that come after ``"base"``.
+
+        :param car: the agent's
+        :param world: in which it drives
+        :param observation: (size,)
+        """
+        for write, where in self._more:
+            write(world, car, observation[where])
+
+
+def sensor_table(name: SensorsName = "base") -> str:
+    """
+    A group of the table as Markdown, for the documentation.
+
+    :param name: of the group
+    """
     lines = [
         "| Num | Sensor | SCR | Unit | Min | Max | Scale | Observation min | Observation max |",
         "|----:|--------|-----|------|----:|----:|------:|----:|----:|",
     ]
-    for sensor, where in zip(SENSORS, feature_slices().values(), strict=True):
-        number = f"{where.start}" if sensor.size == 1 else f"{where.start}-{where.stop - 1}"
+    where = feature_slices(("base",) if name == "base" else ("base", name))
+    for sensor in GROUPS[name]:
+        first, end = where[sensor.name].start, where[sensor.name].stop
+        number = f"{first}" if sensor.size == 1 else f"{first}-{end - 1}"
         low, high = sensor.low * sensor.scale, sensor.high * sensor.scale
+        key = f"`{sensor.key}`" if sensor.key else ""
         lines.append(
-            f"| {number} | `{sensor.name}` | `{sensor.key}` | {sensor.unit} | {sensor.low:.5g} | "
+            f"| {number} | `{sensor.name}` | {key} | {sensor.unit} | {sensor.low:.5g} | "
             f"{sensor.high:.5g} | {sensor.scale:.5g} | {low:.5g} | {high:.5g} |"
         )
     return "\n".join(lines)

@@ -29,7 +29,16 @@ def choices():
 
 
 def test_what_is_chosen_by_name_has_a_type():
-    chosen = {"action", "gearbox", "picture", "range_finders", "render_mode", "reward", "start"}
+    chosen = {
+        "action",
+        "gearbox",
+        "picture",
+        "range_finders",
+        "render_mode",
+        "reward",
+        "sensors",
+        "start",
+    }
     of_lite = {case.values[1] for case in choices() if case.values[0] is TorcsLiteEnv}
     of_the_game = {case.values[1] for case in choices() if case.values[0] is TorcsEnv}
     assert of_lite == chosen

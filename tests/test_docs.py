@@ -166,6 +166,7 @@ GENERATED = {
         "arguments": arguments_table,
         "torcs-arguments": torcs_arguments_table,
         "sensors": sensor_table,
+        "preview": functools.partial(sensor_table, "preview"),
         "range-finders": range_finders_table,
         "terms": terms_table,
         "presets": presets_table,

@@ -145,7 +145,7 @@ def test_the_game_s_own_process_is_not_started_with_it(broken, monkeypatch, spoi
 
 def test_known_tracks_need_no_trial(monkeypatch):
     """All that TORCS 1.3.7 brings, by content: what somebody put beside them is tried."""
-    monkeypatch.setattr(track_trial, "_load", lambda *words: pytest.fail("was tried"))
+    monkeypatch.setattr(track_trial, "load_road", lambda *words: pytest.fail("was tried"))
     game = find_game()
     for path in game.tracks().values():
         arguments = {"car": "car1-trb1", "session": "practice", "laps": 0}
@@ -154,8 +154,10 @@ def test_known_tracks_need_no_trial(monkeypatch):
 
 def test_a_content_is_tried_once_for_each_race(broken, monkeypatch):
     tried = []
-    load = track_trial._load
-    monkeypatch.setattr(track_trial, "_load", lambda *words: tried.append(words) or load(*words))
+    load = track_trial.load_road
+    monkeypatch.setattr(
+        track_trial, "load_road", lambda *words: tried.append(words) or load(*words)
+    )
     path = broken("road/g-track-1", (r"\Z", " "))
     for opponents in ((), (), ("bt",)):
         NativeBackend(path, opponents=opponents).close()
@@ -169,7 +171,7 @@ def test_what_is_no_fault_of_the_file_is_not_blamed_on_it(monkeypatch):
     monkeypatch.setattr(sys, "path", [])
     path = find_game().tracks()["road/g-track-1"]
     with pytest.raises(BackendUnavailable, match=r"cannot be tried .*No module named '"):
-        track_trial._load(path, {"entries": []})
+        track_trial.load_road(path, {"entries": []})
 
 
 class TestRoad:

@@ -24,7 +24,8 @@ class Backend(Protocol):
 
     A world that has several tracks has a method ``draw_track(rng)``, which the environment calls
     before it draws a start on that track. One whose car has more or fewer than six forward gears
-    has an attribute ``gears``.
+    has an attribute ``gears``. One whose road has hills has an attribute ``profile``, a
+    :class:`~sb3_torcs.tracks.profile.RoadProfile`.
     """
 
     track: Track

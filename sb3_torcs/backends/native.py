@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Sequence
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import numpy.typing as npt
@@ -30,6 +31,7 @@ from sb3_torcs.torcs.starting_list import AGENT, starting_list
 from sb3_torcs.torcs.track_names import TrackFile, find_track
 from sb3_torcs.torcs.trial_child import encoded
 from sb3_torcs.tracks.catalogue import load_track
+from sb3_torcs.tracks.profile import RoadProfile, game_profile
 from sb3_torcs.tracks.track import Track
 from sb3_torcs.tracks.trial import check_road, engine_arguments, try_race
 
@@ -99,6 +101,10 @@ def make_engine(
     return engine
 
 
+_profiles: WeakKeyDictionary[Track, RoadProfile] = WeakKeyDictionary()
+"""Of tracks that were looked ahead on. Races on one track share it."""
+
+
 class NativeBackend:
     """
     One agent in the real game, alone or among its robots.
@@ -158,6 +164,13 @@ class NativeBackend:
         self._noise = sensor_noise
         self._align()
         self._drive: list[Any] = []  # steps since the reset, for copies
+
+    @cached_property
+    def profile(self) -> RoadProfile:
+        """The road with its hills; see :class:`~sb3_torcs.backends.base.Backend`."""
+        if self.track not in _profiles:
+            _profiles[self.track] = game_profile(self.engine.road())
+        return _profiles[self.track]
 
     def race_setup(self) -> RaceSetup:
         """

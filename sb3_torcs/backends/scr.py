@@ -6,6 +6,7 @@ import os
 from array import array
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,9 @@ from sb3_torcs.torcs.race_setup import SCR_SERVER, RaceSetup
 from sb3_torcs.torcs.starting_list import AGENT, starting_list
 from sb3_torcs.torcs.track_names import find_track
 from sb3_torcs.tracks.catalogue import load_track
+from sb3_torcs.tracks.profile import RoadProfile, game_profile
 from sb3_torcs.tracks.track import Track
+from sb3_torcs.tracks.trial import engine_arguments, load_road
 
 __all__ = ["ScrBackend"]
 
@@ -170,6 +173,13 @@ class ScrBackend:
             self._hang_up()
             raise
         return self._state
+
+    @cached_property
+    def profile(self) -> RoadProfile:
+        """The road with its hills as the engine loads it, since the server does not send them."""
+        path = find_track(self._settings["track"], self._game).path
+        race = engine_arguments(self._game, path, [AGENT], car=self.car, session="practice", laps=0)
+        return game_profile(load_road(path, race))
 
     @property
     def over(self) -> bool:

@@ -11,6 +11,7 @@ from sb3_torcs.actions import GEARS
 from sb3_torcs.backends.base import Backend
 from sb3_torcs.car import CarState, Controls, Start
 from sb3_torcs.errors import InvalidOption
+from sb3_torcs.tracks.profile import RoadProfile
 from sb3_torcs.tracks.track import Track
 
 __all__ = ["SeveralWorlds", "is_several", "one_or_several", "world_index", "worlds_of"]
@@ -58,6 +59,11 @@ class SeveralWorlds:
         self._enter(0)
         self.gears: int = min(getattr(world, "gears", GEARS) for world in self.worlds)
         self.range_finder_angles = self._world.range_finder_angles
+
+    @property
+    def profile(self) -> RoadProfile | None:
+        """The road of the present episode, if it has hills."""
+        return getattr(self._world, "profile", None)
 
     def _enter(self, index: int) -> None:
         self.index = index

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 __all__ = ["add_parser", "run"]
 
-KEPT = ("car", "action_repeat", "range_finders", "action", "gearbox")
+KEPT = ("car", "action_repeat", "range_finders", "sensors", "action", "gearbox")
 """What an agent drives with as in its training, unless the command line says otherwise."""
 
 DESCRIPTION = """\

@@ -21,7 +21,7 @@ from sb3_torcs.envs.compiled import COMPILED, read_actions, value_timesteps
 from sb3_torcs.envs.racing import RacingEnv, racing_info
 from sb3_torcs.errors import CarLost, InvalidAction, InvalidOption
 from sb3_torcs.rewards import Term
-from sb3_torcs.sensors import OBSERVATION_SIZE
+from sb3_torcs.sensors import View
 
 __all__ = ["Batch", "Timestep", "fleet_of"]
 
@@ -37,7 +37,7 @@ class Timestep(NamedTuple):
 
     before: FloatArray  # (n, 82) cars
     after: FloatArray  # (n, 82) cars
-    observations: npt.NDArray[np.float32]  # (n, 29)
+    observations: npt.NDArray[np.float32]  # (n, size)
     rewards: list[float]
     terms: list[list[float]]  # of the rewards, in the order of `names`
     names: list[tuple[str, ...]]  # of the terms
@@ -108,7 +108,13 @@ class Batch:
                 f"the environments read actions in {len(layouts)} ways; give all the same action "
                 "and cars with as many gears"
             )
-        self._layout = self.envs[0].layout
+        views = {env.sensors for env in self.envs}
+        if len(views) > 1:
+            raise InvalidOption(
+                f"the environments have observations of {len(views)} kinds; give all the same "
+                "sensors"
+            )
+        self._layout, self._view = self.envs[0].layout, View(*views)
         self._bounds = np.array(self._layout.low), np.array(self._layout.high)
         worlds = [worlds_of(env.backend) for env in self.envs]
         self._first = np.cumsum([0, *map(len, worlds)])[:-1]
@@ -183,7 +189,7 @@ class Batch:
         failed = self._fleet.step(self._worlds, controls, self._ticks, after)
         after[failed] = before[failed]
         number = len(self.envs)
-        observations = np.empty((number, OBSERVATION_SIZE), np.float32)
+        observations = np.empty((number, self._view.size), np.float32)
         values, ended = np.empty_like(self._weights), np.empty(number, np.bool_)
         standing, patience = self._standing.copy(), self._patience.copy()
         value_timesteps(
@@ -200,6 +206,9 @@ class Batch:
             values,
             ended,
         )
+        if self._view.has_more:
+            for env, row, seen in zip(self.envs, after, observations, strict=True):
+                self._view.add(car_from_record(row), env.backend, seen)
         for race, i, term, weight in self._in_python:
             values[race, i] = self._ask(term, weight, before[race], after[race], controls[race])
         ended[failed] = True

@@ -134,7 +134,7 @@ def value_timesteps(
     :param ticks: (n,) control ticks of a timestep
     :param patience: (n,) control ticks for which cars may stand, changed
     :param standing: (n,) control ticks for which they have been standing, changed
-    :param observations: (n, 29) filled
+    :param observations: (n, size) whose first 29 numbers are filled
     :param terms: (n, k) filled
     :param ended: (n,) filled
     """

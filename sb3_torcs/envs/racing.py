@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, Literal, TypedDict, get_args
 
@@ -31,7 +31,7 @@ from sb3_torcs.car import (
 )
 from sb3_torcs.errors import CarLost, EnvClosed, InvalidOption
 from sb3_torcs.rewards import Reward, RewardChoice
-from sb3_torcs.sensors import OBSERVATION_HIGH, OBSERVATION_LOW, encode
+from sb3_torcs.sensors import SensorsName, View
 from sb3_torcs.tracks.track import Track
 
 __all__ = ["RacingEnv", "RacingInfo", "RenderMode"]
@@ -130,6 +130,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
 
     :param backend: the world
     :param action: which numbers an action has; see :func:`sb3_torcs.actions.action_layout`
+    :param sensors: which groups of sensors an observation has; see :mod:`sb3_torcs.sensors`
     :param reward: a preset, or a mapping from terms to weights; see :mod:`sb3_torcs.rewards`
     :param action_repeat: control ticks of 0.02 s per timestep
     :param start: ``"grid"``, or ``"random"``: anywhere on the track, moving
@@ -145,6 +146,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         backend: Backend,
         *,
         action: ActionName = "pedals",
+        sensors: Sequence[SensorsName] = ("base",),
         reward: RewardChoice = "progress",
         action_repeat: int = 5,
         start: StartName = "grid",
@@ -168,7 +170,8 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
             **self.metadata,
             "render_fps": 1.0 / (action_repeat * CONTROL_TICK),
         }
-        self.observation_space = spaces.Box(OBSERVATION_LOW, OBSERVATION_HIGH, dtype=np.float32)
+        self.view = View(sensors)
+        self.observation_space = spaces.Box(self.view.low, self.view.high, dtype=np.float32)
         self.action = action
         self.layout = action_layout(action, getattr(backend, "gears", GEARS))
         self.action_space = spaces.Box(
@@ -192,6 +195,11 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
     def track(self) -> Track:
         """The track of the present episode."""
         return self.backend.track
+
+    @property
+    def sensors(self) -> tuple[SensorsName, ...]:
+        """Names of the groups of sensors in an observation."""
+        return self.view.sensors
 
     @property
     def range_finder_angles(self) -> FloatArray:
@@ -256,7 +264,8 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         self.standing = 0
         if self.render_mode == "human":
             self.render()
-        return encode(self.car), racing_info(self.car, 0.0, self.reward.nothing(), None)
+        seen = self.view.encode(self.car, self.backend)
+        return seen, racing_info(self.car, 0.0, self.reward.nothing(), None)
 
     def step(
         self, action: npt.NDArray[np.float32]
@@ -324,7 +333,8 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
             self.render()
         truncated = end == "laps"
         terminated = end is not None and not truncated
-        return encode(after), sum(terms.values()), terminated, truncated, info
+        seen = self.view.encode(after, self.backend)
+        return seen, sum(terms.values()), terminated, truncated, info
 
     def render(self) -> npt.NDArray[np.uint8] | None:
         """

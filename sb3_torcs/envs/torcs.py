@@ -18,7 +18,7 @@ from sb3_torcs.car import DEFAULT_CAR, StartName, is_count
 from sb3_torcs.envs.racing import RacingEnv, RenderMode
 from sb3_torcs.errors import EnvClosed, InvalidOption, near_miss
 from sb3_torcs.rewards import RewardChoice
-from sb3_torcs.sensors import RangeFinderName
+from sb3_torcs.sensors import RangeFinderName, SensorsName
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.scenery import find_scenery
 from sb3_torcs.torcs.track_names import find_track
@@ -56,6 +56,8 @@ class TorcsEnv(RacingEnv):
     :param reward: ``"progress"``, ``"blog"``, ``"apex"``, or a dict of weights
     :param action_repeat: control ticks of 0.02 s per timestep
     :param range_finders: ``"scr"``, ``"narrow"``, or 19 angles in degrees, left to right
+    :param sensors: groups of sensors in an observation: ``("base",)``, the 29 numbers, or
+        ``("base", "preview")``, with the road ahead of the car
     :param action: ``"pedals"``: steering, throttle, brake; ``"pedal"``: steering and one signed
         pedal; or ``"manual"``: steering, throttle, brake, gear, clutch
     :param gearbox: ``"automatic"``, by motor speed; or ``"road_speed"``, which does not hunt while
@@ -96,6 +98,7 @@ class TorcsEnv(RacingEnv):
         reward: RewardChoice = "progress",
         action_repeat: int = 5,
         range_finders: RangeFinderName | Sequence[float] = "scr",
+        sensors: Sequence[SensorsName] = ("base",),
         action: ActionName = "pedals",
         gearbox: GearboxName = "automatic",
         start: StartName = "grid",
@@ -146,6 +149,7 @@ class TorcsEnv(RacingEnv):
                 grid_place=grid_place,
             ),
             action=action,
+            sensors=sensors,
             reward=reward,
             action_repeat=action_repeat,
             start=start,

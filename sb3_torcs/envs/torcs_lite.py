@@ -14,7 +14,7 @@ from sb3_torcs.car import DEFAULT_CAR, StartName
 from sb3_torcs.envs.racing import RacingEnv, RenderMode
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.rewards import RewardChoice
-from sb3_torcs.sensors import RangeFinderName
+from sb3_torcs.sensors import RangeFinderName, SensorsName
 from sb3_torcs.tracks.track import Track
 
 __all__ = ["OF_THE_GAME", "TorcsLiteEnv"]
@@ -69,6 +69,8 @@ class TorcsLiteEnv(RacingEnv):
     :param reward: ``"progress"``, ``"blog"``, ``"apex"``, or a dict of weights
     :param action_repeat: control ticks of 0.02 s per timestep
     :param range_finders: ``"scr"``, ``"narrow"``, or 19 angles in degrees, left to right
+    :param sensors: groups of sensors in an observation: ``("base",)``, the 29 numbers, or
+        ``("base", "preview")``, with the road ahead of the car
     :param action: ``"pedals"``: steering, throttle, brake; ``"pedal"``: steering and one signed
         pedal; or ``"manual"``: steering, throttle, brake, gear, clutch
     :param gearbox: ``"automatic"``, by motor speed; or ``"road_speed"``, which does not hunt while
@@ -88,6 +90,7 @@ class TorcsLiteEnv(RacingEnv):
         reward: RewardChoice = "progress",
         action_repeat: int = 5,
         range_finders: RangeFinderName | Sequence[float] = "scr",
+        sensors: Sequence[SensorsName] = ("base",),
         action: ActionName = "pedals",
         gearbox: GearboxName = "automatic",
         start: StartName = "grid",
@@ -114,6 +117,7 @@ class TorcsLiteEnv(RacingEnv):
         super().__init__(
             one_or_several(make, track, car),
             action=action,
+            sensors=sensors,
             reward=reward,
             action_repeat=action_repeat,
             start=start,

@@ -21,7 +21,6 @@ from sb3_torcs.car import CarState, is_count
 from sb3_torcs.envs.racing import Observation
 from sb3_torcs.envs.torcs import TorcsEnv
 from sb3_torcs.errors import EnvClosed, InvalidAction, InvalidOption
-from sb3_torcs.sensors import OBSERVATION_SIZE
 
 __all__ = ["TorcsVectorEnv"]
 
@@ -29,7 +28,7 @@ NO_LIMIT = -1  # as in gym.make
 
 Answer = tuple[Observation, float, bool, bool, dict[str, Any]]
 Answers = tuple[
-    npt.NDArray[np.float32],  # (n, 29) observations
+    npt.NDArray[np.float32],  # (n, size) observations
     npt.NDArray[np.float64],  # (n,) rewards
     npt.NDArray[np.bool_],  # (n,) terminated
     npt.NDArray[np.bool_],  # (n,) truncated
@@ -140,7 +139,7 @@ class TorcsVectorEnv(SyncVectorEnv):
     def _collect(self, anew: list[bool]) -> Answers:
         """Take the cars in order; what is done here is done while later ones still drive."""
         number = self.num_envs
-        observations = np.empty((number, OBSERVATION_SIZE), np.float32)
+        observations = np.empty((number, self.envs[0].view.size), np.float32)
         rewards = np.zeros(number)
         terminated, truncated = np.zeros(number, np.bool_), np.zeros(number, np.bool_)
         infos: dict[str, Any] = {}

@@ -20,6 +20,11 @@ Widths ground(const Segment& segment, Side side) {
     return widths;
 }
 
+// Of the axis, between two corners of a segment.
+double height(const Segment& segment, Vertex left, Vertex right) {
+    return 0.5 * (double(segment.vertex[left].z) + segment.vertex[right].z);
+}
+
 double curvature(const Segment& segment) {
     if (segment.type == STRAIGHT) return 0.0;
     return (segment.type == LEFT_TURN ? segment.arc : -segment.arc) / segment.length;
@@ -38,7 +43,9 @@ std::vector<RoadSegment> road_of(const TrackData& track) {
                         segment->surface->friction, segment->surface->rolling_resistance,
                         segment->barrier[LEFT]->surface->friction,
                         segment->barrier[RIGHT]->surface->friction,
-                        double(segment->from_start) + segment->length});
+                        double(segment->from_start) + segment->length,
+                        height(*segment, START_LEFT, START_RIGHT),
+                        height(*segment, END_LEFT, END_RIGHT)});
     }
     return road;
 }

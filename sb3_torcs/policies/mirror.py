@@ -6,56 +6,57 @@ road. Learning from both gives twice the experience, with every bend in both dir
 
 from __future__ import annotations
 
-import numpy as np
+from functools import lru_cache
+
 import torch as th
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
-from sb3_torcs.sensors import OBSERVATION_SIZE, feature_slices
+from sb3_torcs.sensors import Sensor, sensors_of_size
 
 __all__ = [
-    "MIRROR_ORDER",
-    "MIRROR_SIGNS",
     "mirror_actions",
     "mirror_half",
+    "mirror_image",
     "mirror_observations",
 ]
-
-SIDED = ("heading_error", "track_position", "speed_y")
-"""Sensors that are positive on one side."""
 
 OTHER_WHEEL = (1, 0, 3, 2)
 """Front right and left, rear right and left change places."""
 
 
-def _order() -> th.Tensor:
-    """Return the index in an observation of each number of its mirror image."""
-    order, where = np.arange(OBSERVATION_SIZE), feature_slices()
-    beams, wheels = where["range_finders"], where["wheel_speeds"]
-    order[beams] = order[beams][::-1]
-    order[wheels] = order[wheels][list(OTHER_WHEEL)]
-    return th.from_numpy(order)
+def _order(sensor: Sensor) -> list[int]:
+    """Return the index among a sensor's numbers of each number of its mirror image."""
+    order = list(range(sensor.size))
+    if sensor.mirror == "reversed":
+        return order[::-1]
+    return list(OTHER_WHEEL) if sensor.mirror == "sides" else order
 
 
-def _signs() -> th.Tensor:
-    """Return the sign of each number of a mirrored observation."""
-    signs, where = np.ones(OBSERVATION_SIZE, np.float32), feature_slices()
-    for name in SIDED:
-        signs[where[name]] = -1.0
-    return th.from_numpy(signs)
+@lru_cache
+def mirror_image(size: int) -> tuple[th.Tensor, th.Tensor]:
+    """
+    Describe the mirror image of observations.
 
-
-MIRROR_ORDER, MIRROR_SIGNS = _order(), _signs()
+    :param size: of one, by which its sensors are known
+    :return: the index in an observation of each number of the image, and its sign there
+    """
+    order: list[int] = []
+    signs: list[float] = []
+    for sensor in sensors_of_size(size):
+        order += [len(order) + index for index in _order(sensor)]
+        signs += [-1.0 if sensor.mirror == "opposite" else 1.0] * sensor.size
+    return th.tensor(order), th.tensor(signs, dtype=th.float32)
 
 
 def mirror_observations(observations: th.Tensor) -> th.Tensor:
     """
     Mirror observations. Mirroring twice gives the same observations.
 
-    :param observations: (n, 29) with range finders that look equally far to both sides
-    :return: (n, 29)
+    :param observations: (n, size) with range finders that look equally far to both sides
+    :return: (n, size)
     """
-    device = observations.device
-    return observations[:, MIRROR_ORDER.to(device)] * MIRROR_SIGNS.to(device)
+    order, signs = (part.to(observations.device) for part in mirror_image(observations.shape[1]))
+    return observations[:, order] * signs
 
 
 def mirror_actions(actions: th.Tensor) -> th.Tensor:

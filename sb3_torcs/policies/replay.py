@@ -15,11 +15,10 @@ from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_torcs.policies.mirror import MIRROR_ORDER, MIRROR_SIGNS, mirror_half
+from sb3_torcs.policies.mirror import mirror_half, mirror_image
+from sb3_torcs.sensors import sensors_of_size
 
 __all__ = ["sample_mirrored"]
-
-ORDER, SIGNS = MIRROR_ORDER.numpy(), MIRROR_SIGNS.numpy()
 
 
 def sample_mirrored(
@@ -40,10 +39,12 @@ def sample_mirrored(
     upper = buffer.buffer_size if buffer.full else buffer.pos
     rows = np.random.randint(0, upper, size=batch_size)  # noqa: NPY002  as SB3 draws
     columns = np.random.randint(0, buffer.n_envs, size=batch_size)  # noqa: NPY002
-    widths = (ORDER.size, buffer.action_dim, ORDER.size, 1, 1, 1)
+    order, signs = (part.numpy() for part in mirror_image(*buffer.obs_shape))
+    widths = (order.size, buffer.action_dim, order.size, 1, 1, 1)
     batch = tuple(np.empty((batch_size, width), np.float32) for width in widths)
     _fill(
-        batch, rows, columns, batch_size // 2, (buffer.pos - 1) % buffer.buffer_size,
+        batch, rows, columns, batch_size // 2, order, signs,
+        (buffer.pos - 1) % buffer.buffer_size,
         gamma ** np.arange(n_steps + 1, dtype=np.float32),
         (buffer.observations, buffer.actions, buffer.next_observations),
         (buffer.dones, buffer.timeouts, buffer.rewards),
@@ -61,14 +62,15 @@ def _is_stock(buffer: ReplayBuffer) -> bool:
         and not buffer.optimize_memory_usage
         and th.device(buffer.device).type == "cpu"
         and buffer.observations.dtype == buffer.actions.dtype == np.float32
-        and buffer.obs_shape == ORDER.shape
+        and len(buffer.obs_shape) == 1
+        and sensors_of_size(*buffer.obs_shape) != ()
     )
 
 
 @njit(cache=True)
 def _fill(
-    batch: Any, rows: Any, columns: Any, half: int, newest: int, discounts: Any, seen: Any,
-    scalars: Any,
+    batch: Any, rows: Any, columns: Any, half: int, order: Any, signs: Any, newest: int,
+    discounts: Any, seen: Any, scalars: Any,
 ) -> None:  # fmt: skip
     """Write transitions and their returns; the first half mirrored."""
     observations, actions, next_observations, ended, returns, factors = batch
@@ -87,9 +89,9 @@ def _fill(
         returns[j, 0], factors[j, 0] = total, discounts[steps]
         ended[j, 0] = dones[last, column] * (np.float32(1) - timeouts[last, column])
         actions[j] = seen[1][row, column]
-        for i in range(ORDER.size):
-            k = ORDER[i] if j < half else i
-            sign = SIGNS[i] if j < half else np.float32(1)
+        for i in range(order.size):
+            k = order[i] if j < half else i
+            sign = signs[i] if j < half else np.float32(1)
             observations[j, i] = seen[0][row, column, k] * sign
             next_observations[j, i] = seen[2][last, column, k] * sign
         if j < half:

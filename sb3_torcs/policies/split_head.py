@@ -35,7 +35,7 @@ from sb3_torcs.policies.networks import (
     SplitHeadActor,
 )
 from sb3_torcs.policies.optimizers import LeanAdam, with_lr_scale
-from sb3_torcs.sensors import OBSERVATION_SIZE
+from sb3_torcs.sensors import sensors_of_size
 
 __all__ = ["SplitHeadPolicy", "export_actor"]
 
@@ -271,9 +271,9 @@ def _check_symmetric(
 ) -> None:
     if not isinstance(symmetric, bool):
         raise InvalidOption(f"symmetric={symmetric!r}: pass True or False")
-    ours = observation_space.shape == (OBSERVATION_SIZE,) and layout_of_width(
-        get_action_dim(action_space)
-    )
+    shape = observation_space.shape or ()
+    known = len(shape) == 1 and sensors_of_size(*shape)
+    ours = known and layout_of_width(get_action_dim(action_space))
     if symmetric and not ours:
         raise InvalidOption(
             "symmetric=True mirrors the sensors and actuators of Torcs-v0 and TorcsLite-v0, not "

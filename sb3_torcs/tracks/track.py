@@ -17,6 +17,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from sb3_torcs.car import FloatArray
+from sb3_torcs.tracks.profile import RoadProfile, road_profile
 
 __all__ = ["Grid", "Segment", "Surface", "Track", "TrackSummary", "closed", "closing_gap"]
 
@@ -167,6 +168,14 @@ class Track:
             pose = _advance(pose, s.length, s.curvature)
         table.setflags(write=False)
         return table
+
+    @functools.cached_property
+    def profile(self) -> RoadProfile:
+        """The road ahead of any place. The track is a plane, so its slope is 0."""
+        table = self.table
+        widths = 0.5 * (table[:, WIDTH_START] + table[:, WIDTH_END])
+        level = np.zeros(len(table))
+        return road_profile(table[:, LENGTH], table[:, CURVATURE], widths, level)
 
     @functools.cached_property
     def _starts(self) -> list[float]:

@@ -31,7 +31,7 @@ from sb3_torcs.torcs.trial_child import ANSWER, REFUSED
 from sb3_torcs.tracks.catalogue import load_track
 from sb3_torcs.tracks.track import Track
 
-__all__ = ["check_road", "check_track", "engine_arguments", "try_race"]
+__all__ = ["check_road", "check_track", "engine_arguments", "load_road", "try_race"]
 
 KNOWN_TRACKS = Path(__file__).parents[1] / "data" / "known_tracks.sha256"
 CHILD = (
@@ -54,6 +54,7 @@ COLUMNS = (  # of the engine's road
     "friction", "rolling resistance", "friction of the left wall", "friction of the right wall",
     "place of the end",
 )  # fmt: skip
+HEIGHTS = 2  # columns after these, which are not read from files
 ROUNDING = 1e-4  # [-] the game computes in single precision; its own tracks differ by 1e-5
 
 _tried: set[Any] = set()
@@ -104,7 +105,7 @@ def try_race(path: Path, race: dict[str, Any]) -> None:
     key = (content, json.dumps(race))
     if _known_digests().issuperset(content) or key in _tried or not _engine_is_built():
         return
-    check_road(path, _load(path, race))
+    check_road(path, load_road(path, race))
     _tried.add(key)
 
 
@@ -113,7 +114,7 @@ def check_road(path: Path, road: FloatArray) -> None:
     Compare the road that the game has made with the one that was read.
 
     :param path: of the track's file
-    :param road: (n_segments, 13) from the engine
+    :param road: (n_segments, 15) from the engine
     :raises TrackFileError: if they differ, naming where
     """
     read = _as_read(load_track(path))
@@ -122,6 +123,7 @@ def check_road(path: Path, road: FloatArray) -> None:
             f"{path}: the game lays {len(road)} segments of {road[:, 0].sum():.1f} m in all, and "
             f"its file says {len(read)} of {read[:, 0].sum():.1f} m; {ADVICE}"
         )
+    road = road[:, : len(COLUMNS)]
     differ = np.abs(road - read) > ROUNDING * np.maximum(1.0, np.abs(read))
     if differ.any():
         row, column = np.argwhere(differ)[0]
@@ -149,13 +151,14 @@ def _as_read(track: Track) -> FloatArray:
     )
 
 
-def _load(path: Path, race: dict[str, Any]) -> FloatArray:
+def load_road(path: Path, race: dict[str, Any]) -> FloatArray:
     """
     Load a race in a process of its own.
 
     :param path: of the track's file
     :param race: from :func:`engine_arguments`
-    :return: its road
+    :return: (n_segments, 15) its road, as of the engine
+    :raises TrackFileError: if the game's loader crashes or hangs
     """
     race = {**race, "angles": [0.0] * RANGE_FINDERS}
     robots = len(race["entries"]) - 1
@@ -204,7 +207,7 @@ def _verdict(path: Path, status: int, output: bytes, words: bytes) -> FloatArray
     if status:
         last = words.decode(errors="replace").strip().splitlines()[-1:]
         raise BackendUnavailable(f"{path} cannot be tried in another process: {''.join(last)}")
-    return np.frombuffer(output).reshape(-1, len(COLUMNS))
+    return np.frombuffer(output).reshape(-1, len(COLUMNS) + HEIGHTS)
 
 
 @lru_cache

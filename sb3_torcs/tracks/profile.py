@@ -1,0 +1,99 @@
+"""The road as a profile along its length, from which a car's view ahead is read.
+
+A world makes the profile of its road once. Looking ahead then costs two numbers of a table per
+distance, wherever the car is.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from sb3_torcs.car import FloatArray
+
+__all__ = [
+    "DISTANCES",
+    "INTERVALS",
+    "QUANTITIES",
+    "RoadProfile",
+    "game_profile",
+    "look_ahead",
+    "road_profile",
+]
+
+DISTANCES = (0, 5, 10, 20, 30, 40, 55, 75, 100, 130, 170, 220, 290, 400)
+"""[m] ahead of the car, at which the intervals of a preview meet: short ones near the car."""
+INTERVALS = len(DISTANCES) - 1
+QUANTITIES = 3  # curvature, width, slope
+
+STEP = 1.0  # [m] between the places of a profile, about
+_AHEAD = np.array(DISTANCES, np.float64)
+
+
+class RoadProfile(NamedTuple):
+    """What a road has added up to since the start line, at places at equal distances."""
+
+    sums: FloatArray  # (n + 1, 3) its turn [rad], area [m²] and climb [m]
+    step: float  # [m] from one place to the next
+
+
+def road_profile(
+    lengths: FloatArray, curvatures: FloatArray, widths: FloatArray, climbs: FloatArray
+) -> RoadProfile:
+    """
+    Make the profile of a closed road.
+
+    :param lengths: (n,) of its segments [m], from the start line on
+    :param curvatures: (n,) of the axis [1/m], left positive
+    :param widths: (n,) in the mean [m]
+    :param climbs: (n,) by how much their ends lie higher than their beginnings [m]
+    :return: the profile
+    """
+    ends = np.concatenate(([0.0], np.cumsum(lengths)))
+    number = max(round(ends[-1] / STEP), 1)
+    places = np.linspace(0.0, ends[-1], number + 1)
+    added = (curvatures * lengths, widths * lengths, climbs)
+    sums = [np.interp(places, ends, np.concatenate(([0.0], np.cumsum(row)))) for row in added]
+    table = np.stack(sums, axis=1)
+    table.setflags(write=False)
+    return RoadProfile(table, float(ends[-1]) / number)
+
+
+def game_profile(road: FloatArray) -> RoadProfile:
+    """
+    Make the profile of a road as the game has laid it, with its hills.
+
+    :param road: (n_segments, 15) from the engine
+    """
+    length, curvature, width, end_width, *_, height, end_height = road.T
+    return road_profile(length, curvature, 0.5 * (width + end_width), end_height - height)
+
+
+@njit(cache=True)
+def look_ahead(sums: FloatArray, step: float, distance: float, means: FloatArray) -> None:
+    """
+    Take the means of curvature, width and slope over the intervals ahead of a car.
+
+    :param sums: of a :class:`RoadProfile`
+    :param step: of it [m]
+    :param distance: of the car from the start line [m]
+    :param means: (3, intervals) filled: curvature [1/m], width [m] and slope [m/m]
+    """
+    places = len(sums) - 1
+    for i in range(len(_AHEAD)):
+        where = (distance + _AHEAD[i]) / step
+        laps = math.floor(where / places)
+        where -= laps * places
+        place = min(int(where), places - 1)
+        share = where - place
+        for quantity in range(QUANTITIES):
+            here, there = sums[place, quantity], sums[place + 1, quantity]
+            total = laps * sums[places, quantity] + here + share * (there - here)
+            if i > 0:
+                means[quantity, i - 1] += total
+                means[quantity, i - 1] /= _AHEAD[i] - _AHEAD[i - 1]
+            if i < len(_AHEAD) - 1:
+                means[quantity, i] = -total

@@ -1,0 +1,241 @@
+"""The road ahead as numbers: what they are, and that everybody sees the same."""
+
+from __future__ import annotations
+
+import contextlib
+from itertools import chain, combinations
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from conftest import ScriptedBackend, car_state
+from stable_baselines3 import DDPG
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+import sb3_torcs  # noqa: F401  # registers the ids
+from sb3_torcs.agents.scripted import ScriptedDriver
+from sb3_torcs.callbacks import MirrorCallback
+from sb3_torcs.envs.batch import Batch
+from sb3_torcs.envs.racing import RacingEnv
+from sb3_torcs.errors import InvalidOption
+from sb3_torcs.evaluation.protocol import race_environment
+from sb3_torcs.policies.mirror import mirror_observations
+from sb3_torcs.sensors import GROUPS, View, feature_slices, sensors_of_size
+from sb3_torcs.tracks.profile import DISTANCES, INTERVALS, look_ahead, road_profile
+from sb3_torcs.tracks.track import Segment, Track
+from sb3_torcs.vec_env import TorcsVecEnv
+
+BOTH = ("base", "preview")
+BENDS, WIDTHS, SLOPES = list(feature_slices(BOTH).values())[-3:]
+ENDS = np.array(DISTANCES[1:])
+
+
+@pytest.fixture(params=["TorcsLite-v0", "Torcs-v0"])
+def env_id(request):
+    if request.param == "Torcs-v0":
+        request.getfixturevalue("game")
+    return request.param
+
+
+def ahead(profile, distance):
+    """Mean curvatures, widths and slopes."""
+    means = np.empty((3, INTERVALS))
+    look_ahead(profile.sums, profile.step, distance, means)
+    return means
+
+
+def seen(track, distance):
+    return View(BOTH).encode(car_state(distance_from_start=distance), ScriptedBackend(track))
+
+
+# ------------------------------------------------------------------------------- what they are
+
+
+def test_the_numbers_are_means_over_intervals_that_begin_at_the_car():
+    """A kilometre: straight and wide, then a bend, then another one that climbs."""
+    road = ([300.0, 500.0, 200.0], [0.0, 0.01, -0.02], [12.0, 8.0, 8.0], [0.0, 0.0, 10.0])
+    curvature, width, slope = ahead(road_profile(*map(np.array, road)), 230.0)
+    before = ENDS <= 70.0
+    assert np.allclose(curvature[before], 0.0, atol=1e-15)
+    assert curvature[6] == pytest.approx(0.01 * 5.0 / 20.0)  # 55 to 75 m ahead: 5 m of the bend
+    assert np.allclose(curvature[7:], 0.01)
+    assert width[6] == pytest.approx(12.0 - 4.0 * 5.0 / 20.0)
+    assert np.allclose(width[before], 12.0)
+    assert np.allclose(slope, 0.0)
+    assert np.allclose(ahead(road_profile(*map(np.array, road)), 800.0)[2, :10], 0.05)
+
+
+def test_the_view_goes_on_across_the_start_line(oval):
+    """Also if the road is shorter than the view is far."""
+    whole = oval.length
+    assert np.allclose(ahead(oval.profile, whole - 1e-9), ahead(oval.profile, 0.0))
+    lap = road_profile(*map(np.array, ([90.0], [2.0 * np.pi / 90.0], [10.0], [0.0])))
+    assert np.allclose(ahead(lap, 45.0)[0], 2.0 * np.pi / 90.0)
+
+
+def test_a_bend_is_seen_by_its_radius(oval):
+    """50 m to the left is 0.5."""
+    observation = seen(oval, 301.0)
+    assert np.allclose(observation[BENDS][:9], 0.5)
+    assert np.allclose(observation[WIDTHS], 0.5)
+    assert np.array_equal(observation[SLOPES], np.zeros(INTERVALS))
+
+
+def test_the_numbers_change_smoothly_while_the_car_moves_on(oval):
+    """By no more in 10 cm than its share of the shortest interval."""
+    rows = np.array([seen(oval, d)[29:] for d in np.arange(0.0, oval.length, 0.1)])
+    assert np.abs(np.diff(rows, axis=0)).max() < 0.04
+
+
+def test_the_game_has_hills_and_the_fallback_none(game):
+    """What climbs comes down again, and the axis turns once around."""
+    del game
+    with contextlib.closing(gym.make("Torcs-v0", track="alpine-2", sensors=BOTH)) as env:
+        observation, _ = env.reset(seed=0, options={"distance": 1000.0})
+        profile = env.unwrapped.backend.profile
+    assert np.abs(observation[SLOPES]).max() > 0.05
+    assert profile.sums[-1, 2] == pytest.approx(0.0, abs=0.01)
+    assert profile.sums[-1, 0] == pytest.approx(2.0 * np.pi, abs=1e-3)
+    with contextlib.closing(gym.make("TorcsLite-v0", track="alpine-2", sensors=BOTH)) as env:
+        flat, _ = env.reset(seed=0, options={"distance": 1000.0})
+    assert not flat[SLOPES].any()
+    np.testing.assert_allclose(flat[BENDS], observation[BENDS], atol=1e-3)
+
+
+# -------------------------------------------------------------------------- everybody sees it so
+
+
+def test_the_first_numbers_are_those_of_the_default(env_id):
+    with gym.make(env_id) as plain, gym.make(env_id, sensors=BOTH) as more:
+        assert more.observation_space.shape == (68,)
+        driver, action = ScriptedDriver(), None
+        for step in range(50):
+            if action is None:
+                one, other = plain.reset(seed=3)[0], more.reset(seed=3)[0]
+            else:
+                one, other = plain.step(action)[0], more.step(action)[0]
+            assert one.tobytes() == other[:29].tobytes(), step
+            assert more.observation_space.contains(other)
+            action, _ = driver.predict(other)
+
+
+@pytest.mark.parametrize("track", ["aalborg", ["alpine-1", "g-track-1"], "random"])
+def test_races_driven_at_once_see_what_single_ones_see(env_id, track):
+    """To the bit, across the ends of episodes; a random track has a new road each time."""
+    if env_id == "Torcs-v0" and track == "random":
+        track = ["wheel-1", "e-track-5"]
+    options = {"track": track, "start": "random", "max_episode_steps": 12, "sensors": BOTH}
+    ours = TorcsVecEnv(3, env_id=env_id, **options)
+    theirs = DummyVecEnv([lambda: Monitor(gym.make(env_id, **options))] * 3)
+    for envs in (ours, theirs):
+        envs.seed(1)
+        envs.action_space.seed(1)
+    assert ours.reset().tobytes() == theirs.reset().tobytes()
+    for step in range(40):
+        actions = np.array([theirs.action_space.sample() for _ in range(3)])
+        (one, *_, infos), (other, *_, others) = ours.step(actions), theirs.step(actions)
+        assert one.tobytes() == other.tobytes(), step
+        for info, same in zip(infos, others, strict=True):
+            last, expected = info.get("terminal_observation"), same.get("terminal_observation")
+            assert (last is None) == (expected is None)
+            assert last is None or last.tobytes() == expected.tobytes()
+    ours.close()
+    theirs.close()
+
+
+@pytest.mark.usefixtures("game")
+def test_a_vector_of_gymnasium_sees_the_same():
+    options = {"sensors": BOTH, "start": "random"}
+    together = gym.make_vec("Torcs-v0", num_envs=2, **options)
+    alone = gym.make("Torcs-v0", **options)
+    seen, _ = together.reset(seed=[4, 5])
+    action = np.array([0.1, 1.0, 0.0], np.float32)
+    expected, _ = alone.reset(seed=5)
+    assert seen.shape == (2, 68)
+    for _ in range(5):
+        assert seen[1].tobytes() == expected.tobytes()
+        seen, expected = together.step([action, action])[0], alone.step(action)[0]
+    together.close()
+    alone.close()
+
+
+@pytest.mark.usefixtures("game")
+def test_a_client_of_the_game_sees_the_same():
+    """But for the six digits of the place that the server sends."""
+    with (
+        contextlib.closing(gym.make("Torcs-v0", track="alpine-2", sensors=BOTH)) as ours,
+        contextlib.closing(
+            gym.make("Torcs-v0", track="alpine-2", sensors=BOTH, backend="scr")
+        ) as client,
+    ):
+        drives = []
+        for env in (ours, client):
+            rows = [env.reset(seed=0)[0]]
+            rows += [env.step(np.array([0.0, 1.0, 0.0], np.float32))[0] for _ in range(10)]
+            drives.append(np.array(rows))
+    np.testing.assert_allclose(drives[0], drives[1], atol=1e-3)
+
+
+def test_races_with_different_sensors_cannot_be_driven_at_once():
+    envs = [gym.make("TorcsLite-v0", sensors=sensors) for sensors in (BOTH, ("base",))]
+    with pytest.raises(InvalidOption, match="give all the same sensors"):
+        Batch([env.unwrapped for env in envs])
+
+
+# --------------------------------------------------------------------------- naming, mirror, file
+
+
+@pytest.mark.parametrize(
+    "choice", ["base", (), ("preview",), ("base", "previews"), ("base", "base")]
+)
+def test_other_sensors_are_refused(choice):
+    with pytest.raises(InvalidOption, match=r"expected a list with 'base', and any of 'preview'"):
+        gym.make("TorcsLite-v0", sensors=choice)
+
+
+def test_the_order_of_names_does_not_matter(oval):
+    env = RacingEnv(ScriptedBackend(oval), sensors=["preview", "base"])
+    assert env.sensors == BOTH
+
+
+def test_each_choice_of_groups_has_a_size_of_its_own():
+    """So a policy knows from the size of an observation how to mirror it."""
+    more = [rows for name, rows in GROUPS.items() if name != "base"]
+    choices = chain.from_iterable(combinations(more, n) for n in range(len(more) + 1))
+    sizes = [sum(s.size for s in chain(GROUPS["base"], *chosen)) for chosen in choices]
+    assert len(set(sizes)) == len(sizes)
+    assert all(sum(s.size for s in sensors_of_size(size)) == size for size in sizes)
+    assert sensors_of_size(30) == ()
+
+
+def test_the_road_ahead_of_a_mirrored_track_is_the_mirror_image(oval):
+    """Bends change sides, widths and slopes stay."""
+
+    def turned(segment):
+        return segment._replace(curvature=-segment.curvature)
+
+    image = Track("image", "oval", tuple(map(turned, oval.segments)), grid=oval.grid)
+    assert isinstance(image.segments[0], Segment)
+    there, here = (th.from_numpy(seen(track, 250.0)[None]) for track in (image, oval))
+    assert mirror_observations(here)[0, 29:].equal(there[0, 29:])
+    assert not here[0, BENDS].equal(there[0, BENDS])
+
+
+def test_a_symmetric_policy_learns_from_mirrored_batches():
+    """With all that the policy and the callback ask of the sensors."""
+    with gym.make("TorcsLite-v0", sensors=BOTH, start="random") as env:
+        small = {"net_arch": {"pi": [8], "qf": [8, 8]}, "symmetric": True}
+        model = DDPG("SplitHeadPolicy", env, policy_kwargs=small, learning_starts=20, seed=0)
+        model.learn(60, callback=MirrorCallback())
+        observation = env.reset(seed=0)[0]
+        action, _ = model.predict(observation, deterministic=True)
+        image = mirror_observations(th.from_numpy(observation[None])).numpy()[0]
+        other, _ = model.predict(image, deterministic=True)
+    np.testing.assert_allclose(other * [-1.0, 1.0, 1.0], action, atol=1e-6)
+
+
+def test_an_evaluation_shows_what_was_learned_from():
+    with race_environment("TorcsLite-v0", {"sensors": ["base", "preview"]}) as env:
+        assert env.observation_space.shape == (68,)
