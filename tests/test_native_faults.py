@@ -81,6 +81,21 @@ def attempt(home, **options):
     return name, message
 
 
+OTHER_PARSER = """
+#include <cstdlib>
+extern "C" void* XML_ParserCreate(const char*) { std::abort(); }
+"""
+
+
+def test_the_game_reads_its_files_with_its_own_parser_not_with_the_process_s(tmp_path):
+    # Debian's own Python and those of uv and conda have another version of expat in the process.
+    preload = os.pathsep.join(
+        [os.environ.get("LD_PRELOAD", ""), str(compiled(OTHER_PARSER, tmp_path / "expat.so"))]
+    )
+    code = f"{BEGIN}\nengine().close()\nprint('drives')"
+    assert python(code, LD_PRELOAD=preload.strip(os.pathsep)) == "drives\n"
+
+
 class TestInstallation:
     def test_none(self, monkeypatch, tmp_path):
         monkeypatch.setenv("SB3_TORCS_HOME", str(tmp_path))

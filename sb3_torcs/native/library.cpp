@@ -359,6 +359,66 @@ bool is_memory(const std::string& import) {
            import.compare(0, 4, "_Zda") == 0;
 }
 
+struct Relocations {
+    const ElfW(Rela) * first = nullptr;
+    std::size_t size = 0;  // bytes
+
+    const ElfW(Rela) * begin() const { return first; }
+    const ElfW(Rela) * end() const { return first + size / sizeof(ElfW(Rela)); }
+};
+
+// What the loader knows of a loaded library.
+struct Linked {
+    ElfW(Addr) base = 0;
+    const ElfW(Sym) * symbols = nullptr;
+    const char* names = nullptr;
+    Relocations data, calls;
+
+    explicit Linked(void* handle) {
+        link_map* map = nullptr;
+        dlinfo(handle, RTLD_DI_LINKMAP, &map);
+        base = map->l_addr;
+        for (const ElfW(Dyn)* entry = map->l_ld; entry->d_tag != DT_NULL; entry++) {
+            const ElfW(Addr) address = entry->d_un.d_ptr;
+            switch (entry->d_tag) {
+                case DT_SYMTAB:
+                    symbols = reinterpret_cast<const ElfW(Sym)*>(address);
+                    break;
+                case DT_STRTAB:
+                    names = reinterpret_cast<const char*>(address);
+                    break;
+                case DT_RELA:
+                    data.first = reinterpret_cast<const ElfW(Rela)*>(address);
+                    break;
+                case DT_RELASZ:
+                    data.size = entry->d_un.d_val;
+                    break;
+                case DT_JMPREL:
+                    calls.first = reinterpret_cast<const ElfW(Rela)*>(address);
+                    break;
+                case DT_PLTRELSZ:
+                    calls.size = entry->d_un.d_val;
+                    break;
+                default:
+                    break;
+            }
+        }
+    }
+
+    const ElfW(Sym) & symbol(const ElfW(Rela) & relocation) const {
+        return symbols[ELF64_R_SYM(relocation.r_info)];
+    }
+
+    void write(const ElfW(Rela) & relocation, void* target) const {
+        static const auto page = static_cast<std::uintptr_t>(sysconf(_SC_PAGESIZE));
+        const auto slot = static_cast<std::uintptr_t>(base + relocation.r_offset);
+        // The loader has made these pages read-only. The copy is ours, so they become writable
+        // again.
+        mprotect(reinterpret_cast<void*>(slot - slot % page), page, PROT_READ | PROT_WRITE);
+        std::memcpy(reinterpret_cast<void*>(slot), &target, sizeof target);
+    }
+};
+
 }  // namespace
 
 std::unique_ptr<Library> Library::take(const std::string& path, const std::string& folder,
@@ -385,6 +445,7 @@ Library& Library::shared(const std::string& path, bool race_memory) {
         if (!handle)
             throw Error("GameIncomplete", path + " will not load: " + loader_message() + REINSTALL);
         library.reset(new Library(path, handle, race_memory));
+        library->keep_own_calls();
     }
     return *library;
 }
@@ -432,39 +493,6 @@ Library::Library(std::string path, void* handle, bool race_memory)
 }
 
 void Library::redirect_imports(bool race_memory) const {
-    link_map* map = nullptr;
-    dlinfo(handle_, RTLD_DI_LINKMAP, &map);
-    const ElfW(Sym)* symbols = nullptr;
-    const char* names = nullptr;
-    struct Table {
-        const ElfW(Rela) * first = nullptr;
-        std::size_t size = 0;
-    } data, calls;
-    for (const ElfW(Dyn)* entry = map->l_ld; entry->d_tag != DT_NULL; entry++) {
-        const ElfW(Addr) address = entry->d_un.d_ptr;
-        switch (entry->d_tag) {
-            case DT_SYMTAB:
-                symbols = reinterpret_cast<const ElfW(Sym)*>(address);
-                break;
-            case DT_STRTAB:
-                names = reinterpret_cast<const char*>(address);
-                break;
-            case DT_RELA:
-                data.first = reinterpret_cast<const ElfW(Rela)*>(address);
-                break;
-            case DT_RELASZ:
-                data.size = entry->d_un.d_val;
-                break;
-            case DT_JMPREL:
-                calls.first = reinterpret_cast<const ElfW(Rela)*>(address);
-                break;
-            case DT_PLTRELSZ:
-                calls.size = entry->d_un.d_val;
-                break;
-            default:
-                break;
-        }
-    }
     const auto replacement = [race_memory](const std::string& import) -> void* {
         const auto ours = replacements().find(import);
         if (ours != replacements().end())
@@ -477,20 +505,23 @@ void Library::redirect_imports(bool race_memory) const {
         }
         return nullptr;
     };
-    const auto page = static_cast<std::uintptr_t>(sysconf(_SC_PAGESIZE));
-    for (const Table& table : {data, calls}) {
-        for (std::size_t i = 0; i < table.size / sizeof(ElfW(Rela)); i++) {
-            const ElfW(Rela) & relocation = table.first[i];
-            const ElfW(Sym) & symbol = symbols[ELF64_R_SYM(relocation.r_info)];
+    const Linked linked(handle_);
+    for (const Relocations& table : {linked.data, linked.calls}) {
+        for (const ElfW(Rela) & relocation : table) {
+            const ElfW(Sym) & symbol = linked.symbol(relocation);
             if (symbol.st_name == 0 || symbol.st_shndx != SHN_UNDEF) continue;
-            void* target = replacement(names + symbol.st_name);
-            if (!target) continue;
-            const auto slot = static_cast<std::uintptr_t>(map->l_addr + relocation.r_offset);
-            // The loader has made these pages read-only. The copy is ours, so they become writable
-            // again.
-            mprotect(reinterpret_cast<void*>(slot - slot % page), page, PROT_READ | PROT_WRITE);
-            std::memcpy(reinterpret_cast<void*>(slot), &target, sizeof target);
+            if (void* target = replacement(linked.names + symbol.st_name))
+                linked.write(relocation, target);
         }
+    }
+}
+
+void Library::keep_own_calls() const {
+    const Linked linked(handle_);
+    for (const ElfW(Rela) & relocation : linked.calls) {
+        const ElfW(Sym) & symbol = linked.symbol(relocation);
+        if (symbol.st_shndx == SHN_UNDEF) continue;
+        linked.write(relocation, reinterpret_cast<void*>(linked.base + symbol.st_value));
     }
 }
 

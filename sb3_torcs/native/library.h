@@ -45,6 +45,10 @@ private:
     void* require_address(const char* symbol) const;
     void redirect_imports(bool race_memory) const;
 
+    // The loader prefers the process's functions to a library's own ones of the same names. Some
+    // Pythons contain another version of the XML parser that the game's parameter files need.
+    void keep_own_calls() const;
+
     struct Range {
         char* begin;
         std::size_t size;
