@@ -361,10 +361,10 @@ bool is_memory(const std::string& import) {
 
 struct Relocations {
     const ElfW(Rela) * first = nullptr;
-    std::size_t size = 0;  // bytes
+    std::size_t number = 0;
 
     const ElfW(Rela) * begin() const { return first; }
-    const ElfW(Rela) * end() const { return first + size / sizeof(ElfW(Rela)); }
+    const ElfW(Rela) * end() const { return first + number; }
 };
 
 // What the loader knows of a loaded library.
@@ -391,13 +391,13 @@ struct Linked {
                     data.first = reinterpret_cast<const ElfW(Rela)*>(address);
                     break;
                 case DT_RELASZ:
-                    data.size = entry->d_un.d_val;
+                    data.number = entry->d_un.d_val / sizeof(ElfW(Rela));
                     break;
                 case DT_JMPREL:
                     calls.first = reinterpret_cast<const ElfW(Rela)*>(address);
                     break;
                 case DT_PLTRELSZ:
-                    calls.size = entry->d_un.d_val;
+                    calls.number = entry->d_un.d_val / sizeof(ElfW(Rela));
                     break;
                 default:
                     break;
