@@ -16,6 +16,7 @@ __all__ = [
     "CarFileError",
     "CarLost",
     "DisplayUnavailable",
+    "DriveFileError",
     "EngineBusy",
     "EngineForked",
     "EnvClosed",
@@ -110,6 +111,10 @@ class RobotUnavailable(BackendUnavailable):
 
 class DisplayUnavailable(BackendUnavailable):
     """There is no display for the game's window."""
+
+
+class DriveFileError(Sb3TorcsError, ValueError):
+    """A file of drives cannot be read, or its drives cannot be compared."""
 
 
 class EngineBusy(Sb3TorcsError, RuntimeError):

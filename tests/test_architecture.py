@@ -20,8 +20,8 @@ import pytest
 PACKAGE = Path(__file__).parent.parent / "sb3_torcs"
 FILES = sorted(PACKAGE.rglob("*.py"))
 
-MAX_MODULES = 15  # at the top of the package
-MAX_FOLDERS = 14  # of Python there; beside them stands native/, the C++
+MAX_MODULES = 14  # at the top of the package
+MAX_FOLDERS = 15  # of Python there; beside them stands native/, the C++
 MAX_CODE_LINES = 300
 LONGER_FILES = {
     "backends/lite/physics.py": 320,  # one physics step is one piece
@@ -31,10 +31,10 @@ LONGER_FILES = {
 FLOORS = (
     {"_engine", "errors", "signals"},
     {"car", "files"},
-    {"telemetry", "torcs"},
+    {"torcs"},
     {"tracks"},
     {"actions", "rewards", "sensors"},  # with car and tracks: the vocabulary
-    {"noise", "policies", "rendering", "scr"},
+    {"noise", "policies", "rendering", "scr", "telemetry"},
     {"backends"},
     {"envs"},
     {"agents", "vec_env"},

@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from sb3_torcs.backends.native import make_engine
+from sb3_torcs.car import CarState, Controls
 from sb3_torcs.errors import InvalidOption
-from sb3_torcs.telemetry import STATE_FIELDS, write_telemetry
+from sb3_torcs.telemetry import STATE_FIELDS, DriveLabel, DriveLog, write_telemetry
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.race_results import Lap, RobotResult
 from sb3_torcs.torcs.race_setup import RaceSetup, Session
+from sb3_torcs.torcs.track_names import find_track
 
-__all__ = ["race"]
+__all__ = ["PARQUET", "drive_log", "race"]
 
 TICKS_AT_ONCE = 50  # a second of the race
 MAX_ROBOTS = 20  # that a grid of the game's tracks has room for
+PARQUET = ".parquet"
+"""Ending of files that :mod:`sb3_torcs.telemetry.drives` writes; all others are CSV."""
+WORLD = "Torcs-v0"  # the same physics
 
 
 def race(
@@ -34,25 +40,52 @@ def race(
     :param track: ``"aalborg"``, ``"road/aalborg"``, or the path of a TORCS XML file
     :param laps: to drive
     :param session: the game's ``"practice"``, or ``"race"``
-    :param telemetry: CSV file for the drive itself, see :mod:`sb3_torcs.telemetry`
+    :param telemetry: file for the drive itself, Parquet or CSV; see :mod:`sb3_torcs.telemetry`
     :return: one result per robot, the winner first
     :raises InvalidOption: if the session cannot be had
     :raises BackendUnavailable: if the game or the extension is missing
     """
+    with _engine(robots, track, laps, session) as engine:
+        if telemetry is None:
+            while not engine.ended:
+                engine.advance(TICKS_AT_ONCE)
+        elif telemetry.suffix.lower() == PARQUET:
+            _log(engine, robots, track).write(telemetry)
+        else:
+            write_telemetry(telemetry, _rows(engine, robots))
+        return [
+            _result(engine, robots, rank, row) for rank, row in enumerate(engine.results(), start=1)
+        ]
+
+
+def drive_log(
+    robots: Sequence[tuple[str, int]], track: str, laps: int, *, session: Session = "practice"
+) -> DriveLog:
+    """
+    Let robots drive, and note what they do.
+
+    :param robots: as of :func:`race`
+    :param track: as of :func:`race`
+    :param laps: as of :func:`race`
+    :param session: as of :func:`race`
+    :return: a row per robot and control tick
+    """
+    with _engine(robots, track, laps, session) as engine:
+        return _log(engine, robots, track)
+
+
+@contextmanager
+def _engine(
+    robots: Sequence[tuple[str, int]], track: str, laps: int, session: Session
+) -> Iterator[Any]:
+    """Start a race, and close its engine at the end."""
     if not robots or len(robots) > MAX_ROBOTS:
         raise InvalidOption(f"{len(robots)} robots; expected 1 to {MAX_ROBOTS}")
     RaceSetup(track, robots, laps, session)  # refuses races that the game itself cannot run
     engine = make_engine(find_game(), track, robots, session=session, laps=laps)
     try:
         engine.start()
-        if telemetry is None:
-            while not engine.ended:
-                engine.advance(TICKS_AT_ONCE)
-        else:
-            write_telemetry(telemetry, _rows(engine, robots))
-        return [
-            _result(engine, robots, rank, row) for rank, row in enumerate(engine.results(), start=1)
-        ]
+        yield engine
     finally:
         engine.close()
 
@@ -78,7 +111,32 @@ def _result(
 
 def _rows(engine: Any, robots: Sequence[tuple[str, int]]) -> Iterator[tuple[Any, ...]]:
     """Drive to the end of the race, and yield the rows of each control tick."""
+    for number, car, controls in _ticks(engine, len(robots)):
+        yield (*robots[number], *car[: len(STATE_FIELDS)], *controls)
+
+
+def _log(engine: Any, robots: Sequence[tuple[str, int]], track: str) -> DriveLog:
+    """Drive to the end of the race, and note each control tick."""
+    name = track if find_track(track).source == "file" else find_track(track).path.stem
+    labels = [
+        DriveLabel(_named(robot), name, engine.car_name(number), WORLD)
+        for number, robot in enumerate(robots)
+    ]
+    log = DriveLog()
+    for number, car, controls in _ticks(engine, len(robots)):
+        log.add(labels[number], car, Controls(*controls))
+    return log
+
+
+def _named(robot: tuple[str, int]) -> str:
+    """Return the shortest name of a robot's driver, as one types it."""
+    name, index = robot
+    return name if find_game().parse_robot(name) == robot else f"{name}:{index}"
+
+
+def _ticks(engine: Any, cars: int) -> Iterator[tuple[int, CarState, tuple[Any, ...]]]:
+    """Drive to the end of the race; yield each car and its controls after each control tick."""
     while not engine.ended:
         engine.advance(1)
-        for car, robot in enumerate(robots):
-            yield (*robot, *engine.read(car)[: len(STATE_FIELDS)], *engine.controls(car))
+        for number in range(cars):
+            yield number, engine.read(number), engine.controls(number)

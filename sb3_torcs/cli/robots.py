@@ -48,7 +48,11 @@ def add_parser(subparsers: Any) -> None:
     add("--with", dest="rivals", metavar="NAME:I,…",
         help="robots to race against; they start behind")  # fmt: skip
     add("--game", action="store_true", help="run the race in the game's text mode")
-    add("--telemetry", metavar="FILE", help="write the drive to this file; not with --game")
+    add(
+        "--telemetry",
+        metavar="FILE",
+        help="write the drive: a .parquet, or else CSV; not with --game",
+    )
     add("--json", action="store_true", help="print JSON and nothing else")
     parser.set_defaults(run=run)
 

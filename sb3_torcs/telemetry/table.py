@@ -1,4 +1,4 @@
-"""Telemetry: tables of drives, one row per driver and moment."""
+"""Drives as CSV files, one row per driver and moment, which any program reads."""
 
 from __future__ import annotations
 

@@ -1,0 +1,176 @@
+"""Drives as Parquet files: one row per driver and moment, every column with its unit.
+
+``pandas.read_parquet`` reads them as they are; the units stand in the ``attrs`` of its table and in
+the metadata of each column.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from sb3_torcs.car import CarState, Controls
+from sb3_torcs.errors import DriveFileError, OutputNotWritable
+from sb3_torcs.sensors import SENSORS
+from sb3_torcs.telemetry.table import CONTROL_FIELDS, STATE_FIELDS
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import pyarrow as pa
+
+__all__ = ["COLUMNS", "LABELS", "DriveLabel", "DriveLog", "read_drives"]
+
+FORMAT = "sb3-torcs drives, version 1"
+AT_ONCE = 5000  # rows that are turned into columns together
+
+WHEELS = ("front_right", "front_left", "rear_right", "rear_left")
+WHOLE = {"gear", "laps", "race_position", "gear_asked"}  # columns of whole numbers
+OTHER_UNITS = {  # of what the sensor table does not hold
+    "time": "s", "x": "m", "y": "m", "yaw": "rad", "yaw_rate": "rad/s", "height": "m",
+    "distance_from_axis": "m", "track_width": "m", "distance_from_start": "m",
+    "distance_raced": "m", "fuel": "l", "damage": "points", "lap_time": "s", "last_lap_time": "s",
+    "best_lap_time": "s",
+}  # fmt: skip
+
+
+class DriveLabel(NamedTuple):
+    """Whose drive it is; the first columns of the table."""
+
+    driver: str  # as it is named on the command line
+    track: str  # a name, or the path of a file
+    car: str
+    world: str  # the environment's id
+    episode: int = 1  # the driver's races are counted
+
+
+LABELS = DriveLabel._fields
+
+
+def _units() -> dict[str, str]:
+    """Name every column of numbers, with its unit."""
+    units = {sensor.name: sensor.unit for sensor in SENSORS} | OTHER_UNITS
+    columns = {name: units.get(name, "-") for name in STATE_FIELDS}
+    columns |= {f"wheel_speed_{wheel}": units["wheel_speeds"] for wheel in WHEELS}
+    beams = next(sensor.size for sensor in SENSORS if sensor.name == "range_finders")
+    columns |= {f"range_finder_{n}": units["range_finders"] for n in range(beams)}
+    return columns | dict.fromkeys(CONTROL_FIELDS, "-")
+
+
+COLUMNS = _units()
+"""The columns of numbers and their units: of the car after the tick, and of its controls."""
+
+
+class DriveLog:
+    """Gathers the rows of drives. Any world, and any mixture of drivers, may fill it."""
+
+    def __init__(self) -> None:
+        self._labels: list[DriveLabel] = []
+        self._numbers: list[np.ndarray[Any, Any]] = []
+        self._open: list[tuple[Any, ...]] = []
+
+    def add(self, label: DriveLabel, car: CarState, controls: Controls) -> None:
+        """
+        Append a row.
+
+        :param label: whose it is
+        :param car: at the end of the control tick or timestep
+        :param controls: that it was driven with
+        """
+        gear = np.nan if controls.gear is None else controls.gear
+        asked = (controls.steering, controls.throttle, controls.brake, gear)
+        state = car[: len(STATE_FIELDS)]
+        self._labels.append(label)
+        self._open.append((*state, *car.wheel_speeds, *car.range_finders, *asked))
+        if len(self._open) == AT_ONCE:
+            self._close()
+
+    def _close(self) -> None:
+        """Pack the newest rows into an array."""
+        if self._open:
+            self._numbers.append(np.array(self._open))
+            self._open = []
+
+    def table(self) -> pa.Table:
+        """Return all rows as a table of Apache Arrow."""
+        import pyarrow as pa
+
+        self._close()
+        numbers = np.concatenate(self._numbers or [np.empty((0, len(COLUMNS)))])
+        columns: dict[str, pa.Array] = {
+            name: pa.array([getattr(label, name) for label in self._labels]).dictionary_encode()
+            for name in LABELS[:-1]
+        }
+        columns["episode"] = pa.array([label.episode for label in self._labels], pa.int32())
+        for name, values in zip(COLUMNS, numbers.T, strict=True):
+            kind = pa.int32() if name in WHOLE else pa.float64()
+            columns[name] = pa.array(values, mask=np.isnan(values)).cast(kind)
+        fields = [
+            pa.field(name, column.type, metadata={"unit": COLUMNS.get(name, "")})
+            for name, column in columns.items()
+        ]
+        # pandas reads a table's `attrs` from this.
+        attrs = json.dumps({"format": FORMAT, "units": COLUMNS})
+        schema = pa.schema(fields, metadata={"PANDAS_ATTRS": attrs})
+        return pa.Table.from_arrays(list(columns.values()), schema=schema)
+
+    def frame(self) -> pd.DataFrame:
+        """Return all rows as a table of pandas, as :func:`read_drives` does of a file."""
+        return self.table().to_pandas()
+
+    def write(self, path: Path) -> None:
+        """
+        Write all rows to a Parquet file.
+
+        :param path: of the file, which appears when it is complete
+        :raises OutputNotWritable: if the file cannot be written
+        """
+        from pyarrow import parquet
+
+        table = self.table()
+        floats = [field.name for field in table.schema if str(field.type) == "double"]
+        others = [field.name for field in table.schema if field.name not in floats]
+        aside = path.with_name(f".{path.name}")
+        try:
+            try:
+                # Bytes of one weight stand together, which compresses better.
+                parquet.write_table(
+                    table, aside, compression="zstd", use_dictionary=others,
+                    use_byte_stream_split=floats, write_page_checksum=True,
+                )  # fmt: skip
+                aside.replace(path)
+            finally:
+                aside.unlink(missing_ok=True)
+        except OSError as error:
+            raise OutputNotWritable(f"{path}: {error}; choose another file") from error
+
+
+def read_drives(path: str | Path) -> pd.DataFrame:
+    """
+    Read the drives of a file, and make sure that they are drives.
+
+    :param path: of a Parquet file that ``--telemetry`` or :class:`DriveLog` has written
+    :return: one row per driver and moment; the columns are :data:`LABELS` and :data:`COLUMNS`
+    :raises DriveFileError: if the file is missing, damaged, or holds something else
+    """
+    import pandas as pd
+    import pyarrow as pa
+
+    again = "write it anew: sb3-torcs evaluate MODEL --telemetry FILE.parquet"
+    try:
+        frame = pd.read_parquet(path, page_checksum_verification=True)
+    except FileNotFoundError:
+        raise DriveFileError(f"there is no file '{path}'; {again}") from None
+    except (OSError, ValueError, pa.ArrowException) as error:
+        told = str(error).splitlines()[0]
+        raise DriveFileError(f"'{path}' cannot be read as a drive ({told}); {again}") from error
+    missing = [name for name in (*LABELS, *COLUMNS) if name not in frame]
+    if missing:
+        raise DriveFileError(
+            f"'{path}' is no drive of ours: it has no column {', '.join(missing[:3])}; {again}"
+        )
+    if frame.empty:
+        raise DriveFileError(f"'{path}' holds no rows: nobody has driven; {again}")
+    return frame

@@ -1,0 +1,143 @@
+"""Drives are Parquet files that anybody reads: every column with its unit, every number exact."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+from conftest import car_state
+from made_drives import drive, log_of
+from pyarrow import parquet
+
+from sb3_torcs.agents.robots import race
+from sb3_torcs.agents.scripted import ScriptedDriver
+from sb3_torcs.car import Controls
+from sb3_torcs.cli import main
+from sb3_torcs.errors import DriveFileError, OutputNotWritable
+from sb3_torcs.evaluation.protocol import evaluate, race_environment
+from sb3_torcs.evaluation.ticks import log_drives
+from sb3_torcs.sensors import SENSORS
+from sb3_torcs.telemetry import STATE_FIELDS, DriveLabel, DriveLog, read_drives
+from sb3_torcs.telemetry.drives import COLUMNS, LABELS
+
+LABEL = DriveLabel("ana", "aalborg", "car1-trb1", "Torcs-v0", 2)
+
+
+def written(tmp_path, log):
+    path = tmp_path / "drive.parquet"
+    log.write(path)
+    return path
+
+
+def test_pandas_reads_what_was_driven(tmp_path):
+    """Without anything of this package: labels, the car's state, its sensors and its controls."""
+    log = DriveLog()
+    car = car_state(speed_x=1.0 / 3.0, range_finders=np.arange(19.0), wheel_speeds=np.arange(4.0))
+    log.add(LABEL, car, Controls(0.25, 0.5, 0.125, gear=3))
+    (row,) = pd.read_parquet(written(tmp_path, log)).to_dict("records")
+    assert tuple(row[name] for name in LABELS) == LABEL
+    assert {name: row[name] for name in STATE_FIELDS} == {
+        name: getattr(car, name) for name in STATE_FIELDS
+    }
+    assert [row[f"range_finder_{n}"] for n in range(19)] == list(range(19))
+    assert (row["wheel_speed_front_right"], row["wheel_speed_rear_left"]) == (0.0, 3.0)
+    asked = (row["steering"], row["throttle"], row["brake"], row["gear_asked"])
+    assert asked == (0.25, 0.5, 0.125, 3)
+
+
+def test_every_column_has_the_unit_of_the_sensor_table(tmp_path):
+    path = written(tmp_path, log_without_gears())
+    units = pd.read_parquet(path).attrs["units"]
+    assert {s.name: units[s.name] for s in SENSORS if s.name in units} == {
+        s.name: s.unit for s in SENSORS if s.name in STATE_FIELDS
+    }
+    assert (units["wheel_speed_front_left"], units["range_finder_18"]) == ("rad/s", "m")
+    stored = {field.name: field.metadata[b"unit"].decode() for field in parquet.read_schema(path)}
+    assert {name: stored[name] for name in COLUMNS} == units
+
+
+def log_without_gears():
+    log = DriveLog()
+    log.add(LABEL, car_state(), Controls(0.0, 0.0, 0.0))
+    return log
+
+
+def test_a_gear_that_nobody_asked_for_is_missing(tmp_path):
+    assert np.isnan(read_drives(written(tmp_path, log_without_gears()))["gear_asked"][0])
+
+
+def test_many_rows_stay_in_their_order(tmp_path, oval):
+    log = drive(DriveLog(), oval, laps=3)
+    time = read_drives(written(tmp_path, log))["time"].to_numpy()
+    assert len(time) > 5000
+    assert (np.diff(time) > 0.0).all()
+
+
+def test_an_agents_drive_is_noted_tick_by_tick_and_stays_the_same():
+    """The laps are those of an evaluation that nobody notes."""
+
+    def laps(note):
+        env = race_environment("TorcsLite-v0", {}, "g-track-1", laps=1)
+        log = log_drives(env, "scripted") if note else None
+        (episode,) = evaluate(env, ScriptedDriver())
+        return episode, log
+
+    alone, _ = laps(note=False)
+    noted, log = laps(note=True)
+    assert noted == alone
+    frame = log.frame()
+    assert np.diff(frame["time"]) == pytest.approx(0.02)
+    assert len(frame) % 5 == 0
+    assert set(frame["driver"]) | set(frame["world"]) == {"scripted", "TorcsLite-v0"}
+    assert (set(frame["track"]), set(frame["episode"])) == ({"g-track-1"}, {1})
+
+
+@pytest.mark.usefixtures("game")
+def test_robots_write_the_same_drive_in_both_formats(tmp_path):
+    race([("bt", 3)], "dirt-1", 1, telemetry=tmp_path / "drive.csv")
+    (result,) = race([("bt", 3)], "dirt-1", 1, telemetry=tmp_path / "drive.parquet")
+    table, drives = (
+        pd.read_csv(tmp_path / "drive.csv", float_precision="round_trip"),
+        read_drives(tmp_path / "drive.parquet"),
+    )
+    for name in ("time", "x", "speed_x", "laps", "throttle", "gear_asked"):
+        assert table[name].tolist() == drives[name].tolist()
+    assert set(drives["driver"]) == {"bt:3"}
+    assert drives["last_lap_time"].iloc[-1] == result.laps[0].time
+
+
+def test_a_file_appears_when_it_is_whole(tmp_path, oval):
+    with pytest.raises(OutputNotWritable, match="choose another file"):
+        log_of(oval, ("ana", 20.0)).write(tmp_path / "nowhere" / "drive.parquet")
+    (tmp_path / "taken.parquet").mkdir()
+    with pytest.raises(OutputNotWritable):
+        log_of(oval, ("ana", 20.0)).write(tmp_path / "taken.parquet")
+    assert [path.name for path in tmp_path.iterdir()] == ["taken.parquet"]
+
+
+def test_what_is_no_drive_is_told(tmp_path, oval):
+    path = written(tmp_path, log_of(oval, ("ana", 20.0)))
+    whole = path.read_bytes()
+    damaged = bytearray(whole)
+    column = parquet.read_metadata(path).row_group(0).column(len(LABELS))
+    damaged[column.data_page_offset + column.total_compressed_size - 1] ^= 1  # one bit of a number
+    for content in (b"", b"PAR1", whole[: len(whole) // 2], whole[:-1], damaged):
+        path.write_bytes(content)
+        with pytest.raises(DriveFileError, match=r"cannot be read as a drive .*; write it anew"):
+            read_drives(path)
+    with pytest.raises(DriveFileError, match="there is no file"):
+        read_drives(tmp_path / "none.parquet")
+    pd.DataFrame({"time": [1.0]}).to_parquet(path)
+    with pytest.raises(DriveFileError, match="it has no column driver, track, car; write"):
+        read_drives(path)
+    DriveLog().write(path)
+    with pytest.raises(DriveFileError, match="holds no rows"):
+        read_drives(path)
+
+
+def test_an_evaluation_writes_its_drives_as_parquet(tmp_path, capsys):
+    path = tmp_path / "drive.parquet"
+    words = "evaluate scripted --env TorcsLite-v0 --track g-track-1 --laps 1 --episodes 2"
+    assert main([*words.split(), "--telemetry", str(path)]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == f"telemetry: {path}"
+    assert read_drives(path)["episode"].unique().tolist() == [1, 2]
