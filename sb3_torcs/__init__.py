@@ -5,9 +5,11 @@ Importing the package registers ``Torcs-v0`` and ``TorcsLite-v0``; nothing heavy
 
 from __future__ import annotations
 
+from typing import Any
+
 from gymnasium.envs.registration import register, registry
 
-__all__ = ["__version__", "register_envs"]
+__all__ = ["__version__", "compare", "register_envs"]
 
 __version__ = "0.1.0"
 
@@ -34,3 +36,12 @@ def register_envs() -> None:
 
 
 register_envs()
+
+
+def __getattr__(name: str) -> Any:
+    """Load ``sb3_torcs.compare`` when somebody asks for it."""
+    if name == "compare":
+        from sb3_torcs.evaluation.comparing import compare
+
+        return compare
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

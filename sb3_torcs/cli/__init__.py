@@ -14,6 +14,7 @@ from types import FrameType
 from sb3_torcs import __version__
 from sb3_torcs.cli import (
     bench,
+    compare,
     compete,
     doctor,
     evaluate,
@@ -37,8 +38,8 @@ USAGE_ERROR = 2
 INTERRUPTED = 130
 READER_LEFT = 141
 VERBS = (
-    doctor, install_torcs, tracks, train, evaluate, watch, study, report, robots, serve, compete,
-    bench,
+    doctor, install_torcs, tracks, train, evaluate, compare, watch, study, report, robots, serve,
+    compete, bench,
 )  # fmt: skip
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sb3_torcs.car import DEFAULT_CAR
@@ -22,8 +24,15 @@ from sb3_torcs.files import writable_file
 if TYPE_CHECKING:
     from sb3_torcs.agents.models import TrainingRecord
     from sb3_torcs.evaluation.protocol import Episode
+    from sb3_torcs.evaluation.recording import Recorder
+    from sb3_torcs.telemetry import DriveLog
 
 __all__ = ["add_parser", "environment_kwargs", "run"]
+
+FILES = {
+    "video": (".mp4",), "line": (".png",), "telemetry": (".parquet", ".csv"), "report": (".html",),
+}  # fmt: skip
+"""Endings of what can be written of a drive."""
 
 HEADERS = ("episode", "laps", "lap times s", "distance m", "end", "damage", "return")
 
@@ -65,7 +74,9 @@ def add_parser(subparsers: Any) -> None:
     add("--json", action="store_true", help="print one JSON object and nothing else")
     add("--video", metavar="FILE.mp4", help="record the best lap from above")
     add("--line", metavar="FILE.png", help="draw the line of the best lap, coloured by speed")
-    add("--telemetry", metavar="FILE.csv", help="write all timesteps to a table")
+    add("--telemetry", metavar="FILE", help="write the drives: all control ticks to a .parquet, "
+        "or all timesteps to a .csv")  # fmt: skip
+    add("--report", metavar="FILE.html", help="make the lap report, as `sb3-torcs compare` does")
     parser.set_defaults(run=run)
 
 
@@ -74,36 +85,79 @@ def run(args: argparse.Namespace) -> int:
     :param args: from the command line
     :return: the exit status
     """
-    video = writable_file(args.video, (".mp4",)) if args.video else None
-    line = writable_file(args.line, (".png",)) if args.line else None
-    telemetry = writable_file(args.telemetry, (".csv",)) if args.telemetry else None
+    files = _files(args)
     with quiet_output(args.json):
-        result, recorder = _drive(args)
-        if video is not None:
-            recorder.save_video(video)
-        if line is not None:
-            recorder.draw_line(line)
-        if telemetry is not None:
-            recorder.write(telemetry, str(args.model))
-        recorder.close()
+        result, recorder, log = _drive(args, ticks=_ticks_wanted(files, "telemetry", "report"))
+        _write(files, recorder, log, str(args.model))
     if args.json:
         episodes = [episode.as_dict() for episode in result]
         print_json({"env": recorder.env_id, **recorder.names(), "episodes": episodes})
-        return 0
-    print(f"{recorder.env_id}, {', '.join(recorder.names().values())}")
-    print(table(HEADERS, [_row(number, episode) for number, episode in enumerate(result, 1)]))
-    for what, path in (("video", video), ("line", line), ("telemetry", telemetry)):
-        if path is not None:
+    else:
+        print(f"{recorder.env_id}, {', '.join(recorder.names().values())}")
+        print(table(HEADERS, [_row(number, episode) for number, episode in enumerate(result, 1)]))
+    if "report" in files:  # last: it is an error if there is no whole lap
+        from sb3_torcs.evaluation.comparing import report_of
+
+        report_of(log.frame()).save(files["report"])
+    for what, path in files.items():
+        if not args.json:
             print(f"{what}: {path}")
     return 0
 
 
-def _drive(args: argparse.Namespace) -> tuple[list[Episode], Any]:
-    """Build the environment, load the driver, drive."""
-    from sb3_torcs.agents.models import load_driver
+def _files(args: argparse.Namespace) -> dict[str, Path]:
+    """Check the files that are asked for, before anything is driven."""
+    from sb3_torcs.errors import InvalidOption
+    from sb3_torcs.torcs.track_names import RANDOM_TRACK
+
+    if args.report and args.track == RANDOM_TRACK:
+        raise InvalidOption("--report compares laps of one track; give --track a name")
+    return {
+        what: writable_file(getattr(args, what), suffixes)
+        for what, suffixes in FILES.items()
+        if getattr(args, what)
+    }
+
+
+def _write(files: Mapping[str, Path], recorder: Recorder, log: DriveLog, model: str) -> None:
+    """
+    Write the files that show the drives.
+
+    :param files: by what they hold
+    :param recorder: of the timesteps
+    :param log: of the control ticks
+    :param model: as typed
+    """
+    if "video" in files:
+        recorder.save_video(files["video"])
+    if "line" in files:
+        recorder.draw_line(files["line"])
+    if _ticks_wanted(files, "telemetry"):
+        log.write(files["telemetry"])
+    elif "telemetry" in files:
+        recorder.write(files["telemetry"], model)
+    recorder.close()
+
+
+def _ticks_wanted(files: Mapping[str, Path], *kinds: str) -> bool:
+    """Whether one of the files is made of control ticks, and not of timesteps."""
+    return any(kind in files and files[kind].suffix.lower() != ".csv" for kind in kinds)
+
+
+def _drive(args: argparse.Namespace, *, ticks: bool) -> tuple[list[Episode], Recorder, DriveLog]:
+    """
+    Build the environment, load the driver, drive.
+
+    :param args: from the command line
+    :param ticks: whether to note every control tick
+    :return: the results, the timesteps and the control ticks
+    """
+    from sb3_torcs.agents.models import driver_name, load_driver
     from sb3_torcs.agents.wrapping import wrapped
     from sb3_torcs.evaluation.protocol import choose_world, evaluate, time_limit
     from sb3_torcs.evaluation.recording import Recorder
+    from sb3_torcs.evaluation.ticks import log_drives
+    from sb3_torcs.telemetry import DriveLog
     from sb3_torcs.training.zoo import check_racing
 
     record = told_record(args.model)
@@ -117,8 +171,9 @@ def _drive(args: argparse.Namespace) -> tuple[list[Episode], Any]:
     # The recorder is inside the wrappers, so it records the actions that reach the car.
     env = wrapped(recorder, record.hyperparameters, trust=args.trust)
     driver = load_driver(args.model, env, args.algo, args.trust)
+    log = log_drives(env, driver_name(args.model)) if ticks else DriveLog()
     result = evaluate(env, driver, episodes=args.episodes, seed=args.seed)
-    return result, recorder
+    return result, recorder, log
 
 
 def environment_kwargs(args: argparse.Namespace, record: TrainingRecord) -> dict[str, Any]:

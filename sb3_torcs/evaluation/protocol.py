@@ -152,15 +152,17 @@ def race_environment(
     env_kwargs: Mapping[str, Any],
     track: str | None = None,
     *,
+    laps: int = RACE_LAPS,
     hyperparameters: Mapping[str, Any] = MappingProxyType({}),
     trust: bool = False,
 ) -> gym.Env[Any, Any]:
     """
-    Build the environment of an evaluation: three laps from the grid.
+    Build the environment of an evaluation: laps from the grid.
 
     :param env_id: of the training
     :param env_kwargs: of the training
     :param track: instead of the training's
+    :param laps: to drive
     :param hyperparameters: of the training, whose wrappers are put around the environment
     :param trust: as of :func:`~sb3_torcs.agents.wrapping.wrapped`
     :return: the environment, whose time limit never ends a race
@@ -168,7 +170,7 @@ def race_environment(
     from sb3_torcs.agents.wrapping import wrapped
 
     kwargs = {name: env_kwargs[name] for name in KEPT if name in env_kwargs}
-    kwargs.update({"laps": RACE_LAPS}, **({} if track is None else {"track": track}))
+    kwargs.update({"laps": laps}, **({} if track is None else {"track": track}))
     env = gym.make(env_id, max_episode_steps=time_limit(kwargs), **kwargs)
     return wrapped(env, hyperparameters, trust=trust)
 

@@ -1,0 +1,229 @@
+"""Laps of agents, robots and saved drives laid on each other: the lap report of drivers by name."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sb3_torcs.agents.models import driver_name, driver_record, load_driver, one_track
+from sb3_torcs.agents.robots import drive_log
+from sb3_torcs.agents.rollout import drive
+from sb3_torcs.car import checked_laps
+from sb3_torcs.errors import BackendUnavailable, DriveFileError, InvalidOption, near_miss
+from sb3_torcs.evaluation.protocol import RACE_LAPS, choose_world, race_environment
+from sb3_torcs.evaluation.ticks import log_drives
+from sb3_torcs.files import writable_file
+from sb3_torcs.telemetry.comparison import Comparison, compare_drives
+from sb3_torcs.telemetry.document import write_document
+from sb3_torcs.telemetry.drives import read_drives
+from sb3_torcs.telemetry.laps import Drive, drives_of
+from sb3_torcs.telemetry.page import lap_report
+from sb3_torcs.torcs.installation import find_game
+from sb3_torcs.torcs.track_names import RANDOM_TRACK
+from sb3_torcs.tracks.catalogue import load_track
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from sb3_torcs.telemetry import DriveLog
+
+__all__ = ["LapReport", "compare", "report_of", "saved_drives"]
+
+DEFAULT_TRACK = "aalborg"
+HEIGHT = 900  # [px] of a report in a notebook
+
+SAVED: dict[str, Callable[[Path], pd.DataFrame]] = {".parquet": read_drives}
+"""Who reads a file of drives, by its ending."""
+
+
+@dataclass(frozen=True)
+class LapReport:
+    """
+    A comparison of laps; in a notebook it shows itself.
+
+    :param comparison: the figures
+    """
+
+    comparison: Comparison
+
+    @cached_property
+    def html(self) -> str:
+        """The page, which needs no other file and no network."""
+        return lap_report(self.comparison)
+
+    def save(self, path: str | Path) -> Path:
+        """
+        Write the page.
+
+        :param path: of the file, ending in ``.html``
+        :return: the path
+        :raises OutputNotWritable: if the file cannot be written
+        """
+        file = writable_file(path, (".html",))
+        write_document(file, self.html)
+        return file
+
+    def _repr_html_(self) -> str:
+        """Show the page in a notebook."""
+        page = escape(self.html)
+        return f'<iframe srcdoc="{page}" width="100%" height="{HEIGHT}" frameborder="0"></iframe>'
+
+
+def compare(
+    *drivers: str | Path, track: str | None = None, laps: int = RACE_LAPS, trust: bool = False
+) -> LapReport:
+    """
+    Let drivers drive alone, and compare their best laps.
+
+    :param drivers: agents, robots and files of saved drives; the first is what the others are
+        measured against
+    :param track: that they drive on; ``None`` is that of a saved drive, or of an agent's training
+    :param laps: each drives so many from the grid, and its best flying one counts
+    :param trust: run the code that is pickled in a model
+    :return: the report
+    :raises InvalidOption: if there is no such driver, or a drive is of another track
+    :raises DriveFileError: if a file cannot be read, or nobody drives a whole lap
+    """
+    checked_laps(laps)
+    if not drivers:
+        raise InvalidOption("there is nobody to compare; name drivers, e.g. ddpg-aalborg inferno")
+    saved = {driver: saved_drives(driver) for driver in drivers if is_saved(driver)}
+    where = _track(track, drivers, saved)
+    drives = []
+    for driver in drivers:
+        known = saved.get(driver)
+        drives += _driven(str(driver), where, laps, trust) if known is None else known
+    return LapReport(compare_drives(_told_apart(drives), load_track(where)))
+
+
+def report_of(frame: pd.DataFrame) -> LapReport:
+    """
+    Make the lap report of drives that are there already, such as those of a race.
+
+    :param frame: of a :class:`~sb3_torcs.telemetry.DriveLog`, on one track
+    :return: the report; its first driver is the first of the table
+    :raises DriveFileError: if nobody drove a whole lap
+    """
+    drives = drives_of(frame)
+    return LapReport(compare_drives(drives, load_track(_track(None, (), {"": drives}))))
+
+
+def is_saved(driver: str | Path) -> bool:
+    """Whether a driver is a file of drives, by its ending."""
+    return Path(driver).suffix.lower() in SAVED
+
+
+def saved_drives(file: str | Path) -> list[Drive]:
+    """
+    Read the drives of a file.
+
+    :param file: of saved drives, such as ``--telemetry`` writes
+    :return: one per driver in it
+    :raises DriveFileError: if it cannot be read
+    """
+    path = Path(os.path.expanduser(file))
+    return drives_of(SAVED[path.suffix.lower()](path))
+
+
+def _track(
+    given: str | None, drivers: Sequence[str | Path], saved: dict[str | Path, list[Drive]]
+) -> str:
+    """Choose the track, and make sure that saved drives are of it."""
+    stored = [drive for drives in saved.values() for drive in drives]
+    names = list(dict.fromkeys(drive.track for drive in stored))
+    track = given or next(iter(names), None) or _trained_on(drivers)
+    if track == RANDOM_TRACK:
+        raise InvalidOption(
+            f"laps of one track are compared, and '{track}' is another one each time; give --track "
+            "a name: `sb3-torcs tracks` lists them"
+        )
+    others = [drive for drive in stored if not _same_track(drive.track, track)]
+    if others:
+        told = ", ".join(f"{drive.driver} on {drive.track}" for drive in others)
+        raise DriveFileError(
+            f"laps of different tracks cannot be compared: {told}, and the others on {track}; "
+            f"name drives of one track{'' if given is None else ', or leave out --track'}"
+        )
+    return track
+
+
+def _same_track(one: str, other: str) -> bool:
+    """Whether two names are of one track."""
+    return one == other or load_track(one).name == load_track(other).name
+
+
+def _trained_on(drivers: Sequence[str | Path]) -> str:
+    """Return the track of the first agent whose training is known."""
+    for driver in drivers:
+        if _robot(str(driver)) is None:
+            track = driver_record(driver).env_kwargs.get("track")
+            if track is not None:
+                return str(one_track(track))
+    return DEFAULT_TRACK
+
+
+def _robot(driver: str) -> tuple[str, int] | None:
+    """Return the name and the index of a robot; ``None`` if there is none of this name."""
+    try:
+        game = find_game()
+    except BackendUnavailable:  # no game, no robots
+        return None
+    known = driver.partition(":")[0] in game.robots()
+    return game.parse_robot(driver) if known else None
+
+
+def _driven(driver: str, track: str, laps: int, trust: bool) -> list[Drive]:
+    """Let a robot or an agent drive."""
+    robot = _robot(driver)
+    if robot is None:
+        return drives_of(_agent_log(driver, track, laps, trust).frame())
+    return drives_of(drive_log([robot], track, laps).frame())
+
+
+def _agent_log(driver: str, track: str, laps: int, trust: bool) -> DriveLog:
+    """Let an agent drive, where it was trained, and note each control tick."""
+    try:
+        record = driver_record(driver)
+    except InvalidOption as error:
+        hint = near_miss(driver, _robots())
+        raise InvalidOption(f"{error}; and there is no robot '{driver}'{hint}") from None
+    world = choose_world(driver, record.env_id, track)
+    env = race_environment(
+        world.env_id,
+        record.env_kwargs,
+        track,
+        laps=laps,
+        hyperparameters=record.hyperparameters,
+        trust=trust,
+    )
+    try:
+        log = log_drives(env, driver_name(driver))
+        for _ in drive(env, load_driver(driver, env, trust=trust), seed=0):
+            pass
+    finally:
+        env.close()
+    return log
+
+
+def _robots() -> list[str]:
+    try:
+        return list(find_game().robots())
+    except BackendUnavailable:
+        return []
+
+
+def _told_apart(drives: Sequence[Drive]) -> list[Drive]:
+    """Number drivers of one name."""
+    seen: Counter[str] = Counter()
+    told = []
+    for one in drives:
+        seen[one.driver] += 1
+        count = seen[one.driver]
+        told.append(one if count == 1 else replace(one, driver=f"{one.driver} ({count})"))
+    return told

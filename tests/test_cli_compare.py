@@ -1,0 +1,168 @@
+"""``sb3-torcs compare``: agents, robots and saved drives on one page, and errors that help."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from made_drives import drive, log_of
+
+from sb3_torcs.cli import main
+from sb3_torcs.evaluation import comparing
+from sb3_torcs.evaluation.comparing import compare
+from sb3_torcs.telemetry import DriveLog
+from sb3_torcs.tracks.catalogue import load_track
+
+TRACK = "g-track-1"
+
+
+@pytest.fixture
+def saved(tmp_path):
+    """Two drivers of one track, in one file."""
+    track = load_track(TRACK)
+    log = DriveLog()
+    for name, pace in (("ana", 25.0), ("ben", 20.0)):
+        drive(log, track, name, speed=lambda place, pace=pace: pace, track=TRACK)
+    path = tmp_path / "drives.parquet"
+    log.write(path)
+    return path
+
+
+def run(capsys, *words):
+    status = main(["compare", *map(str, words)])
+    out, err = capsys.readouterr()
+    return status, out, err
+
+
+@pytest.mark.usefixtures("game")
+def test_an_agent_a_robot_and_a_saved_drive_are_compared(tmp_path, capsys):
+    """And the robot as it was saved drives as the robot does."""
+    saved = tmp_path / "inferno.parquet"
+    assert main(["robots", "inferno", "--laps", "2", "--telemetry", str(saved)]) == 0
+    capsys.readouterr()
+    page = tmp_path / "report.html"
+    words = ["scripted", "inferno", saved, "--track", "aalborg", "--laps", "2", "--html", page]
+    status, out, _ = run(capsys, *words, "--json")
+    report = json.loads(out)
+    assert (status, report["track"], report["html"]) == (0, "aalborg", str(page))
+    names = ["scripted", "inferno", "inferno (2)"]
+    assert [driver["driver"] for driver in report["drivers"]] == names
+    first, robot, again = report["drivers"]
+    assert robot["lap_time"] == again["lap_time"]
+    assert robot["corners"] == again["corners"]
+    assert robot["delta_at_end"] == pytest.approx(robot["lap_time"] - first["lap_time"], abs=1e-9)
+    assert len(robot["corners"]) == 17
+    assert set(robot["corners"][0]) == {
+        "distance", "braking_point", "entry_speed", "apex_speed", "exit_speed", "time_lost",
+    }  # fmt: skip
+    assert page.read_text().startswith("<!DOCTYPE html>")
+
+
+def test_the_documented_json_is_what_it_prints(saved, tmp_path, capsys):
+    page = Path(__file__).parent.parent / "docs" / "lap-report.md"
+    example = json.loads(page.read_text("utf-8").split("```json\n")[1].split("```")[0])
+    _, out, _ = run(capsys, saved, "--html", tmp_path / "page.html", "--json")
+    printed = json.loads(out)
+    assert list(example) == list(printed)
+    (documented,), driver = example["drivers"], printed["drivers"][0]
+    assert list(documented) == list(driver)
+    assert list(documented["corners"][0]) == list(driver["corners"][0])
+
+
+def test_it_prints_what_the_page_shows(saved, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    status, out, _ = run(capsys, saved)
+    assert status == 0
+    lines = out.splitlines()
+    assert lines[0] == TRACK
+    assert lines[3].split() == ["ana", "82.302", "0.000"]
+    assert lines[4].split() == ["ben", "102.878", "20.576"]
+    assert lines[-2].startswith("ben is 20.576 s slower than ana")
+    assert lines[-1] == "page: report.html"
+    assert (tmp_path / "report.html").is_file()
+
+
+def test_an_agent_drives_the_track_of_a_saved_drive(saved):
+    report = compare(saved, "scripted", laps=1)
+    assert report.comparison.track.name == TRACK
+    assert report.comparison.drivers[-1].drive.track == TRACK
+
+
+def test_the_track_is_that_of_the_training(monkeypatch):
+    asked = []
+    monkeypatch.setattr(comparing, "_driven", lambda *words: asked.append(words[1]) or [])
+    monkeypatch.setattr(comparing, "compare_drives", lambda drives, track: None)
+    compare("ddpg-league")
+    compare("scripted")
+    compare("ddpg-league", track="forza")
+    assert asked == ["corkscrew", "aalborg", "forza"]
+
+
+def test_an_evaluation_makes_the_same_page(tmp_path, capsys):
+    page = tmp_path / "lap.html"
+    words = f"evaluate scripted --env TorcsLite-v0 --track {TRACK} --laps 1 --report {page}"
+    assert main(words.split()) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == f"report: {page}"
+    text = page.read_text()
+    assert "There is one lap only" in text
+    assert "From the grid, not flying: the lap of scripted." in text
+
+
+def test_in_a_notebook_the_report_shows_itself(saved):
+    shown = compare(saved)._repr_html_()
+    assert shown.startswith('<iframe srcdoc="&lt;!DOCTYPE html&gt;')
+
+
+def test_drives_of_different_tracks_are_refused(saved, oval, tmp_path, capsys):
+    other = tmp_path / "other.parquet"
+    drive(DriveLog(), oval, "cleo", track="aalborg").write(other)
+    status, _, err = run(capsys, saved, other)
+    assert status == 2
+    assert "laps of different tracks cannot be compared: cleo on aalborg, and the others on" in err
+    status, _, err = run(capsys, saved, "--track", "aalborg")
+    assert status == 2
+    assert "ana on g-track-1, ben on g-track-1, and the others on aalborg; name drives" in err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["none.parquet"], "there is no file 'none.parquet'"),
+        (["broken.parquet"], "'broken.parquet' cannot be read as a drive"),
+        (["infernal"], "there is no model 'infernal'"),
+        (["scripted", "--track", "forzza"], "no track 'forzza'"),
+        (["scripted", "--html", "page.txt"], "'page.txt' should end in .html"),
+        (
+            ["scripted", "--track", "random"],
+            "laps of one track are compared, and 'random' is another one each time",
+        ),
+    ],
+)
+def test_what_cannot_be_compared(words, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "broken.parquet").write_bytes(b"PAR1")
+    status, _, err = run(capsys, *words)
+    assert status == 2
+    assert message in err
+
+
+def test_an_unfinished_lap_alone_is_an_error(oval, tmp_path, capsys):
+    path = tmp_path / "short.parquet"
+    drive(DriveLog(), oval, laps=0, end=120.0, track="aalborg").write(path)
+    status, _, err = run(capsys, path, "--html", tmp_path / "page.html")
+    assert status == 2
+    assert "nobody drove a whole lap of aalborg, 2588 m: ana drove 120 m" in err
+    assert not (tmp_path / "page.html").exists()
+
+
+def test_nobody_is_nobody_to_compare():
+    with pytest.raises(ValueError, match="there is nobody to compare; name drivers"):
+        compare()
+
+
+def test_a_race_of_several_makes_a_page_too(oval, monkeypatch):
+    """Whoever has a log of drives calls this."""
+    monkeypatch.setattr(comparing, "load_track", lambda name: oval)
+    report = comparing.report_of(log_of(oval, ("ana", 25.0), ("ben", 20.0)).frame())
+    assert [one.drive.driver for one in report.comparison.drivers] == ["ana", "ben"]
