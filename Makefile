@@ -7,6 +7,8 @@ BUILT := $(VENV)/.built
 NATIVE := $(wildcard sb3_torcs/native/*.* sb3_torcs/native/*/*)
 SOURCES := setup.py $(NATIVE)
 SHELL := /bin/bash
+SUDO := $(if $(filter 0,$(shell id -u)),,sudo)
+BROWSER := $(SUDO) apt-get install --yes --no-install-recommends chromium chromium-driver
 
 # One thread per process: on few cores torch's own threads get in each other's way.
 export OMP_NUM_THREADS ?= 1
@@ -44,10 +46,15 @@ $(BUILT): $(STAMP) $(SOURCES)
 game: install ## get TORCS and Xvfb, if they are not here
 	$(BIN)/sb3-torcs install-torcs --video
 
-test: native game check-codestyle lint type ## check format, lint and types, and run every test
+# Debian's packages; elsewhere a test says what it needs.
+browser: ## get Chromium, in which tests open the pages, if it is not here
+	@command -v chromium >/dev/null && command -v chromedriver >/dev/null || { set -x; \
+	  $(BROWSER) || { $(SUDO) apt-get update && $(BROWSER); }; }
+
+test: native game browser check-codestyle lint type ## check format, lint and types, and run every test
 	$(BIN)/python -m pytest -n 2 --durations=10
 
-pytest: native game ## run the tests that do not train
+pytest: native game browser ## run the tests that do not train
 	$(BIN)/python -m pytest -n 2 -m 'not slow'
 
 # Python itself leaks by design and is built without the sanitizers and without C++: they are loaded
@@ -89,4 +96,4 @@ commit-checks: format lint type ## what to run before a commit
 clean: ## remove .venv/ and what was built; trainings stay
 	rm -rf build dist *.egg-info $(VENV)
 
-.PHONY: help install native game demo test pytest sanitize bench format check-codestyle lint type commit-checks clean
+.PHONY: help install native game browser demo test pytest sanitize bench format check-codestyle lint type commit-checks clean
