@@ -1,3 +1,4 @@
+import argparse
 import csv
 import dataclasses
 import importlib
@@ -310,6 +311,26 @@ def test_an_evaluation_says_what_happened(capsys):
     assert set(episode) == keys
     assert (episode["laps"], episode["end"], len(episode["lap_times"])) == (1, "laps", 1)
     assert run(capsys, *words) == (0, out, "")
+
+
+def test_an_evaluation_takes_any_argument_of_the_environment(capsys):
+    """Conditions such as a delay are not those of the training unless they are given."""
+    words = ["evaluate", "scripted", *LITE, "--track", "g-track-1", "--laps", "1", "--json"]
+    times = []
+    for more in ([], ["--env-kwargs", "delay=[3, 4]", "sensors=[base, preview]"]):
+        status, out, _ = run(capsys, *words, *more)
+        assert status == 0
+        times.append(json.loads(out)["episodes"][0]["lap_times"])
+    assert times[0] != times[1]
+    status, _, err = run(capsys, *words, "--env-kwargs", "dely=3")
+    assert status == 2
+    assert "--env-kwargs: unknown env_kwargs: argument 'dely'; did you mean 'delay'?" in err
+
+
+@pytest.mark.parametrize("words", ["delay", "=3", "delay=[3"])
+def test_an_argument_without_a_value_is_refused(words):
+    with pytest.raises(argparse.ArgumentTypeError, match=r"expected NAME=VALUE, e\.g\. delay=2"):
+        common.setting(words)
 
 
 def test_an_evaluation_as_a_table_has_a_row_per_episode(capsys):

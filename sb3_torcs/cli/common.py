@@ -21,6 +21,7 @@ __all__ = [
     "print_json",
     "quiet_output",
     "seed",
+    "setting",
     "table",
     "told_record",
 ]
@@ -87,6 +88,24 @@ def seed(text: str) -> int:
     if number >= 2**32:
         raise argparse.ArgumentTypeError(f"{text!r}: expected a whole number below 2**32")
     return number
+
+
+def setting(text: str) -> tuple[str, Any]:
+    """
+    Read a name and a value of YAML, for argparse.
+
+    :param text: from the command line, e.g. ``"delay=[0, 5]"``
+    :return: the name and the value, of plain Python types
+    """
+    from yaml import YAMLError
+
+    from sb3_torcs.files import read_yaml
+
+    name, equals, value = text.partition("=")
+    with contextlib.suppress(YAMLError):
+        if name.isidentifier() and equals:
+            return name, read_yaml(value)
+    raise argparse.ArgumentTypeError(f"{text!r}: expected NAME=VALUE, e.g. delay=2")
 
 
 @contextlib.contextmanager

@@ -16,6 +16,7 @@ from sb3_torcs.cli.common import (
     print_json,
     quiet_output,
     seed,
+    setting,
     table,
     told_record,
 )
@@ -69,6 +70,14 @@ def add_parser(subparsers: Any) -> None:
     add("--seed", type=seed, default=0, metavar="S", help="of the first reset; default: 0")
     add("--action-repeat", type=positive, metavar="N", help="control ticks of 0.02 s per timestep")
     add("--range-finders", metavar="SET", help="scr or narrow")
+    add(
+        "--env-kwargs",
+        nargs="+",
+        type=setting,
+        default=[],
+        metavar="NAME=VALUE",
+        help="other arguments of the environment, e.g. delay=2 or opponents='[inferno, bt]'",
+    )
     add("--algo", help="the model's algorithm, if it cannot be found out")
     add("--trust", action="store_true", help=TRUST_HELP)
     add("--json", action="store_true", help="print one JSON object and nothing else")
@@ -158,7 +167,7 @@ def _drive(args: argparse.Namespace, *, ticks: bool) -> tuple[list[Episode], Rec
     from sb3_torcs.evaluation.recording import Recorder
     from sb3_torcs.evaluation.ticks import log_drives
     from sb3_torcs.telemetry import DriveLog
-    from sb3_torcs.training.zoo import check_racing
+    from sb3_torcs.training.zoo import check_env_kwargs, check_racing
 
     record = told_record(args.model)
     env_id = args.env
@@ -166,6 +175,7 @@ def _drive(args: argparse.Namespace, *, ticks: bool) -> tuple[list[Episode], Rec
         env_id, reason = choose_world(args.model, record.env_id, args.track)
         print(f"driving {env_id}: {reason}", file=sys.stderr)
     check_racing(env_id)
+    check_env_kwargs(dict(args.env_kwargs), env_id, "--env-kwargs")
     kwargs = environment_kwargs(args, record)
     recorder = Recorder(env_id, kwargs, time_limit(kwargs))
     # The recorder is inside the wrappers, so it records the actions that reach the car.
@@ -190,6 +200,7 @@ def environment_kwargs(args: argparse.Namespace, record: TrainingRecord) -> dict
     kwargs = record.kept(KEPT)
     given = {name: getattr(args, name, None) for name in KEPT}
     kwargs.update({name: value for name, value in given.items() if value is not None})
+    kwargs.update(getattr(args, "env_kwargs", ()))
     one_track(kwargs.get("track"))
     return {**kwargs, "laps": args.laps}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -27,6 +28,9 @@ __all__ = ["Batch", "Timestep", "fleet_of"]
 
 Counts = npt.NDArray[np.int64]
 
+Held = tuple[FloatArray, Counts]
+"""Controls of all races, (n, 5), and for how many control ticks each of them is held, (n,)."""
+
 CONTROLS_RECORD = np.dtype([(name, "f8") for name in Controls._fields])
 CAR_NUMBERS = CAR_RECORD.itemsize // 8
 NO_TERM = -1
@@ -43,6 +47,7 @@ class Timestep(NamedTuple):
     names: list[tuple[str, ...]]  # of the terms
     standing: Counts  # (n,) control ticks for which cars had been standing before
     patience: Counts  # (n,) control ticks for which they were allowed to stand
+    waiting: list[tuple[Controls, ...]]  # controls that had not arrived before, of each race
     ended: npt.NDArray[np.bool_]  # (n,) also if the race has failed; time limits are not known here
     failures: dict[int, Exception]  # the errors of races, by index
 
@@ -123,7 +128,8 @@ class Batch:
         self._cars = np.zeros((number, CAR_NUMBERS))
         self._laps = np.full(number, np.inf)
         self._ticks, self._patience, self._standing = np.ones((3, number), np.int64)
-        self._driven: list[list[FloatArray]] = [[] for _ in self.envs]
+        self._driven: list[list[list[Held]]] = [[] for _ in self.envs]
+        self._controls = np.zeros((number, len(Controls._fields)))
         self._rewards = [env.reward for env in self.envs]
         self._read_rewards()
 
@@ -168,11 +174,15 @@ class Batch:
         """
         if not self._driven[race]:
             return
-        env, ticks = self.envs[race], int(self._ticks[race])
-        car = car_from_record(self._cars[race])
-        steps = [(_controls(row[race]), ticks) for row in self._driven[race]]
+        env, car = self.envs[race], car_from_record(self._cars[race])
+        steps = [
+            (_controls(controls[race]), int(ticks[race]))
+            for parts in self._driven[race]
+            for controls, ticks in parts
+            if ticks[race]
+        ]
         self._fleet.arrive(int(self._worlds[race]), steps, car)
-        env.arrive(car, steps[-1][0], int(self._standing[race]))
+        env.arrive(car, _controls(self._controls[race]), int(self._standing[race]))
         self._driven[race] = []
 
     def step(self, asked: npt.NDArray[np.floating]) -> Timestep:
@@ -186,7 +196,9 @@ class Batch:
         """
         controls = self._read(asked)
         before, after = self._cars, np.empty_like(self._cars)
-        failed = self._fleet.step(self._worlds, controls, self._ticks, after)
+        waiting = [env.delay.waiting for env in self.envs]
+        parts = self._parts(controls)
+        failed = self._drive(parts, after)
         after[failed] = before[failed]
         number = len(self.envs)
         observations = np.empty((number, self._view.size), np.float32)
@@ -213,9 +225,9 @@ class Batch:
             values[race, i] = self._ask(term, weight, before[race], after[race], controls[race])
         ended[failed] = True
         terms = values.tolist()
-        self._cars = after
+        self._cars, self._controls = after, controls
         for driven in self._driven:
-            driven.append(controls)
+            driven.append(parts)
         return Timestep(
             before,
             after,
@@ -225,6 +237,7 @@ class Batch:
             self._names,
             standing,
             patience,
+            waiting,
             ended,
             {race: self._fleet.failure(int(self._worlds[race])) for race in failed},
         )
@@ -243,12 +256,14 @@ class Batch:
         failure = timestep.failures.get(race)
         if failure is not None and not isinstance(failure, CarLost):
             self._driven[race].pop()
+            env.delay.waiting = timestep.waiting[race]
             self._standing[race] = timestep.standing[race]
             self._patience[race] = timestep.patience[race]
             raise failure
         env.car = car_from_record(timestep.before[race])
         env.standing = int(timestep.standing[race])
         env.patience = int(timestep.patience[race])
+        env.delay.waiting = timestep.waiting[race]
         world, env.backend = env.backend, _Driven(env.backend, timestep, race)
         try:
             return act()
@@ -259,6 +274,44 @@ class Batch:
     def close(self) -> None:
         """End the threads."""
         self._fleet.close()
+
+    def _parts(self, controls: FloatArray) -> list[Held]:
+        """
+        Split the timestep where controls arrive.
+
+        :param controls: (n, 5) that were asked for
+        :return: what is held, one part if no controls arrive during the timestep, else two
+        """
+        if not any(env.delay.ticks for env in self.envs):
+            return [(controls, self._ticks.copy())]
+        first, second = np.zeros((2, *controls.shape))
+        ticks = np.zeros((2, len(self.envs)), np.int64)
+        for race, env in enumerate(self.envs):
+            *begun, (held, ticks[1, race]) = env.delay.hold(_controls(controls[race]))
+            second[race] = _row(held)
+            for held, number in begun:
+                first[race], ticks[0, race] = _row(held), number
+        return [(first, ticks[0]), (second, ticks[1])]
+
+    def _drive(self, parts: list[Held], after: FloatArray) -> list[int]:
+        """
+        Drive all races.
+
+        :param parts: of the timestep
+        :param after: (n, 82) filled
+        :return: the races that failed, whose rows are not
+        """
+        if len(parts) == 1:
+            return self._fleet.step(self._worlds, *parts[0], after)
+        going, failed = np.ones(len(self.envs), np.bool_), []
+        for controls, ticks in parts:
+            races = np.flatnonzero(going & (ticks > 0))
+            cars = np.empty((len(races), CAR_NUMBERS))
+            lost = self._fleet.step(self._worlds[races], controls[races], ticks[races], cars)
+            after[races] = cars
+            failed += races[lost].tolist()
+            going[races[lost]] = False
+        return failed
 
     def _read(self, asked: npt.NDArray[np.floating]) -> FloatArray:
         """Turn the actions into controls, (n, 5)."""
@@ -275,8 +328,7 @@ class Batch:
                 f"({len(self.envs)}, {len(low)}), as of model.predict(observations)"
             )
         for race, row in enumerate(rows):
-            steering, throttle, brake, gear, clutch = controls_from_action(row, self._layout)
-            controls[race] = steering, throttle, brake, np.nan if gear is None else gear, clutch
+            controls[race] = _row(controls_from_action(row, self._layout))
         return controls
 
     def _ask(
@@ -291,6 +343,12 @@ class Batch:
         was, car = car_from_record(before), car_from_record(after)
         seconds = car.time - was.time
         return weight * seconds * term(was, car, _controls(controls)) if seconds else 0.0
+
+
+def _row(controls: Controls) -> tuple[float, ...]:
+    """Write controls as a row of an array, (5,)."""
+    steering, throttle, brake, gear, clutch = controls
+    return steering, throttle, brake, math.nan if gear is None else gear, clutch
 
 
 def _controls(row: FloatArray) -> Controls:

@@ -29,6 +29,7 @@ from sb3_torcs.car import (
     is_count,
     is_number,
 )
+from sb3_torcs.envs.conditions import Delay, Part, checked_delay, draw_delay
 from sb3_torcs.errors import CarLost, EnvClosed, InvalidOption
 from sb3_torcs.rewards import Reward, RewardChoice
 from sb3_torcs.sensors import SensorsName, View
@@ -135,6 +136,8 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
     :param action_repeat: control ticks of 0.02 s per timestep
     :param start: ``"grid"``, or ``"random"``: anywhere on the track, moving
     :param laps: whole laps after which the episode is truncated; ``None`` drives on
+    :param delay: control ticks by which controls arrive late; or a pair, between which each
+        episode draws
     :param render_mode: ``None``, or one of ``metadata["render_modes"]``
     :raises InvalidOption: if an option has a value that is not allowed
     """
@@ -151,6 +154,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         action_repeat: int = 5,
         start: StartName = "grid",
         laps: int | None = None,
+        delay: int | Sequence[int] = 0,
         render_mode: str | None = None,
     ) -> None:
         if not is_count(action_repeat) or action_repeat > MAX_ACTION_REPEAT:
@@ -180,6 +184,8 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         self.set_reward(reward)
         self.set_start(start)
         self.set_random_speed(RANDOM_SPEED)
+        self._delays = checked_delay(delay)
+        self.delay = Delay(0, self.action_repeat)
         self.car: CarState | None = None
         self._controls = Controls(0.0, 0.0, 0.0)
         self._viewer: Any = None
@@ -257,6 +263,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         if self._draw_track is not None:
             self._draw_track(self.np_random)
         start = self._place(options) if options else self._draw_start()
+        self.delay = Delay(draw_delay(self._delays, self.np_random), self.action_repeat)
         self.car = None  # if the reset fails, no step is possible
         self.car = self.backend.reset(self.np_random, start)
         self._controls = Controls(0.0, 0.0, 0.0)
@@ -278,19 +285,26 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         :return: observation, reward, terminated, truncated, info
         :raises InvalidAction: if the action has another shape or is not a number
         """
-        controls = self.begin_step(action)
-        return self.finish_step(partial(self.backend.step, controls, self.action_repeat))
+        parts = self.begin_step(action)
+        return self.finish_step(partial(self._hold, parts))
 
-    def begin_step(self, action: npt.NDArray[np.float32]) -> Controls:
+    def _hold(self, parts: list[Part]) -> CarState:
+        """Drive what ``begin_step`` returned."""
+        for controls, ticks in parts[:-1]:
+            self.backend.step(controls, ticks)
+        return self.backend.step(*parts[-1])
+
+    def begin_step(self, action: npt.NDArray[np.float32]) -> list[Part]:
         """
         Do the part of ``step`` before the world moves. Used to drive several worlds at once.
 
         :param action: as of ``step``
-        :return: the arguments of the backend's ``step``
+        :return: the arguments of the calls of the backend's ``step``: one, or two if the controls
+            arrive during the timestep
         """
         self.check_ready()
         self._controls = controls_from_action(action, self.layout)
-        return self._controls
+        return self.delay.hold(self._controls)
 
     def check_ready(self) -> None:
         """
@@ -305,7 +319,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
 
     @property
     def controls(self) -> Controls:
-        """The controls of the last timestep."""
+        """The controls that were asked for in the last timestep."""
         return self._controls
 
     def finish_step(

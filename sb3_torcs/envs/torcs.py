@@ -64,6 +64,8 @@ class TorcsEnv(RacingEnv):
         the wheels spin, and slips the clutch to set off
     :param start: ``"grid"`` or ``"random"``
     :param laps: whole laps after which the episode is truncated; ``None`` drives on
+    :param delay: control ticks of 0.02 s from an observation until the controls that answer it
+        arrive; or a pair, e.g. ``(0, 5)``, between which each episode draws
     :param render_mode: ``"rgb_array"`` or ``"human"``; ``"game"`` is another name for
         ``"rgb_array"`` with ``picture="game"``
     :param picture: ``"above"``, the road and the car from above, or ``"game"``, the game's own 3D
@@ -103,6 +105,7 @@ class TorcsEnv(RacingEnv):
         gearbox: GearboxName = "automatic",
         start: StartName = "grid",
         laps: int | None = None,
+        delay: int | Sequence[int] = 0,
         render_mode: GameRenderMode | None = None,
         backend: BackendName = "native",
         opponents: Sequence[str] = (),
@@ -154,6 +157,7 @@ class TorcsEnv(RacingEnv):
             action_repeat=action_repeat,
             start=start,
             laps=laps,
+            delay=delay,
             render_mode=render_mode,
         )
 

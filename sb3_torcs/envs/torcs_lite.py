@@ -77,6 +77,8 @@ class TorcsLiteEnv(RacingEnv):
         the wheels spin, and slips the clutch to set off
     :param start: ``"grid"`` or ``"random"``
     :param laps: whole laps after which the episode is truncated; ``None`` drives on
+    :param delay: control ticks of 0.02 s from an observation until the controls that answer it
+        arrive; or a pair, e.g. ``(0, 5)``, between which each episode draws
     :param render_mode: ``"rgb_array"`` or ``"human"``
     :param picture: ``"above"``
     :param of_the_game: options of ``Torcs-v0`` alone, which are refused by name
@@ -95,6 +97,7 @@ class TorcsLiteEnv(RacingEnv):
         gearbox: GearboxName = "automatic",
         start: StartName = "grid",
         laps: int | None = None,
+        delay: int | Sequence[int] = 0,
         render_mode: RenderMode | None = None,
         picture: Literal["above"] = "above",
         **of_the_game: Any,
@@ -122,6 +125,7 @@ class TorcsLiteEnv(RacingEnv):
             action_repeat=action_repeat,
             start=start,
             laps=laps,
+            delay=delay,
             render_mode=render_mode,
         )
 

@@ -6,6 +6,7 @@ import itertools
 import math
 import os
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -18,9 +19,10 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from sb3_torcs.backends.native import Fleet
 from sb3_torcs.backends.several import world_index, worlds_of
 from sb3_torcs.car import CarState, is_count
+from sb3_torcs.envs.conditions import Part
 from sb3_torcs.envs.racing import Observation
 from sb3_torcs.envs.torcs import TorcsEnv
-from sb3_torcs.errors import EnvClosed, InvalidAction, InvalidOption
+from sb3_torcs.errors import CarLost, EnvClosed, InvalidAction, InvalidOption
 
 __all__ = ["TorcsVectorEnv"]
 
@@ -105,20 +107,28 @@ class TorcsVectorEnv(SyncVectorEnv):
                 f"{self.action_space.shape}: take them from envs.action_space.sample()"
             )
         anew = self._begin_anew()
-        ticks = self.envs[0].action_repeat
         # All before any drives: a wrong one leaves all races where they are.
-        controls = {
+        parts = {
             index: env.begin_step(rows[index])
             for index, env in enumerate(self.envs)
             if not anew[index]
         }
         try:
-            for index, asked in controls.items():
-                self._fleet.begin(self._world(index), asked, ticks)
+            for index, (held, *_) in parts.items():
+                self._fleet.begin(self._world(index), *held)
+            for index, (_, *later) in parts.items():
+                for held in later:  # the controls have arrived
+                    self._go_on(self._world(index), held)
             return self._collect(anew)
         except BaseException:
             self._fleet.finish()  # so that a reset finds no thread at work
             raise
+
+    def _go_on(self, world: int, held: Part) -> None:
+        """Drive the next part of a timestep, unless the race has failed in the one before."""
+        with suppress(CarLost):  # told when the car is collected
+            self._fleet.wait(world)
+            self._fleet.begin(world, *held)
 
     def _world(self, index: int) -> int:
         """The world of the fleet in which a race is."""

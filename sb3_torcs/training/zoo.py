@@ -197,7 +197,7 @@ def check_entry(entry: Entry, algo: str, env_id: str, place: Place, *, trust: bo
     for key in ("callback", "env_wrapper", "vec_env_wrapper"):
         for path, arguments in _items(entry.get(key), key, place):
             _check_call(f"{key} {path}", _imported(path, key, place), arguments, place)
-    _check_env_kwargs(entry.get("env_kwargs"), env_id, place)
+    check_env_kwargs(entry.get("env_kwargs"), env_id, place)
     _check_wrappers(entry, place)
     _check_symmetric(entry, place)
 
@@ -220,8 +220,15 @@ def _check_symmetric(entry: Entry, place: Place) -> None:
         )
 
 
-def _check_env_kwargs(env_kwargs: Any, env_id: str, place: Place) -> None:
-    """Check what goes to ``gym.make``."""
+def check_env_kwargs(env_kwargs: Any, env_id: str, place: Place | str) -> None:
+    """
+    Check what goes to ``gym.make``.
+
+    :param env_kwargs: names and values
+    :param env_id: of the environment
+    :param place: where they were given
+    :raises ZooConfigError: if the environment does not have one of them
+    """
     if not isinstance(env_kwargs, Mapping | None):
         raise ZooConfigError(f"{place}: env_kwargs is {env_kwargs!r}; expected '{{key: value}}'")
     if env_kwargs is not None and TIME_LIMIT in env_kwargs:
@@ -435,7 +442,7 @@ def _check_call(
     what: str,
     function: Callable[..., Any],
     arguments: Any,
-    place: Place,
+    place: Place | str,
     given: Iterable[str] = ("self",),
 ) -> None:
     """Make sure that a constructor has these arguments; the zoo evaluates strings itself."""
@@ -444,7 +451,9 @@ def _check_call(
         _check_keys(arguments, known - set(given), f"{what}: argument", place)
 
 
-def _check_keys(mapping: Mapping[str, Any], known: Iterable[str], what: str, place: Place) -> None:
+def _check_keys(
+    mapping: Mapping[str, Any], known: Iterable[str], what: str, place: Place | str
+) -> None:
     """Make sure that all keys are known."""
     known = sorted(known)
     for key in mapping:

@@ -1,0 +1,100 @@
+"""Conditions that an episode draws: for agents that shall drive in more worlds than one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sb3_torcs.car import Controls, is_count, is_number
+from sb3_torcs.errors import InvalidOption
+
+__all__ = ["MAX_DELAY", "Delay", "Range", "checked_delay", "draw_delay"]
+
+MAX_DELAY = 50  # control ticks: 1 s
+RESTING = Controls(0.0, 0.0, 0.0)  # held until the first action arrives
+
+Part = tuple[Controls, int]
+"""Controls, and the control ticks for which they are held."""
+
+
+class Range(NamedTuple):
+    """The bounds of a number that each episode draws; equal ones draw nothing."""
+
+    low: float
+    high: float
+
+
+def checked_range(name: str, choice: Any, low: float, high: float, unit: str) -> Range:
+    """
+    Check a number, or the two bounds of one that is drawn.
+
+    :param name: of the option
+    :param choice: what was given
+    :param low: the least that is allowed
+    :param high: the most that is allowed
+    :param unit: of both, in words
+    :raises InvalidOption: if it is no such number
+    """
+    pair = list(choice) if isinstance(choice, Sequence | np.ndarray) else [choice, choice]
+    numbers = not isinstance(choice, str) and len(pair) == 2 and all(map(is_number, pair))
+    if not numbers or not low <= pair[0] <= pair[1] <= high:
+        raise InvalidOption(
+            f"{name} is {choice!r}; expected {unit} from {low:g} to {high:g}, or a pair of them, "
+            "between which each episode draws"
+        )
+    return Range(*pair)
+
+
+def checked_delay(choice: Any) -> Range:
+    """
+    Check the option ``delay``.
+
+    :param choice: control ticks, or a pair of them
+    :raises InvalidOption: if it is no such number
+    """
+    bounds = checked_range("delay", choice, 0, MAX_DELAY, "whole control ticks")
+    if not all(bound == 0 or is_count(bound) for bound in bounds):
+        raise InvalidOption(f"delay is {choice!r}; expected whole control ticks of 0.02 s")
+    return bounds
+
+
+def draw_delay(bounds: Range, rng: np.random.Generator) -> int:
+    """
+    Draw the delay of an episode. Equal bounds draw nothing.
+
+    :param bounds: from :func:`checked_delay`
+    :param rng: the environment's
+    :return: control ticks
+    """
+    low, high = int(bounds.low), int(bounds.high)
+    return low if low == high else int(rng.integers(low, high + 1))
+
+
+class Delay:
+    """
+    Controls that arrive late: a timestep goes on with earlier ones until they do.
+
+    :param ticks: from an observation to the arrival of the controls that answer it
+    :param repeat: control ticks per timestep
+    """
+
+    def __init__(self, ticks: int = 0, repeat: int = 1) -> None:
+        self.ticks = ticks
+        whole, self._rest = divmod(ticks, repeat)
+        self._repeat = repeat
+        self.waiting: tuple[Controls, ...] = (RESTING,) * (whole + 1)
+        """Controls that are held or on their way, oldest first."""
+
+    def hold(self, controls: Controls) -> list[Part]:
+        """
+        Begin a timestep.
+
+        :param controls: that set out now
+        :return: what is held in it, one part or two
+        """
+        earlier, later, *_ = *self.waiting, controls
+        self.waiting = (*self.waiting[1:], controls)
+        parts = [(earlier, self._rest), (later, self._repeat - self._rest)]
+        return parts if self._rest else parts[1:]
