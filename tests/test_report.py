@@ -212,3 +212,16 @@ def test_one_picture_shows_all_variants(tmp_path):
     ]  # fmt: skip
     assert text.index("![all variants](learning.png)") < text.index("![base](learning-base.png)")
     assert (tmp_path / "out" / "learning.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_the_whole_distance_is_in_the_picture(tmp_path, monkeypatch):
+    seen = []
+    monkeypatch.setattr(
+        "matplotlib.figure.Figure.savefig",
+        lambda figure, *_, **__: seen.append([axes.get_ylim() for axes in figure.axes]),
+    )
+    rows = [row(seed) for seed in (0, 1)]
+    write_report(written(tmp_path / "study", rows), tmp_path / "out")
+    (low, high) = seen[0][0]
+    assert low == 0.0
+    assert high > 7000.0

@@ -83,7 +83,6 @@ def _figure(trials: Sequence[Results]) -> tuple[Any, Any]:
         panel.set_xlabel("thousand timesteps learned from")
         panel.set_xlim(0.0, 1.02 * max(trial.train[-1]["decisions"] for trial in trials) / 1000.0)
         panel.grid(alpha=0.3)
-    panels[0].set_ylim(bottom=0.0)
     panels[2].set_ylim(-0.03, 1.03)
     return figure, panels
 
@@ -100,6 +99,7 @@ def _bands(panels: Any, every: Sequence[dict[str, Array]], colour: Any) -> tuple
 
 
 def _as_png(figure: Any) -> bytes:
+    figure.axes[0].set_ylim(bottom=0.0)  # at last: it also keeps the top where it is
     picture = io.BytesIO()
     figure.savefig(picture, dpi=100)
     return picture.getvalue()
