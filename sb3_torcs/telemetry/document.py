@@ -17,6 +17,8 @@ __all__ = ["OKABE_ITO", "Cell", "chip", "document", "paragraph", "table", "write
 
 FOLDER = Path(__file__).parent
 
+LONG = 60  # rows; a table with more scrolls on the screen
+
 OKABE_ITO = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
 """Colours that colour-blind people tell apart; without the yellow, which is weak on white."""
 
@@ -152,4 +154,5 @@ def table(
     opening = "<tbody>" if len(groups) == 1 else '<tbody class="group" tabindex="0">'
     bodies = "".join(f"{opening}{''.join(row('td', r) for r in rows)}</tbody>" for rows in groups)
     head = f"<thead>{row('th', list(headers))}</thead>"
-    return f'<div class="scroll"><table class="{kind}">{head}{bodies}</table></div>'
+    frame = "scroll long" if sum(map(len, groups)) > LONG else "scroll"
+    return f'<div class="{frame}"><table class="{kind}">{head}{bodies}</table></div>'

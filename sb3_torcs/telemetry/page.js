@@ -50,6 +50,7 @@ const PANELS = [ // title, height, columns
   ["place across the road, left edge 1, right edge −1", 1.4, ["position"]],
   ["wheel slip, spinning up, locking down", 1.2, ["slip"]],
 ].filter(([, , [column]]) => column !== "delta" || drivers.length > 1);
+const HEIGHT = window.innerWidth > 900 ? 1180 : 1050; // [px]
 const GAP = 0.028; // between two panels, of the whole height
 const MARGIN = { l: 44, r: 12, t: 26, b: 40 };
 const LIMITS = { position: [-1.15, 1.15], throttle: [-1.05, 1.05], steering: [-1.05, 1.05] };
@@ -57,7 +58,7 @@ const LIMITS = { position: [-1.15, 1.15], throttle: [-1.05, 1.05], steering: [-1
 function drawCharts() {
   const layout = {
     font: FONT, margin: MARGIN, showlegend: false, hovermode: false,
-    dragmode: touch ? false : "zoom", height: window.innerWidth > 900 ? 1180 : 1050,
+    dragmode: touch ? false : "zoom", height: HEIGHT,
     plot_bgcolor: "#fff", paper_bgcolor: "#fff", shapes: [], annotations: [],
     xaxis: {
       range: [0, lapLength], anchor: `y${PANELS.length}`, gridcolor: "#e6e9ed", zeroline: false,
@@ -93,14 +94,10 @@ function drawCharts() {
     }
     top = bottom - GAP;
   });
-  data.corners.forEach((corner, number) => {
+  data.corners.forEach((corner) => {
     layout.shapes.push({
       type: "rect", layer: "below", xref: "x", x0: corner.begin, x1: corner.end, yref: "paper",
       y0: 0, y1: 1, fillcolor: "rgba(27, 31, 36, 0.06)", line: { width: 0 },
-    });
-    layout.annotations.push({
-      text: `${number + 1}`, x: (corner.begin + corner.end) / 2, xref: "x", y: 1, yref: "paper",
-      yanchor: "bottom", yshift: 12, showarrow: false, font: { ...FONT, size: 10, color: "#5b6470" },
     });
   });
   return Plotly.newPlot(charts, traces, layout, CONFIG);
@@ -159,6 +156,45 @@ function drawMap() {
   return Plotly.newPlot(map, traces, layout, { ...CONFIG, scrollZoom: !touch });
 }
 
+// ---------------------------------------------------------------------------- numbers of corners
+
+const ROOM = 15; // [px] for a number
+
+// Choose the numbers that do not stand on others.
+function apart(places) {
+  const chosen = [];
+  return places.map(([x, y]) => {
+    const free = chosen.every(([a, b]) => Math.hypot(x - a, y - b) >= ROOM);
+    if (free) chosen.push([x, y]);
+    return free;
+  });
+}
+
+function numberCharts() {
+  const [from, to] = shown();
+  const places = data.corners.map((corner) =>
+    [MARGIN.l + ((corner.begin + corner.end) / 2 - from) / (to - from) * inner(), 0]);
+  const free = apart(places);
+  byId("numbers").replaceChildren(...places.flatMap(([x], number) => {
+    if (!free[number] || x < MARGIN.l || x > MARGIN.l + inner()) return [];
+    const label = document.createElement("span");
+    label.textContent = number + 1;
+    label.style.left = `${x}px`;
+    return [label];
+  }));
+}
+
+let scale = 0; // [m/px] of the map when it was numbered
+
+function numberMap() {
+  const [low, high] = map.layout.xaxis.range;
+  const now = (high - low) / map.clientWidth;
+  if (Math.abs(now / scale - 1) < 0.2) return;
+  scale = now;
+  const free = apart(data.corners.map((corner) => [corner.x / scale, corner.y / scale]));
+  Plotly.restyle(map, { text: [free.map((yes, number) => (yes ? `${number + 1}` : ""))] }, [cars - 1]);
+}
+
 // ---------------------------------------------------------------------------- the moment
 
 let moment = 0; // [s] since the lap began
@@ -166,7 +202,7 @@ let drawn = true;
 
 // The range of distance that the charts show, and where it lies on the screen.
 const shown = () => charts.layout.xaxis.range.map(Number);
-const inner = () => charts.clientWidth - MARGIN.l - MARGIN.r;
+const inner = () => (charts.layout.width || charts.clientWidth) - MARGIN.l - MARGIN.r;
 
 function show(time) {
   moment = Math.min(Math.max(time, 0), longest);
@@ -254,8 +290,10 @@ function zoom(number) { // to a corner; without a number back to the whole lap
 function listen() {
   charts.parentElement.addEventListener("pointermove", point);
   charts.parentElement.addEventListener("pointerdown", point);
-  charts.on("plotly_relayout", () => show(moment));
-  new ResizeObserver(() => show(moment)).observe(charts);
+  const changed = () => { numberCharts(); show(moment); };
+  charts.on("plotly_relayout", changed);
+  new ResizeObserver(changed).observe(charts);
+  map.on("plotly_relayout", numberMap);
   slider.addEventListener("input", () => { pause(); show(slider.value * longest); });
   play.addEventListener("click", () => (before === null ? start() : pause()));
   follow.addEventListener("change", () => {
@@ -268,14 +306,18 @@ function listen() {
     group.addEventListener("click", go);
     group.addEventListener("keydown", (event) => { if (event.key === "Enter") go(); });
   });
-  const resize = (width) => () => [charts, map].forEach((plot) =>
-    Plotly.relayout(plot, { width, autosize: !width }));
-  addEventListener("beforeprint", resize(690)); // [px] the width of A4
-  addEventListener("afterprint", resize(null));
+  const resize = (width, height) => () => {
+    Plotly.relayout(charts, { width, height, autosize: !width });
+    Plotly.relayout(map, { width, height: width && width / 2, autosize: !width });
+  };
+  addEventListener("beforeprint", resize(690, 860)); // [px] what of A4 is within its margins
+  addEventListener("afterprint", resize(null, HEIGHT));
 }
 
 plotlyReady.then(() => Promise.all([drawCharts(), drawMap()])).then(() => {
   listen();
+  numberCharts();
+  numberMap();
   show(0);
   document.body.dataset.ready = performance.now().toFixed(0); // [ms] since the page was opened
 });

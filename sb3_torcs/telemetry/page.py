@@ -27,6 +27,8 @@ __all__ = ["lap_report"]
 
 KMH = 3.6  # [km/h per m/s]
 MOST_SLIP = 0.5  # [-] that is shown; a car that turns round slips by any number
+EQUAL = 0.0005  # [s] less is no difference
+IN_TITLE = 3  # laps that the title names
 DASHES = ("solid", "dash", "dot")  # of the first seven drivers, the next seven, and so on
 BESIDE = 1.6  # [-] of the road's width, from its middle to a corner's number
 
@@ -39,13 +41,15 @@ def lap_report(comparison: Comparison) -> str:
     :return: HTML, which works without any other file and without a network
     """
     drivers, track = comparison.drivers, comparison.track
-    title = f"{track.name}: " + ", ".join(
-        f"{one.drive.driver} {clock(one.lap.time)}" for one in drivers
+    laps = [f"{one.drive.driver} {clock(one.lap.time)}" for one in drivers]
+    shown = ", ".join(laps[:IN_TITLE]) + (
+        f" and {len(laps) - IN_TITLE} more" if laps[IN_TITLE:] else ""
     )
+    title = f"{track.name}: {shown}"
     body = "\n".join(
         [
             f"<header><h1>{escape(title)}</h1>",
-            *(paragraph(sentence) for sentence in summary(comparison)),
+            _folded([paragraph(sentence) for sentence in summary(comparison)]),
             *(paragraph(sentence, "note missing") for sentence in missing(comparison)),
             "</header>",
             "<main>",
@@ -68,6 +72,13 @@ def lap_report(comparison: Comparison) -> str:
         ]
     )
     return document(title, body, _data(comparison), ["page.js"])
+
+
+def _folded(paragraphs: Sequence[str]) -> str:
+    """Hide all but a few paragraphs until somebody asks for them."""
+    few, rest = paragraphs[: IN_TITLE - 1], "".join(paragraphs[IN_TITLE - 1 :])
+    more = f"<details><summary>The others</summary>{rest}</details>" if rest else ""
+    return "".join(few) + more
 
 
 def clock(seconds: float) -> str:
@@ -93,13 +104,15 @@ def summary(comparison: Comparison) -> list[str]:
         behind = float(one.delta[-1])
         told = f"{one.drive.driver} is {abs(behind):.3f} s "
         told += f"{'slower' if behind > 0.0 else 'faster'} than {name}"
+        if abs(behind) < EQUAL:
+            told = f"{one.drive.driver} is as fast as {name}"
         lost = [corner.time_lost for corner in one.corners]
         if lost:
             worst, best = int(np.argmax(lost)), int(np.argmin(lost))
             parts = []
-            if lost[best] < 0.0:
+            if lost[best] < -EQUAL:
                 parts.append(f"it gains most at corner {best + 1} ({-lost[best]:.3f} s)")
-            if lost[worst] > 0.0:
+            if lost[worst] > EQUAL:
                 parts.append(f"it loses most at corner {worst + 1} ({lost[worst]:.3f} s)")
             told += "".join(f"{', and ' if n else ': '}{part}" for n, part in enumerate(parts))
         sentences.append(f"{told}.")
