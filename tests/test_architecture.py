@@ -50,7 +50,8 @@ LEARNING = {"callbacks", "noise", "policies"}
 
 DRAWS = {
     "evaluation/watching.py", "rendering/game_camera.py", "rendering/game_video.py",
-    "rendering/highway.py", "rendering/hud.py", "rendering/scenery.py", "rendering/viewer.py",
+    "rendering/gap.py", "rendering/highway.py", "rendering/hud.py", "rendering/scenery.py",
+    "rendering/viewer.py",
 }  # fmt: skip
 STARTS_PROGRAMS = {
     "torcs/display.py",

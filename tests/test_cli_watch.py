@@ -16,6 +16,7 @@ from processes import children
 from sb3_torcs.agents import remote as driving
 from sb3_torcs.cli import _parser, main
 from sb3_torcs.evaluation import watching
+from sb3_torcs.evaluation.comparing import saved_drives
 from sb3_torcs.scr.server import start_server
 from sb3_torcs.torcs.display import VirtualDisplay
 
@@ -75,13 +76,16 @@ def test_a_video_of_a_robot_is_the_race_that_the_game_runs_without_one(tmp_path,
 
 
 def test_two_drivers_side_by_side(tmp_path, capsys):
-    video = tmp_path / "both.mp4"
+    video, drives = tmp_path / "both.mp4", tmp_path / "drives.parquet"
     words = ["watch", "scripted", *SMALL, "--beside", "inferno", "--video", str(video)]
-    assert main(words) == 0
+    assert main([*words, "--telemetry", str(drives)]) == 0
     out = capsys.readouterr().out
     assert "scripted, car1-trb1, a-speedway" in out
     assert "inferno 3, car1-trb1, a-speedway" in out
-    slower = max(float(lap) for lap in re.findall(r"best lap: ([\d.]+) s", out))
+    laps = [float(lap) for lap in re.findall(r"best lap: ([\d.]+) s", out)]
+    saved = [round(drive.laps[0].time, 3) for drive in saved_drives(drives)]
+    assert saved == pytest.approx(laps, abs=0.001)  # [s] SCR packets carry six digits
+    slower = max(laps)
     kind, frames = stream(video)
     assert kind[2] == "160x120"
     assert abs(frames - 5 * (slower + 2.0)) <= 2

@@ -8,9 +8,10 @@ from typing import Any
 
 import gymnasium as gym
 
-from sb3_torcs.agents.models import driver_record, load_driver
+from sb3_torcs.agents.models import driver_name, driver_record, load_driver
 from sb3_torcs.agents.rollout import drive
 from sb3_torcs.agents.wrapping import wrapped
+from sb3_torcs.telemetry import DriveLabel, DriveLog
 
 __all__ = ["Agent"]
 
@@ -40,6 +41,10 @@ class Agent:
         self.env = wrapped(bare, driver_record(model).hyperparameters, trust=trust)
         self.driver = load_driver(model, self.env, algo, trust)
         self.backend.driver_name = name
+        track = str(settings.get("track", self.backend.track.name))
+        self._label = DriveLabel(driver_name(model), track, self.backend.car, "Torcs-v0")
+        self.log: DriveLog | None = None
+        """What notes each timestep, once it is set."""
         self.error: BaseException | None = None
         """What went wrong, where the agent drives in a thread."""
         with self.backend.rehearsal():  # first calls are too slow for a race
@@ -83,6 +88,8 @@ class Agent:
         over = partial(self._is_over, aftermath)
         for step in drive(self.env, self.driver, over=over):
             self._note(step.info, step.terminated)
+            if self.log is not None:
+                self.log.add(self._label, step.car, self.env.get_wrapper_attr("controls"))
 
     def _note(self, info: dict[str, Any], terminated: bool) -> None:
         """

@@ -67,6 +67,8 @@ def add_parser(subparsers: Any) -> None:
     add("--video", metavar="FILE.mp4", help="write a video of the race to this file")
     add("--film", dest="video", help=argparse.SUPPRESS)  # its older name
     add("--fps", type=float, metavar="N", help="frames per second of the video; default: 30")
+    add("--telemetry", metavar="FILE.parquet",
+        help="write the drives: an agent's timesteps, a robot's control ticks")  # fmt: skip
     add("--trust", action="store_true", help=TRUST_HELP)
     add(
         "--beside",
@@ -82,13 +84,14 @@ def run(args: argparse.Namespace) -> int:
     :return: the exit status
     """
     from sb3_torcs.errors import InvalidOption
-    from sb3_torcs.evaluation.watching import record_shows
+    from sb3_torcs.evaluation.watching import drive_logs, record_shows
     from sb3_torcs.torcs.installation import find_game
 
     for option in ("beside", "fps"):
         if getattr(args, option) is not None and args.video is None:
             raise InvalidOption(f"--{option} is for videos; add --video FILE.mp4")
     video = writable_file(args.video, (".mp4",)) if args.video else None
+    telemetry = writable_file(args.telemetry, (".parquet",)) if args.telemetry else None
     game = find_game()
     names = [args.name] if args.beside is None else [args.name, args.beside]
     shows = _shows(game, names, args)
@@ -99,8 +102,11 @@ def run(args: argparse.Namespace) -> int:
         record_shows(shows, video, size=args.size, view=args.view, **fps)
     for name, show in zip(names, shows, strict=True):
         _report(name, show)
-    if video is not None:
-        print(f"video: {video}")
+    if telemetry is not None:
+        drive_logs(shows).write(telemetry)
+    for what, path in (("video", video), ("telemetry", telemetry)):
+        if path is not None:
+            print(f"{what}: {path}")
     return 0
 
 

@@ -14,13 +14,16 @@ import numpy.typing as npt
 
 from sb3_torcs.agents.models import driver_name
 from sb3_torcs.agents.remote import Agent
+from sb3_torcs.agents.robots import drive_log
 from sb3_torcs.agents.scripted import SCRIPTED
 from sb3_torcs.car import DEFAULT_CAR
 from sb3_torcs.errors import GameFailed, InvalidOption, ServerLost
 from sb3_torcs.rendering.encoder import PHOTOGRAPHIC, write_video
 from sb3_torcs.rendering.game_video import FPS, GameVideo, side_by_side
+from sb3_torcs.rendering.gap import Passing, draw_gap, time_behind
 from sb3_torcs.scr.protocol import plain_name
 from sb3_torcs.scr.server import open_ports, start_server
+from sb3_torcs.telemetry import DriveLog
 from sb3_torcs.torcs.installation import Game
 from sb3_torcs.torcs.process import GameProcess
 from sb3_torcs.torcs.race_results import RobotResult
@@ -29,7 +32,7 @@ from sb3_torcs.torcs.results import read_results
 from sb3_torcs.torcs.window import ViewName, Window, window_arguments
 from sb3_torcs.tracks.trial import check_track
 
-__all__ = ["Show", "record_shows", "show_in_window"]
+__all__ = ["Show", "drive_logs", "record_shows", "show_in_window"]
 
 AFTERMATH = 2.0  # [s] of the race that are shown after an agent's drive has ended
 SCR_DRIVER = (SCR_SERVER, 0)
@@ -60,7 +63,8 @@ class Show:
     trust: bool = False
     agent: Agent | None = None
     results: list[RobotResult] = field(default_factory=list)
-    share: float = 0.0  # of the race that is recorded, 0 to 1
+    passing: Passing = field(default_factory=Passing)  # where the car is in the video
+    log: DriveLog = field(default_factory=DriveLog)  # of an agent, a row per timestep
 
     @property
     def race(self) -> RaceSetup:
@@ -95,6 +99,7 @@ class Show:
         try:
             settings = {"track": self.track, "host": "127.0.0.1", "port": port, **self.settings}
             self.agent = Agent(self.model, settings, trust=self.trust, name=self.driver_name)
+            self.agent.log = self.log
         except BaseException:
             process.stop()
             raise
@@ -108,6 +113,25 @@ class Show:
         """
         if process.poll() == 0:
             self.results = read_results(process, self.race, self.race.cars(self.game))
+
+
+def drive_logs(shows: Sequence[Show]) -> DriveLog:
+    """
+    Gather what was driven. A robot is asked again, of the engine: it drives as the game does.
+
+    :param shows: that are over
+    :return: rows of all shows, each driver's in one piece
+    """
+    log = DriveLog()
+    for show in shows:
+        race = show.race
+        again = show.robot is not None
+        log.extend(
+            drive_log(race.drivers, str(race.track), race.laps, session=race.session)
+            if again
+            else show.log
+        )
+    return log
 
 
 def show_in_window(show: Show, window: Window) -> None:
@@ -169,16 +193,27 @@ def record_shows(
         threads = [_begin(show, video) for show, video in zip(shows, videos, strict=True)]
         pictures = [_pictures(show, video) for show, video in zip(shows, videos, strict=True)]
         try:
-            joint = side_by_side(*pictures)
+            joint = _with_gap(side_by_side(*pictures), shows)
             write_video(
                 path, joint, fps, encoding=PHOTOGRAPHIC,
-                share=lambda: min(show.share for show in shows),
+                share=lambda: min(show.passing.share for show in shows),
             )  # fmt: skip
         finally:
             for video in videos:
                 video.game.stop()
             for thread in threads:
                 thread.join()
+
+
+def _with_gap(
+    pictures: Iterator[npt.NDArray[np.uint8]], shows: Sequence[Show]
+) -> Iterator[npt.NDArray[np.uint8]]:
+    """Write on each picture of two races by how much the second driver is behind the first."""
+    for picture in pictures:
+        behind = time_behind(shows[0].passing, shows[1].passing) if len(shows) == 2 else None
+        if behind is not None:
+            picture = draw_gap(picture, shows[1].driver_name, behind)
+        yield picture
 
 
 def _begin(show: Show, video: GameVideo) -> threading.Thread:
@@ -216,7 +251,7 @@ def _pictures(show: Show, video: GameVideo) -> Iterator[npt.NDArray[np.uint8]]:
     agent = show.agent
     try:
         for frame in video.frames():
-            show.share = frame.share
+            show.passing.note(frame.time, frame.share)
             yield frame.picture
             if agent is not None and agent.end_time is not None:
                 left = agent.end_time + AFTERMATH - frame.time

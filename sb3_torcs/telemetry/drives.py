@@ -87,6 +87,17 @@ class DriveLog:
         if len(self._open) == AT_ONCE:
             self._close()
 
+    def extend(self, other: DriveLog) -> None:
+        """
+        Append the rows of another log.
+
+        :param other: which is not filled any more
+        """
+        for log in (self, other):
+            log._close()
+        self._labels += other._labels
+        self._numbers += other._numbers
+
     def _close(self) -> None:
         """Pack the newest rows into an array."""
         if self._open:
