@@ -1,4 +1,4 @@
-"""Conditions that episodes draw: controls that arrive late."""
+"""Conditions that episodes draw: late controls, the grip of the ground, the mass of the car."""
 
 from __future__ import annotations
 
@@ -152,3 +152,96 @@ def test_other_delays_are_refused(choice):
 def test_no_delay_waits_for_nothing():
     delay = Delay(0, 5)
     assert delay.hold(RESTING._replace(throttle=1.0)) == [(RESTING._replace(throttle=1.0), 5)]
+
+
+# ---------------------------------------------------------------------------------- grip and mass
+
+
+def speeds(env_id, action, **conditions):
+    """Along a straight of forza from 40 m/s, for a second."""
+    env = gym.make(env_id, track="forza", **conditions)
+    env.reset(seed=0, options={"distance": 4200.0, "speed": 40.0})
+    driven = [env.step(np.array(action, np.float32))[4]["car"].speed_x for _ in range(10)]
+    env.close()
+    return driven
+
+
+def test_less_grip_brakes_less(env_id):
+    """Fully: the tyres are at their limit."""
+    full = [0.0, 0.0, 1.0]
+    as_it_is, slippery = speeds(env_id, full), speeds(env_id, full, grip=0.6)
+    assert slippery[-1] > as_it_is[-1] + 1.0
+    assert speeds(env_id, full, grip=1.0) == as_it_is
+
+
+@pytest.mark.usefixtures("game")
+def test_a_heavier_car_gathers_speed_more_slowly():
+    """By as much as it is heavier, without its fuel; a lighter one is faster."""
+    gained = [speeds("Torcs-v0", [0.0, 1.0, 0.0], mass=mass)[-1] - 40.0 for mass in (0.8, 1.0, 1.2)]
+    assert gained[0] > gained[1] > gained[2] > 0.0
+
+
+@pytest.mark.parametrize("options", [{}, {"options": {"distance": 900.0, "speed": 20.0}}])
+def test_conditions_end_with_their_episode(env_id, options):
+    """The next one has its own, and the same seed gives the same drive, from both starts."""
+    env = gym.make(env_id, grip=(0.7, 0.8))
+    drives, grips = [], []
+    for seed in (1, 2, 1):
+        rows = [env.reset(seed=seed, **options)[0]]
+        rows += [env.step(np.array([0.02, 0.7, 0.0], np.float32))[0] for _ in range(25)]
+        drives.append(np.array(rows).tobytes())
+        grips.append(env.unwrapped.conditions.grip)
+    assert drives[0] == drives[2] != drives[1]
+    assert grips[0] == grips[2] != grips[1]
+    env.close()
+
+
+@pytest.mark.usefixtures("game")
+def test_a_copy_and_a_restored_race_have_the_conditions_of_their_episode():
+    env = gym.make("Torcs-v0", grip=(0.6, 0.9), mass=(0.9, 1.1), start="random")
+    env.reset(seed=3)
+    for _ in range(3):
+        env.step(GAS)
+    backend = env.unwrapped.backend
+    twin, moment = copy.deepcopy(env.unwrapped), backend.save()
+    expected = [env.step(np.array([0.1, 0.0, 1.0], np.float32))[0].tobytes() for _ in range(5)]
+    again = [twin.step(np.array([0.1, 0.0, 1.0], np.float32))[0].tobytes() for _ in range(5)]
+    assert again == expected
+    env.reset()
+    car = backend.restore(moment)
+    for _ in range(5):
+        car = backend.step(twin.controls, 5)
+    assert twin.view.encode(car, backend).tobytes() == expected[-1]
+    env.close()
+    twin.close()
+
+
+def test_races_driven_at_once_have_their_own_grip(env_id):
+    options = {"grip": [0.6, 1.2], "start": "random", "max_episode_steps": 9}
+    options["track"] = ["aalborg", "g-track-1"]
+    ours = TorcsVecEnv(3, env_id=env_id, **options)
+    theirs = DummyVecEnv([lambda: Monitor(gym.make(env_id, **options))] * 3)
+    for envs in (ours, theirs):
+        envs.seed(2)
+    theirs.action_space.seed(2)
+    assert ours.reset().tobytes() == theirs.reset().tobytes()
+    for step in range(30):
+        actions = np.array([theirs.action_space.sample() for _ in range(3)])
+        for one, other in zip(ours.step(actions)[:3], theirs.step(actions)[:3], strict=True):
+            assert one.tobytes() == other.tobytes(), step
+    assert len({drawn.grip for drawn in ours.get_attr("conditions")}) == 3
+    ours.close()
+    theirs.close()
+
+
+@pytest.mark.parametrize("choice", [0, 0.4, 2.1, "1", (1.1, 0.9), (1.0,), None])
+def test_another_grip_is_refused(choice):
+    with pytest.raises(InvalidOption, match=r"grip is .* expected a factor from 0\.5 to 2"):
+        gym.make("TorcsLite-v0", grip=choice)
+
+
+def test_a_world_that_cannot_change_says_so(oval):
+    with pytest.raises(InvalidOption, match=r"grip is .* cannot change; leave it out"):
+        RacingEnv(ScriptedBackend(oval), grip=0.9)
+    with pytest.raises(InvalidOption, match=r"mass is 1\.1, which needs the installed game"):
+        gym.make("TorcsLite-v0", mass=1.1)

@@ -25,7 +25,9 @@ class Backend(Protocol):
     A world that has several tracks has a method ``draw_track(rng)``, which the environment calls
     before it draws a start on that track. One whose car has more or fewer than six forward gears
     has an attribute ``gears``. One whose road has hills has an attribute ``profile``, a
-    :class:`~sb3_torcs.tracks.profile.RoadProfile`.
+    :class:`~sb3_torcs.tracks.profile.RoadProfile`. One that can drive under other conditions has a
+    method ``set_conditions(grip, mass)``, factors that hold from the next reset on, and in
+    ``conditions`` the names of those that it can change.
     """
 
     track: Track

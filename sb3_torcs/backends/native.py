@@ -119,6 +119,8 @@ class NativeBackend:
     :param gearbox: see :data:`sb3_torcs.actions.GEARBOXES`
     """
 
+    conditions = ("grip", "mass")
+
     def __init__(
         self,
         track: str | Path = "aalborg",
@@ -162,6 +164,7 @@ class NativeBackend:
         self._agent = entries.index(AGENT)
         self.gears = self.engine.gears(self._agent)
         self._noise = sensor_noise
+        self._conditions = 1.0, 1.0
         self._align()
         self._drive: list[Any] = []  # steps since the reset, for copies
 
@@ -194,18 +197,26 @@ class NativeBackend:
         if abs(x - there["x"]) > MIN_SHIFT or abs(y - there["y"]) > MIN_SHIFT:
             self.engine.set_origin(x - there["x"], y - there["y"])
 
+    def set_conditions(self, grip: float, mass: float) -> None:
+        """Change the next episode's world; see :class:`~sb3_torcs.backends.base.Backend`."""
+        self._conditions = grip, mass
+
     def reset(self, rng: np.random.Generator, start: Start | None) -> CarState:
         """Begin an episode; see :class:`~sb3_torcs.backends.base.Backend`."""
-        return self._begin(start, int(rng.integers(2**63)) if self._noise else None)
+        noise = int(rng.integers(2**63)) if self._noise else None
+        return self._begin(start, noise, self._conditions)
 
-    def _begin(self, start: Start | None, noise: int | None) -> CarState:
+    def _begin(
+        self, start: Start | None, noise: int | None, conditions: tuple[float, float]
+    ) -> CarState:
         self._drive = []
         self.engine.set_noise(noise)
+        self.engine.set_conditions(*conditions)
         if start is None:
             self.engine.start()
         else:
             self.engine.start_at(*start)
-        self._drive.append((start, noise))
+        self._drive.append((start, noise, conditions))
         self._state: CarState = self.engine.read(self._agent)
         return self._state
 

@@ -59,6 +59,7 @@ class SeveralWorlds:
         self._enter(0)
         self.gears: int = min(getattr(world, "gears", GEARS) for world in self.worlds)
         self.range_finder_angles = self._world.range_finder_angles
+        self.conditions: Sequence[str] = getattr(self._world, "conditions", ())
 
     @property
     def profile(self) -> RoadProfile | None:
@@ -74,6 +75,11 @@ class SeveralWorlds:
     def draw_track(self, rng: np.random.Generator) -> None:
         """Choose the next episode's world; see :class:`~sb3_torcs.backends.base.Backend`."""
         self._enter(int(rng.integers(len(self.worlds))))
+
+    def set_conditions(self, grip: float, mass: float) -> None:
+        """Change the next episode's world; see :class:`~sb3_torcs.backends.base.Backend`."""
+        world: Any = self._world
+        world.set_conditions(grip, mass)
 
     def reset(self, rng: np.random.Generator, start: Start | None) -> CarState:
         """Begin an episode; see :class:`~sb3_torcs.backends.base.Backend`."""

@@ -10,9 +10,10 @@ import numpy as np
 from sb3_torcs.car import Controls, is_count, is_number
 from sb3_torcs.errors import InvalidOption
 
-__all__ = ["MAX_DELAY", "Delay", "Range", "checked_delay", "draw_delay"]
+__all__ = ["MAX_DELAY", "Conditions", "Delay"]
 
 MAX_DELAY = 50  # control ticks: 1 s
+LEAST_FACTOR = 0.5  # of grip or mass; ice is another game
 RESTING = Controls(0.0, 0.0, 0.0)  # held until the first action arrives
 
 Part = tuple[Controls, int]
@@ -60,18 +61,6 @@ def checked_delay(choice: Any) -> Range:
     return bounds
 
 
-def draw_delay(bounds: Range, rng: np.random.Generator) -> int:
-    """
-    Draw the delay of an episode. Equal bounds draw nothing.
-
-    :param bounds: from :func:`checked_delay`
-    :param rng: the environment's
-    :return: control ticks
-    """
-    low, high = int(bounds.low), int(bounds.high)
-    return low if low == high else int(rng.integers(low, high + 1))
-
-
 class Delay:
     """
     Controls that arrive late: a timestep goes on with earlier ones until they do.
@@ -98,3 +87,56 @@ class Delay:
         self.waiting = (*self.waiting[1:], controls)
         parts = [(earlier, self._rest), (later, self._repeat - self._rest)]
         return parts if self._rest else parts[1:]
+
+
+class Conditions:
+    """
+    What each episode draws of its world.
+
+    :param delay: control ticks, or a pair of them
+    :param grip: factor on the friction of all ground, or a pair
+    :param mass: factor on the mass of the car, or a pair
+    :raises InvalidOption: if one has a value that is not allowed
+    """
+
+    def __init__(self, delay: Any, grip: Any, mass: Any) -> None:
+        self._delays = checked_delay(delay)
+        self._factors = {
+            name: checked_range(name, choice, LEAST_FACTOR, 1.0 / LEAST_FACTOR, "a factor")
+            for name, choice in (("grip", grip), ("mass", mass))
+        }
+        self._changed = [name for name, bounds in self._factors.items() if bounds != (1.0, 1.0)]
+        self.grip = self.mass = 1.0
+
+    def check(self, world: Any) -> None:
+        """
+        Check that a world can change what is to be drawn.
+
+        :param world: a backend
+        :raises InvalidOption: if it cannot
+        """
+        for name in self._changed:
+            if name not in getattr(world, "conditions", ()):
+                raise InvalidOption(
+                    f"{name} is {tuple(self._factors[name])!r}, which this world cannot change; "
+                    "leave it out, or use backend 'native' of Torcs-v0"
+                )
+
+    def draw(self, rng: np.random.Generator, world: Any, repeat: int) -> Delay:
+        """
+        Draw the conditions of an episode. Equal bounds draw nothing.
+
+        :param rng: the environment's
+        :param world: a backend, which is told
+        :param repeat: control ticks per timestep
+        :return: the delay
+        """
+        low, high = map(int, self._delays)
+        ticks = low if low == high else int(rng.integers(low, high + 1))
+        if self._changed:
+            self.grip, self.mass = (
+                float(low if low == high else rng.uniform(low, high))
+                for low, high in self._factors.values()
+            )
+            world.set_conditions(self.grip, self.mass)
+        return Delay(ticks, repeat)

@@ -29,7 +29,7 @@ from sb3_torcs.car import (
     is_count,
     is_number,
 )
-from sb3_torcs.envs.conditions import Delay, Part, checked_delay, draw_delay
+from sb3_torcs.envs.conditions import Conditions, Delay, Part
 from sb3_torcs.errors import CarLost, EnvClosed, InvalidOption
 from sb3_torcs.rewards import Reward, RewardChoice
 from sb3_torcs.sensors import SensorsName, View
@@ -138,6 +138,8 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
     :param laps: whole laps after which the episode is truncated; ``None`` drives on
     :param delay: control ticks by which controls arrive late; or a pair, between which each
         episode draws
+    :param grip: factor on the friction of all ground; or a pair, as for the delay
+    :param mass: factor on the mass of the car; or a pair, as for the delay
     :param render_mode: ``None``, or one of ``metadata["render_modes"]``
     :raises InvalidOption: if an option has a value that is not allowed
     """
@@ -155,6 +157,8 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         start: StartName = "grid",
         laps: int | None = None,
         delay: int | Sequence[int] = 0,
+        grip: float | Sequence[float] = 1.0,
+        mass: float | Sequence[float] = 1.0,
         render_mode: str | None = None,
     ) -> None:
         if not is_count(action_repeat) or action_repeat > MAX_ACTION_REPEAT:
@@ -184,7 +188,8 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         self.set_reward(reward)
         self.set_start(start)
         self.set_random_speed(RANDOM_SPEED)
-        self._delays = checked_delay(delay)
+        self.conditions = Conditions(delay, grip, mass)
+        self.conditions.check(backend)
         self.delay = Delay(0, self.action_repeat)
         self.car: CarState | None = None
         self._controls = Controls(0.0, 0.0, 0.0)
@@ -263,7 +268,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         if self._draw_track is not None:
             self._draw_track(self.np_random)
         start = self._place(options) if options else self._draw_start()
-        self.delay = Delay(draw_delay(self._delays, self.np_random), self.action_repeat)
+        self.delay = self.conditions.draw(self.np_random, self.backend, self.action_repeat)
         self.car = None  # if the reset fails, no step is possible
         self.car = self.backend.reset(self.np_random, start)
         self._controls = Controls(0.0, 0.0, 0.0)

@@ -66,6 +66,9 @@ class TorcsEnv(RacingEnv):
     :param laps: whole laps after which the episode is truncated; ``None`` drives on
     :param delay: control ticks of 0.02 s from an observation until the controls that answer it
         arrive; or a pair, e.g. ``(0, 5)``, between which each episode draws
+    :param grip: factor on the friction of all ground; or a pair, e.g. ``(0.8, 1.1)``, between which
+        each episode draws
+    :param mass: factor on the mass of the agent's car; or a pair, as for the grip
     :param render_mode: ``"rgb_array"`` or ``"human"``; ``"game"`` is another name for
         ``"rgb_array"`` with ``picture="game"``
     :param picture: ``"above"``, the road and the car from above, or ``"game"``, the game's own 3D
@@ -106,6 +109,8 @@ class TorcsEnv(RacingEnv):
         start: StartName = "grid",
         laps: int | None = None,
         delay: int | Sequence[int] = 0,
+        grip: float | Sequence[float] = 1.0,
+        mass: float | Sequence[float] = 1.0,
         render_mode: GameRenderMode | None = None,
         backend: BackendName = "native",
         opponents: Sequence[str] = (),
@@ -158,6 +163,8 @@ class TorcsEnv(RacingEnv):
             start=start,
             laps=laps,
             delay=delay,
+            grip=grip,
+            mass=mass,
             render_mode=render_mode,
         )
 

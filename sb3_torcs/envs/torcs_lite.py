@@ -24,6 +24,7 @@ OF_THE_GAME = (
     "opponents",
     "grid_place",
     "sensor_noise",
+    "mass",
     "view",
     "boards",
     "render_size",
@@ -79,6 +80,8 @@ class TorcsLiteEnv(RacingEnv):
     :param laps: whole laps after which the episode is truncated; ``None`` drives on
     :param delay: control ticks of 0.02 s from an observation until the controls that answer it
         arrive; or a pair, e.g. ``(0, 5)``, between which each episode draws
+    :param grip: factor on the friction of all ground; or a pair, e.g. ``(0.8, 1.1)``, between which
+        each episode draws
     :param render_mode: ``"rgb_array"`` or ``"human"``
     :param picture: ``"above"``
     :param of_the_game: options of ``Torcs-v0`` alone, which are refused by name
@@ -98,6 +101,7 @@ class TorcsLiteEnv(RacingEnv):
         start: StartName = "grid",
         laps: int | None = None,
         delay: int | Sequence[int] = 0,
+        grip: float | Sequence[float] = 1.0,
         render_mode: RenderMode | None = None,
         picture: Literal["above"] = "above",
         **of_the_game: Any,
@@ -126,6 +130,7 @@ class TorcsLiteEnv(RacingEnv):
             start=start,
             laps=laps,
             delay=delay,
+            grip=grip,
             render_mode=render_mode,
         )
 

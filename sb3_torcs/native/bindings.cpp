@@ -229,6 +229,10 @@ PYBIND11_MODULE(_engine, module) {
              })
         .def("read", [](Engine& engine, int car) { return as_state(engine.read(car)); })
         .def("set_noise", &Engine::set_noise)
+        .def(
+            "set_conditions",
+            [](Engine& engine, double grip, double mass) { engine.set_conditions({grip, mass}); },
+            "grip"_a, "mass"_a)
         .def("set_origin", &Engine::set_origin, "Move the positions that are read by x and y [m].")
         .def("save", &Engine::save)
         .def("restore", &Engine::restore)

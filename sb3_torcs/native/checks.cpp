@@ -177,6 +177,7 @@ void check_simulation(const SimulatedCar* simulated, const CarElement* cars, int
         expect("its yaw", own.local.pos.az, car.pub.local.pos.az);
         expect("its motor speed", own.engine_speed, car.priv.engine_speed);
         expect("its fuel", own.fuel, car.priv.fuel);
+        expect("its mass by its inverse mass", 1.0f, own.mass * own.inverse_mass);
         expect("its gear", own.gear, car.priv.gear);
         expect("its damage", own.damage, car.priv.damage);
         for (int wheel = FRONT_RIGHT; wheel <= REAR_LEFT; wheel++) {

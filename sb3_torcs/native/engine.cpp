@@ -105,6 +105,10 @@ void Engine::set_noise(std::optional<std::uint64_t> seed) {
     if (seed) noise_.emplace(*seed);
 }
 
+void Engine::set_conditions(const Conditions& conditions) {
+    Access(*this)->set_conditions(conditions);
+}
+
 void Engine::set_origin(double x, double y) {
     Access race(*this);
     x_ = x;

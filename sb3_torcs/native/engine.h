@@ -61,7 +61,8 @@ public:
     void drive(const Controls& controls, int ticks);
     Reading read(int car);
     void set_noise(std::optional<std::uint64_t> seed);
-    void set_origin(double x, double y);  // added to positions that are read
+    void set_conditions(const Conditions& conditions);  // for the starts that follow
+    void set_origin(double x, double y);                // added to positions that are read
     Moment save();
     void restore(const Moment& moment);
     // The SCR server's `focus`: distances at 1 degree from each other around a direction [rad]

@@ -427,13 +427,17 @@ struct SimulatedCar {
     int gear;
     Unused<564> c_;
     float engine_speed;  // [rad/s]
-    Unused<76> d_;
-    float fuel;  // [l]
+    Unused<40> d_;
+    float mass;  // [kg] without fuel
+    float inverse_mass;
+    Unused<16> f_;
+    float inverse_inertia[3];  // of rolling, pitching and yawing
+    float fuel;                // [l]
     Motion local;
     Motion global;
     Unused<544> e_;
     int damage;
-    Unused<80> f_;
+    Unused<80> g_;
 };
 
 // ---- Offsets ------------------------------------------------------------------------------------

@@ -153,6 +153,13 @@ void Race::load_track() {
         throw Error("TrackFileError", path + ": " + error.what());
     }
     check_track(track_, file, path);
+    const Segment* road = track_->last;
+    for (int i = 0; i < track_->segments_number; i++, road = road->next) {
+        friction_.emplace(road->surface, road->surface->friction);
+        for (const Side side : {RIGHT, LEFT})
+            for (const Segment* strip = road->side[side]; strip; strip = strip->side[side])
+                friction_.emplace(strip->surface, strip->surface->friction);
+    }
 }
 
 Params Race::load_car(const std::string& name) {
@@ -428,10 +435,34 @@ void Race::prepare() {
     on_grid_ = save();
 }
 
-void Race::start() { restore(on_grid_); }
+void Race::set_conditions(const Conditions& conditions) { conditions_ = conditions; }
+
+void Race::set_grip(double grip) {
+    if (grip == grip_) return;
+    for (const auto& [surface, friction] : friction_)
+        surface->friction = static_cast<float>(friction * grip);
+    grip_ = grip;
+}
+
+// The agent's car gets the mass of the episode.
+void Race::load_agent() {
+    if (agent_ < 0 || conditions_.mass == 1.0) return;
+    SimulatedCar& car = (*simulated_)[agent_];
+    const auto factor = static_cast<float>(conditions_.mass);
+    car.mass *= factor;
+    car.inverse_mass /= factor;
+    for (float& inverse : car.inverse_inertia) inverse /= factor;
+}
+
+void Race::start() {
+    restore(on_grid_);
+    set_grip(conditions_.grip);
+    load_agent();
+}
 
 void Race::start(const Start& start) {
     restore(unannounced_);
+    set_grip(conditions_.grip);
     try {
         start_elsewhere(start);
     } catch (...) {
@@ -444,6 +475,7 @@ void Race::start_elsewhere(const Start& start) {
     Hosted hosted(host_);
     Situation& situation = world_->situation;
     const std::vector<double> distances = put_down(field(), start, rest_heights_);
+    load_agent();
     {
         std::lock_guard<std::mutex> lock(game_.mutex);  // robots may read files, as when loaded
         announce();
@@ -599,13 +631,14 @@ std::vector<LapRecord> Race::laps(int index) const {
 }
 
 Snapshot Race::save() const {
-    Snapshot snapshot{number_, arena_.save(), {}};
+    Snapshot snapshot{number_, grip_, arena_.save(), {}};
     snapshot.variables.push_back(simulation_library_->save());
     for (const auto& library : robot_libraries_) snapshot.variables.push_back(library->save());
     return snapshot;
 }
 
 void Race::restore(const Snapshot& snapshot) {
+    set_grip(snapshot.grip);
     arena_.restore(snapshot.memory);
     simulation_library_->restore(snapshot.variables[0]);
     for (std::size_t i = 0; i < robot_libraries_.size(); i++)

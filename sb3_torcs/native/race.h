@@ -61,8 +61,15 @@ struct Result {
     bool out;  // did not finish
 };
 
+// What an episode may change of the world; 1 is as it is.
+struct Conditions {
+    double grip = 1.0;  // of all ground
+    double mass = 1.0;  // of the agent's car, and of its inertia
+};
+
 struct Snapshot {
     std::uint64_t race;  // number of the one that it is of
+    double grip;         // the track's memory is not kept
     std::vector<char> memory;
     std::vector<Variables> variables;
 };
@@ -94,6 +101,8 @@ public:
     void start();
     // Moves the field along the road, so that the agent is at a place; all cars get a speed.
     void start(const Start& start);
+    // For the starts that follow.
+    void set_conditions(const Conditions& conditions);
 
     // Hold the agent's controls for some intervals between two calls of drivers.
     void drive(const Controls& controls, int ticks);
@@ -169,6 +178,8 @@ private:
     void announce();
     void prepare();
     void start_elsewhere(const Start& start);
+    void set_grip(double grip);
+    void load_agent();
 
     void step();
     bool call_is_due() const;
@@ -214,6 +225,9 @@ private:
     int set_up_ = 0;                   // drivers that know the track
     std::vector<float> rest_heights_;  // [m] of each car's mass centre over the road, standing
     Snapshot unannounced_, on_grid_;
+    Conditions conditions_;
+    double grip_ = 1.0;                   // of the ground now
+    std::map<Surface*, float> friction_;  // of the ground by its file
 };
 
 }  // namespace torcs

@@ -38,14 +38,13 @@ std::vector<RoadSegment> road_of(const TrackData& track) {
     for (int i = 0; i < track.segments_number; i++) {
         segment = segment->next;
         const Widths left = ground(*segment, LEFT), right = ground(*segment, RIGHT);
-        road.push_back({segment->length, curvature(*segment), segment->start_width,
-                        segment->end_width, left.start, left.end, right.start, right.end,
-                        segment->surface->friction, segment->surface->rolling_resistance,
-                        segment->barrier[LEFT]->surface->friction,
-                        segment->barrier[RIGHT]->surface->friction,
-                        double(segment->from_start) + segment->length,
-                        height(*segment, START_LEFT, START_RIGHT),
-                        height(*segment, END_LEFT, END_RIGHT)});
+        road.push_back(
+            {segment->length, curvature(*segment), segment->start_width, segment->end_width,
+             left.start, left.end, right.start, right.end, segment->surface->friction,
+             segment->surface->rolling_resistance, segment->barrier[LEFT]->surface->friction,
+             segment->barrier[RIGHT]->surface->friction,
+             double(segment->from_start) + segment->length,
+             height(*segment, START_LEFT, START_RIGHT), height(*segment, END_LEFT, END_RIGHT)});
     }
     return road;
 }

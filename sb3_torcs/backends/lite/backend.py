@@ -17,12 +17,14 @@ from sb3_torcs.car import DEFAULT_CAR, CarState, Controls, FloatArray, Start
 from sb3_torcs.errors import CarLost, InvalidOption
 from sb3_torcs.sensors import RangeFinderName, range_finder_angles
 from sb3_torcs.torcs.track_names import RANDOM_TRACK
+from sb3_torcs.tracks import track as column
 from sb3_torcs.tracks.catalogue import load_track
 from sb3_torcs.tracks.track import Track
 
 __all__ = ["LiteBackend"]
 
 CARS = (DEFAULT_CAR,)
+GROUND_FRICTIONS = [column.ROAD_FRICTION, column.LEFT_FRICTION, column.RIGHT_FRICTION]
 
 
 class LiteBackend:
@@ -36,6 +38,7 @@ class LiteBackend:
     """
 
     gears = TOP_GEAR
+    conditions = ("grip",)
 
     def __init__(
         self,
@@ -56,13 +59,21 @@ class LiteBackend:
         self.range_finder_angles = range_finder_angles(range_finders)
         self._random = track == RANDOM_TRACK
         self._flying = False
+        self._grip = 1.0
         self._state = np.zeros(physics.STATE_SIZE)
         self._set_track(load_track(track, np.random.default_rng(0) if self._random else None))
 
     def _set_track(self, track: Track) -> None:
         self.track = track
-        self._table: FloatArray = track.table
+        self._table: FloatArray = _with_grip(track.table, self._grip)
         self._edges: Edges = road_edges(track)
+
+    def set_conditions(self, grip: float, mass: float) -> None:
+        """Change the next episode's world; see :class:`~sb3_torcs.backends.base.Backend`."""
+        assert mass == 1.0, "the environment refuses others"
+        if grip != self._grip:
+            self._grip = grip
+            self._table = _with_grip(self.track.table, grip)
 
     def keep_state_in(self, state: FloatArray) -> None:
         """
@@ -135,3 +146,12 @@ class LiteBackend:
         values[physics.GEAR_FIELD] = int(values[physics.GEAR_FIELD])
         values[physics.LAPS_FIELD] = int(values[physics.LAPS_FIELD])
         return CarState._make((*values, 1, wheels, beams, opponents))
+
+
+def _with_grip(table: FloatArray, grip: float) -> FloatArray:
+    """Return the table of a track whose ground has another grip."""
+    if grip == 1.0:
+        return table
+    changed = table.copy()
+    changed[:, GROUND_FRICTIONS] *= grip
+    return changed
