@@ -302,6 +302,22 @@ def test_reward_and_start_are_switched_and_given_back(n_envs, vec_env_cls):
     env.close()
 
 
+def test_the_reward_changes_after_so_many_timesteps():
+    model = make_model()
+    spy = learn(model, 20, RewardCallback(reward="blog", timesteps=12))
+    assert [reward == 4.0 for reward in spy.rewards] == [False] * 12 + [True] * 8
+    assert model.get_env().env_method("settings") == [("progress", "grid")]
+
+
+def test_a_continued_training_has_the_later_reward_at_once():
+    model = make_model()
+    learn(model, 12)
+    spy = Spy()
+    callbacks = [RewardCallback(reward="blog", timesteps=12), spy]
+    model.learn(4, callback=callbacks, reset_num_timesteps=False)
+    assert spy.rewards == [4.0] * 4
+
+
 @pytest.mark.parametrize(("also_eval", "expected"), [(False, "progress"), (True, "blog")])
 def test_evaluation_keeps_its_reward_unless_asked(also_eval, expected):
     """Also when the EvalCallback sits deep in a list; afterwards all is as before."""
@@ -323,6 +339,7 @@ def test_evaluation_keeps_its_reward_unless_asked(also_eval, expected):
     ("callback", "options", "message"),
     [
         (RewardCallback, {"reward": "progres"}, "did you mean 'progress'"),
+        (RewardCallback, {"reward": "blog", "timesteps": -1}, "pass a whole number"),
         (RandomStartCallback, {"start": "rnadom"}, "expected 'grid' or 'random'"),
         (RandomStartCallback, {"speed": "fast"}, "expected 0 to 150 m/s"),
         (NoiseCallback, {"kind": 5}, "pass 'set_point' or 'ou'"),

@@ -9,7 +9,7 @@ from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_torcs.callbacks.metrics import callbacks_in
-from sb3_torcs.car import StartName, checked_start, checked_start_speed
+from sb3_torcs.car import StartName, checked_start, checked_start_speed, is_count
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.rewards import Reward, RewardChoice
 
@@ -31,20 +31,41 @@ class _SwitchUser(BaseCallback):
 
 class RewardCallback(_SwitchUser):
     """
-    Use another reward in the training environments.
+    Use another reward in the training environments, from the beginning or from a later timestep on.
 
     :param reward: name of a reward, or a mapping of terms to weights
     :param also_eval: also use it in the environments of an ``EvalCallback``, changing its score
+    :param timesteps: after which the reward changes, of all environments together
     :param verbose: as in ``BaseCallback``
+    :raises InvalidOption: if there is no such reward, or ``timesteps`` is no whole number
     """
 
-    def __init__(self, *, reward: RewardChoice, also_eval: bool = False, verbose: int = 0) -> None:
+    def __init__(
+        self,
+        *,
+        reward: RewardChoice,
+        also_eval: bool = False,
+        timesteps: int = 0,
+        verbose: int = 0,
+    ) -> None:
         super().__init__(verbose)
         Reward(reward)  # checked here, for a message of this process and not of a worker
+        if timesteps != 0 and not is_count(timesteps):
+            raise InvalidOption(f"timesteps is {timesteps!r}; pass a whole number")
         self.reward = reward
         self.also_eval = also_eval
+        self.timesteps = timesteps
 
     def _on_training_start(self) -> None:
+        self._switches = ()
+        if self.num_timesteps >= self.timesteps:
+            self._change()
+
+    def _on_rollout_start(self) -> None:
+        if not self._switches and self.num_timesteps >= self.timesteps:
+            self._change()
+
+    def _change(self) -> None:
         envs = [self.training_env]
         if self.also_eval:
             others = callbacks_in(self.locals["callback"])
