@@ -98,3 +98,17 @@ def test_the_leaderboard_says_what_cards_and_reference_laps_say():
     racers = {name for name in AGENTS if "--env Torcs-v0" in card_of(name)}
     assert {driver for driver, _ in told} >= {"inferno", "scripted", *racers}
     assert told == {key: known.get(key) for key in told}
+
+
+POST = {"sensors": ["base"], "action": "pedals", "gearbox": "automatic"}  # rule 2
+
+
+def test_the_leaderboard_says_the_class_of_each_agent():
+    """By what its record says that it sees and does."""
+    text = (Path(__file__).parent.parent / "LEADERBOARD.md").read_text(encoding="utf-8")
+    told = re.findall(r"^\| \[([\w-]+)\].* \| (post|open) \| `sb3-torcs", text, re.M)
+    assert {name for name, _ in told} <= set(AGENTS)
+    assert len(told) == len(re.findall(r"^\| \[", text, re.M))
+    for name, kind in told:
+        drives = {**POST, **models.driver_record(name).env_kwargs}
+        assert (kind == "post") == (POST.items() <= drives.items()), name
