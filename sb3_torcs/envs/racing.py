@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, Literal, TypedDict, get_args
 
@@ -17,7 +17,6 @@ from sb3_torcs.backends.base import Backend
 from sb3_torcs.car import (
     CONTROL_TICK,
     MAX_DAMAGE,
-    MAX_START_SPEED,
     CarState,
     Controls,
     FloatArray,
@@ -27,9 +26,8 @@ from sb3_torcs.car import (
     checked_start,
     checked_start_speed,
     is_count,
-    is_number,
 )
-from sb3_torcs.envs.conditions import Conditions, Delay, Part
+from sb3_torcs.envs.conditions import Conditions, Delay, Part, read_start
 from sb3_torcs.errors import CarLost, EnvClosed, InvalidOption
 from sb3_torcs.rewards import Reward, RewardChoice
 from sb3_torcs.sensors import SensorsName, View
@@ -53,7 +51,6 @@ RANDOM_GRID_SHARE = 0.1
 RANDOM_TRACK_POSITION = 0.6  # [-]
 RANDOM_HEADING_ERROR = 0.25  # [rad]
 RANDOM_SPEED = 40.0  # [m/s] default
-RESET_OPTIONS = ("distance", "track_position", "heading_error", "speed")
 
 
 class RacingInfo(TypedDict):
@@ -267,7 +264,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         super().reset(seed=seed)
         if self._draw_track is not None:
             self._draw_track(self.np_random)
-        start = self._place(options) if options else self._draw_start()
+        start = read_start(options, self.track.length) if options else self._draw_start()
         self.delay = self.conditions.draw(self.np_random, self.backend, self.action_repeat)
         self.car = None  # if the reset fails, no step is possible
         self.car = self.backend.reset(self.np_random, start)
@@ -309,7 +306,8 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         """
         self.check_ready()
         self._controls = controls_from_action(action, self.layout)
-        return self.delay.hold(self._controls)
+        at_once = (self._controls, self.action_repeat)
+        return self.delay.hold(self._controls) if self.delay.ticks else [at_once]
 
     def check_ready(self) -> None:
         """
@@ -423,37 +421,4 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
             draw(-RANDOM_TRACK_POSITION, RANDOM_TRACK_POSITION),
             draw(-RANDOM_HEADING_ERROR, RANDOM_HEADING_ERROR),
             draw(0.0, self._random_speed),
-        )
-
-    def _place(self, options: dict[str, Any]) -> Start:
-        """Read the options of ``reset``."""
-        if not isinstance(options, Mapping):
-            raise InvalidOption(
-                f"options of reset is {options!r}; expected a dict, e.g. {{'distance': 100.0}}"
-            )
-        for name, value in options.items():
-            if name not in RESET_OPTIONS:
-                raise InvalidOption(
-                    f"unknown reset option {name!r}; allowed: {', '.join(RESET_OPTIONS)}"
-                )
-            if not is_number(value):
-                raise InvalidOption(f"reset option {name} is {value!r}; expected a number")
-        values = {name: float(options.get(name, 0.0)) for name in RESET_OPTIONS}
-        if abs(values["track_position"]) > 1.0:
-            raise InvalidOption(
-                f"track_position is {values['track_position']:g}; expected -1 (right edge) to 1"
-            )
-        if not 0.0 <= values["speed"] <= MAX_START_SPEED:
-            raise InvalidOption(
-                f"speed is {values['speed']:g} m/s; expected 0 to {MAX_START_SPEED:g}"
-            )
-        if abs(values["heading_error"]) > math.pi:
-            raise InvalidOption(
-                f"heading_error is {values['heading_error']:g} rad; expected -pi to pi"
-            )
-        return Start(
-            values["distance"] % self.backend.track.length,
-            values["track_position"],
-            values["heading_error"],
-            values["speed"],
         )
