@@ -124,12 +124,14 @@ def test_changes_are_merged_into_an_entry():
 
 
 def test_a_study_is_its_variants_by_its_seeds(tmp_path):
-    variants = {"one": {}, "Two!": {"algo": "sac", "n_timesteps": 50, "gamma": 0.5}}
+    changes = {"algo": "sac", "n_timesteps": 50, "eval_interval": 25, "gamma": 0.5}
+    variants = {"one": {}, "Two!": changes}
     study = read_study(written(tmp_path, variants=variants, n_timesteps=200, seeds=[4, 7]))
     names = [trial.name for trial in study.trials]
     assert names == ["one-seed4", "one-seed7", "two-seed4", "two-seed7"]
     assert [trial.budget for trial in study.trials] == [200, 200, 50, 50]
     assert [trial.algo for trial in study.trials] == ["ddpg", "ddpg", "sac", "sac"]
+    assert [trial.eval_interval for trial in study.trials] == [100, 100, 25, 25]
     assert study.trials[2].entry["gamma"] == 0.5
     assert study.trials[0].final_tracks == study.trials[0].eval_tracks == ("aalborg",)
 

@@ -31,11 +31,13 @@ from sb3_torcs.training.zoo_data import as_data
 __all__ = ["FIELDS", "Study", "Trial", "merged", "read_study", "track_name"]
 
 REQUIRED = ("name", "seeds", "eval_interval")
-SOURCE = ("algo", "env", "conf_file", "entry", "n_timesteps", "eval_tracks")
+SOURCE = (
+    "algo", "env", "conf_file", "entry", "n_timesteps", "eval_interval", "eval_tracks",
+)  # fmt: skip
 """What a study says for all its variants, and a variant may say for itself."""
 
 WORDS = ("algo", "env", "conf_file", "entry")
-KEYS = (*REQUIRED, *SOURCE, "variants", "final_tracks")
+KEYS = tuple(dict.fromkeys((*REQUIRED, *SOURCE, "variants", "final_tracks")))
 ROAD = "road"
 SEEDS = 2**32  # that NumPy takes
 MANY = 10_000  # a larger number of seeds is one seed, without its brackets
@@ -247,9 +249,9 @@ def _trials(
     zoo.check_entry(entry, algo, env_id, place)
     entry["n_timesteps"] = zoo.timesteps(entry)
     _check_evaluable(entry, place)
-    interval = said["eval_interval"]
+    interval = source["eval_interval"]
     if type(interval) is not int or interval < 1:
-        raise StudyError(f"{file}: eval_interval is {interval!r}; expected timesteps, e.g. 5000")
+        raise StudyError(f"{place}: eval_interval is {interval!r}; expected timesteps, e.g. 5000")
     env_kwargs = entry.get("env_kwargs") or {}
     own = env_kwargs.get("track", "aalborg")
     given = source["eval_tracks"]
