@@ -93,6 +93,19 @@ class Fleet:
         cars: FloatArray,  # (n, 82) filled, as of CarState
     ) -> list[int]: ...  # the rows that were not, of races that failed
 
+class Rollouts:
+    def __init__(self, engines: Sequence[Engine], threads: int) -> None: ...
+    def mark(self) -> None: ...
+    def drive(self, path: FloatArray, ticks: int) -> None: ...  # (n, 7), see native/rollouts.h
+    def go_back(self, drives: int) -> None: ...
+    def follow(
+        self,
+        line: FloatArray,  # (n, 7)
+        gains: tuple[float, float, float],
+        offsets: FloatArray,  # (candidates, steps, 3)
+        ticks: int,
+    ) -> tuple[FloatArray, npt.NDArray[np.int64]]: ...  # (candidates, steps + 1, 7), (candidates,)
+
 def scr_format_state(  # 79 numbers, SI, in the protocol's order
     numbers: Sequence[float], exact: bool = False
 ) -> bytes: ...

@@ -36,9 +36,9 @@ from sb3_torcs.tracks.track import Track
 from sb3_torcs.tracks.trial import check_road, engine_arguments, try_race
 
 if TYPE_CHECKING:
-    from sb3_torcs._engine import Engine
+    from sb3_torcs._engine import Engine, Rollouts
 
-__all__ = ["Fleet", "NativeBackend", "check_layout", "make_engine"]
+__all__ = ["Fleet", "NativeBackend", "check_layout", "make_engine", "make_rollouts"]
 
 MIN_SHIFT = 1.0  # [m] between the game's frame and the track's, from which positions are moved
 
@@ -103,6 +103,18 @@ def make_engine(
 
 _profiles: WeakKeyDictionary[Track, RoadProfile] = WeakKeyDictionary()
 """Of tracks that were looked ahead on. Races on one track share it."""
+
+
+def make_rollouts(engines: Sequence[Engine]) -> Rollouts:
+    """
+    Drive copies of one race at once, one thread each, to see what candidates come to.
+
+    :param engines: of the same race, at the same moment
+    :return: the rollouts, which begin where the engines stand; see ``native/rollouts.h``
+    """
+    rollouts: Rollouts = _extension().Rollouts(list(engines), len(engines))
+    rollouts.mark()
+    return rollouts
 
 
 class NativeBackend:

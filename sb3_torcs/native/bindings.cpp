@@ -12,6 +12,7 @@
 #include "errors.h"
 #include "fleet.h"
 #include "road.h"
+#include "rollouts.h"
 #include "scr/messages.h"
 
 namespace py = pybind11;
@@ -88,10 +89,10 @@ std::array<double, RANGE_FINDERS> angles_of(const std::vector<double>& angles) {
     return array;
 }
 
-std::unique_ptr<Fleet> make_fleet(const std::vector<Engine*>& engines, int threads) {
+const std::vector<Engine*>& checked(const std::vector<Engine*>& engines) {
     for (const Engine* engine : engines)
         if (!engine) throw py::type_error("engine is None; expected an Engine");
-    return std::make_unique<Fleet>(engines, threads);
+    return engines;
 }
 
 // Reads orders from arrays with one row per order. Controls are those of sb3_torcs.car.Controls; a
@@ -119,6 +120,39 @@ std::vector<Fleet::Order> orders_of(const py::array_t<std::int64_t, py::array::c
                           static_cast<int>(ticks.at(i)), arrivals + i});
     }
     return orders;
+}
+
+constexpr py::ssize_t WAYPOINT = sizeof(Waypoint) / sizeof(double);
+
+std::vector<Waypoint> line_of(const py::array_t<double, py::array::c_style>& rows) {
+    if (rows.ndim() != 2 || rows.shape(1) != WAYPOINT)
+        throw py::type_error("expected a line (m, " + std::to_string(WAYPOINT) + ")");
+    const Waypoint* first = reinterpret_cast<const Waypoint*>(rows.data());
+    return {first, first + rows.shape(0)};
+}
+
+py::tuple follow(Rollouts& rollouts, const py::array_t<double, py::array::c_style>& rows,
+                 const std::array<double, 3>& gains,
+                 const py::array_t<double, py::array::c_style>& offsets, int ticks) {
+    if (offsets.ndim() != 3 || offsets.shape(2) != 3)
+        throw py::type_error("expected offsets (n, steps, 3)");
+    const std::vector<Waypoint> line = line_of(rows);
+    const py::ssize_t candidates = offsets.shape(0), steps = offsets.shape(1);
+    py::array_t<double> paths({candidates, steps + 1, WAYPOINT});
+    py::array_t<std::int64_t> lasted(candidates);
+    const Rollouts::Order order{&line,
+                                {gains[0], gains[1], gains[2]},
+                                reinterpret_cast<const Offsets*>(offsets.data()),
+                                reinterpret_cast<Waypoint*>(paths.mutable_data()),
+                                lasted.mutable_data(),
+                                static_cast<std::size_t>(candidates),
+                                static_cast<std::size_t>(steps),
+                                ticks};
+    {
+        const WithoutPython released;
+        rollouts.follow(order);
+    }
+    return py::make_tuple(paths, lasted);
 }
 
 // The game's side of the SCR protocol, so that tests can compare the Python client with it.
@@ -321,7 +355,10 @@ PYBIND11_MODULE(_engine, module) {
         });
 
     py::class_<Fleet>(module, "Fleet", "Engines that are driven at once, on threads that stay.")
-        .def(py::init(&make_fleet), py::keep_alive<1, 2>(), "engines"_a, "threads"_a)
+        .def(py::init([](const std::vector<Engine*>& engines, int threads) {
+                 return std::make_unique<Fleet>(checked(engines), threads);
+             }),
+             py::keep_alive<1, 2>(), "engines"_a, "threads"_a)
         .def(
             "begin",
             [](Fleet& fleet, std::size_t index, double steering, double throttle, double brake,
@@ -356,6 +393,34 @@ PYBIND11_MODULE(_engine, module) {
             const WithoutPython released;
             fleet.finish();
         });
+
+    py::class_<Rollouts>(module, "Rollouts", "Short drives from one moment, at once.")
+        .def(py::init([](const std::vector<Engine*>& engines, int threads) {
+                 return std::make_unique<Rollouts>(checked(engines), threads);
+             }),
+             py::keep_alive<1, 2>(), "engines"_a, "threads"_a)
+        .def("mark",
+             [](Rollouts& rollouts) {
+                 const WithoutPython released;
+                 rollouts.mark();
+             })
+        .def(
+            "drive",
+            [](Rollouts& rollouts, const py::array_t<double, py::array::c_style>& path, int ticks) {
+                const std::vector<Waypoint> line = line_of(path);
+                const WithoutPython released;
+                rollouts.drive(line, ticks);
+            },
+            "path"_a, "ticks"_a, "Drive on from the mark, and mark there.")
+        .def(
+            "go_back",
+            [](Rollouts& rollouts, std::size_t drives) {
+                const WithoutPython released;
+                rollouts.go_back(drives);
+            },
+            "drives"_a, "Begin again where the last so many drives began.")
+        .def("follow", &follow, "line"_a, "gains"_a, "offsets"_a, "ticks"_a,
+             "Follow a line with offsets; returns the paths, and how many timesteps each lasted.");
 
     bind_scr(module);
 }
