@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
+from sb3_torcs.agents.ghosts import GhostDriver, check_fits, is_ghost, read_ghost
 from sb3_torcs.agents.model_algorithm import algorithm_of, check_same, is_sbx, told_algorithm
 from sb3_torcs.agents.model_file import (
     as_mismatch,
@@ -180,9 +181,12 @@ def driver_record(driver: str | Path) -> TrainingRecord:
     """
     Read how a driver was trained.
 
-    :param driver: as in :func:`find_model`, or ``"scripted"``, of whom nothing is known
+    :param driver: as in :func:`find_model`; a ghost's file, which says where it was driven; or
+        ``"scripted"``, of whom nothing is known
     :return: what is known
     """
+    if is_ghost(driver):
+        return TrainingRecord(env_id="Torcs-v0", env_kwargs=read_ghost(driver).env_kwargs)
     return TrainingRecord() if str(driver) == SCRIPTED else training_record(find_model(driver))
 
 
@@ -197,7 +201,7 @@ def driver_name(driver: str | Path) -> str:
     given = Path(os.path.expanduser(driver))
     if given.name == BEST_MODEL or given.name == Path(BEST_MODEL).stem:
         given = given.absolute().parent
-    return given.absolute().name.removesuffix(".zip")
+    return given.absolute().name.removesuffix(".zip").removesuffix(".npz")
 
 
 def one_track(track: Any) -> Any:
@@ -352,7 +356,7 @@ def load_driver(
     """
     Load a driver. No code of the file runs, unless it is trusted.
 
-    :param path: of a saved model or its run's folder, or ``"scripted"``
+    :param path: of a saved model or its run's folder, of a ghost, or ``"scripted"``
     :param env: that it is to drive, with the wrappers of the training
     :param algo: as the zoo calls it; ``None`` finds out
     :param trust: load the model as SB3 does, which runs code that is pickled in it
@@ -363,6 +367,10 @@ def load_driver(
     """
     if str(path) == SCRIPTED:
         return _scripted(env)
+    if is_ghost(path):
+        ghost = read_ghost(path)
+        check_fits(ghost, env, path)
+        return GhostDriver(ghost)
     file = find_model(path)
     data = saved_data(file)
     record = _record(file, data)

@@ -1,0 +1,250 @@
+"""Ghosts: drives that are kept as their actions, and drive again, to the bit, as any driver."""
+
+from __future__ import annotations
+
+import json
+import os
+import zipfile
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+
+from sb3_torcs.agents.rollout import Timestep, drive
+from sb3_torcs.errors import InvalidOption, ModelMismatch
+from sb3_torcs.files import writable_file
+from sb3_torcs.torcs.installation import find_game
+from sb3_torcs.torcs.track_names import find_track
+from sb3_torcs.tracks.catalogue import load_track
+
+__all__ = [
+    "Demonstration",
+    "Ghost",
+    "GhostDriver",
+    "check_fits",
+    "demonstration",
+    "is_ghost",
+    "read_ghost",
+]
+
+SUFFIX = ".npz"
+VERSION = 1
+MAX_SIZE = 2**24  # [bytes] of a ghost's file, and of what is in it
+AFTERWARDS = -0.3  # [-] the pedal of a ghost that has no actions left: it brakes
+
+FloatArray = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Ghost:
+    """
+    A drive from the grid, kept as its actions.
+
+    :param env_kwargs: of the ``Torcs-v0`` that it was driven in, track, car and laps among them
+    :param actions: (timesteps, numbers of the action)
+    :param lap_times: of its whole laps [s], the first one from the grid
+    :param agent: around whose drive it was searched
+    :param rollouts: candidates that were driven to find it
+    """
+
+    env_kwargs: Mapping[str, Any]
+    actions: FloatArray
+    lap_times: tuple[float, ...]
+    agent: str
+    rollouts: int
+
+    def make_env(self) -> gym.Env[Any, Any]:
+        """Make the environment in which the actions give this drive."""
+        return gym.make(
+            "sb3_torcs:Torcs-v0", max_episode_steps=len(self.actions) + 1, **self.env_kwargs
+        )
+
+    def drive(self) -> Iterator[Timestep]:
+        """
+        Drive again.
+
+        :return: the timesteps, one by one
+        """
+        env = self.make_env()
+        try:
+            yield from drive(env, GhostDriver(self), seed=0)
+        finally:
+            env.close()
+
+    def write(self, path: str | Path) -> Path:
+        """
+        Write the ghost to a file, whole or not at all.
+
+        :param path: ending in ``.npz``
+        :return: the file
+        :raises OutputNotWritable: if that cannot be done
+        """
+        file = writable_file(path, (SUFFIX,))
+        record = {
+            "version": VERSION,
+            "env_kwargs": dict(self.env_kwargs),
+            "lap_times": list(self.lap_times),
+            "agent": self.agent,
+            "rollouts": self.rollouts,
+        }
+        half = file.with_name(f".{file.name}.{os.getpid()}{SUFFIX}")
+        try:
+            np.savez_compressed(half, actions=self.actions, record=np.array(json.dumps(record)))
+            half.replace(file)
+        finally:
+            half.unlink(missing_ok=True)
+        return file
+
+
+def is_ghost(driver: str | Path) -> bool:
+    """
+    Tell by its name whether a driver is a ghost.
+
+    :param driver: a path, or the name of any driver
+    """
+    return str(driver).lower().endswith(SUFFIX)
+
+
+def read_ghost(path: str | Path) -> Ghost:
+    """
+    Read a ghost. Nothing is unpickled.
+
+    :param path: of the file
+    :raises InvalidOption: if there is no such file
+    :raises ModelMismatch: if it is not a ghost
+    """
+    file = Path(os.path.expanduser(path))
+    if not file.is_file():
+        raise InvalidOption(f"there is no ghost '{file}'; `sb3-torcs optimize-lap` makes one")
+    try:
+        _check_size(file)
+        with np.load(file, allow_pickle=False) as content:
+            actions, record = content["actions"], json.loads(str(content["record"]))
+        return _ghost(actions, record)
+    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+        raise ModelMismatch(
+            f"'{file}' is not a ghost ({error}); give one that `sb3-torcs optimize-lap` wrote"
+        ) from error
+
+
+def _check_size(file: Path) -> None:
+    with zipfile.ZipFile(file) as archive:
+        size = sum(item.file_size for item in archive.infolist())
+    if size > MAX_SIZE:
+        raise ValueError(f"it would take {size} bytes of memory; at most {MAX_SIZE} are read")
+
+
+def _ghost(actions: npt.NDArray[Any], record: Any) -> Ghost:
+    """Check what a file holds."""
+    if not isinstance(record, dict) or record.get("version") != VERSION:
+        raise ValueError(f"its version is not {VERSION}")
+    kwargs = record["env_kwargs"]
+    if not isinstance(kwargs, dict) or not {"track", "car", "action_repeat", "laps"} <= set(kwargs):
+        raise ValueError("it does not say track, car, action repeat and laps")
+    if actions.dtype != np.float32 or actions.ndim != 2 or not len(actions):
+        raise ValueError(f"its actions are {actions.dtype}, {actions.shape}")
+    if not np.isfinite(actions).all():
+        raise ValueError("an action is not finite")
+    times = tuple(float(time) for time in record["lap_times"])
+    return Ghost(kwargs, actions, times, str(record["agent"]), int(record["rollouts"]))
+
+
+class GhostDriver:
+    """
+    Drives as a ghost did. It goes by the count of timesteps and looks at nothing.
+
+    After its last action it brakes.
+
+    :param ghost: whose actions
+    """
+
+    def __init__(self, ghost: Ghost) -> None:
+        self.ghost = ghost
+
+    def predict(
+        self,
+        observation: npt.NDArray[np.float32],
+        state: int | None = None,
+        episode_start: npt.NDArray[np.bool_] | None = None,
+        deterministic: bool = True,
+    ) -> tuple[FloatArray, int]:
+        """
+        Give the next action.
+
+        :param observation: unused
+        :param state: timesteps driven; ``None`` begins
+        :param episode_start: (1,) whether an episode begins here
+        :param deterministic: unused; it always is
+        :return: the action, and the state for the next call
+        """
+        del observation, deterministic
+        begins = state is None or (episode_start is not None and bool(np.any(episode_start)))
+        step = 0 if begins or state is None else state
+        actions = self.ghost.actions
+        if step < len(actions):
+            return actions[step], step + 1
+        width = actions.shape[1]
+        return np.array([0.0, AFTERWARDS] if width == 2 else [0.0, 0.0, -AFTERWARDS], "f4"), step
+
+
+def check_fits(ghost: Ghost, env: gym.Env[Any, Any], name: str | Path) -> None:
+    """
+    Make sure that an environment is the one that a ghost was driven in.
+
+    :param ghost: that is to drive
+    :param env: a racing environment
+    :param name: of the ghost, for the message
+    :raises ModelMismatch: if the drive would be another one
+    """
+    backend = env.get_wrapper_attr("backend")
+    wanted = ghost.env_kwargs
+    has = {
+        "track": backend.track.name,
+        "car": backend.car,
+        "action_repeat": env.get_wrapper_attr("action_repeat"),
+        "action": env.get_wrapper_attr("action"),
+    }
+    needs = {
+        "track": load_track(find_track(wanted["track"], find_game()).path).name,
+        "car": wanted["car"],
+        "action_repeat": wanted["action_repeat"],
+        "action": wanted.get("action", "pedals"),
+    }
+    for what, value in needs.items():
+        if has[what] != value:
+            raise ModelMismatch(
+                f"the ghost '{name}' was driven with {what} {value!r}, not {has[what]!r}: its "
+                "actions fit no other race; search one there: sb3-torcs optimize-lap"
+            )
+
+
+class Demonstration(NamedTuple):
+    """A drive as it would lie in a replay buffer, one row per timestep."""
+
+    observations: FloatArray  # (n, numbers of the observation)
+    next_observations: FloatArray
+    actions: FloatArray  # (n, numbers of the action)
+    rewards: FloatArray  # (n,)
+    terminated: npt.NDArray[np.bool_]  # (n,) left the road and such; a ghost never does
+    truncated: npt.NDArray[np.bool_]  # (n,) the last is: all laps are driven
+
+
+def demonstration(ghost: Ghost) -> Demonstration:
+    """
+    Drive a ghost again, and return what an agent would have seen and been rewarded for.
+
+    :param ghost: that drives, in its own environment
+    """
+    steps = list(ghost.drive())
+    return Demonstration(
+        np.array([step.observation for step in steps], np.float32),
+        np.array([step.next_observation for step in steps], np.float32),
+        np.array([step.action for step in steps], np.float32),
+        np.array([step.reward for step in steps], np.float32),
+        np.array([step.terminated for step in steps]),
+        np.array([step.truncated for step in steps]),
+    )
