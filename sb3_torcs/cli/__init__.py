@@ -19,6 +19,7 @@ from sb3_torcs.cli import (
     doctor,
     evaluate,
     install_torcs,
+    optimize_lap,
     report,
     robots,
     serve,
@@ -38,8 +39,8 @@ USAGE_ERROR = 2
 INTERRUPTED = 130
 READER_LEFT = 141
 VERBS = (
-    doctor, install_torcs, tracks, train, evaluate, compare, watch, study, report, robots, serve,
-    compete, bench,
+    doctor, install_torcs, tracks, train, evaluate, compare, watch, optimize_lap, study, report,
+    robots, serve, compete, bench,
 )  # fmt: skip
 
 

@@ -1,0 +1,159 @@
+"""``sb3-torcs optimize-lap``: search a faster lap than an agent's, and keep it as a ghost."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+from sb3_torcs.cli.common import (
+    MODEL_HELP,
+    TRUST_HELP,
+    positive,
+    print_json,
+    quiet_output,
+    seed,
+    table,
+)
+from sb3_torcs.files import writable_file
+
+if TYPE_CHECKING:
+    from sb3_torcs.agents.ghosts import Ghost
+    from sb3_torcs.training.lap_search import Budget, LapSearch, State
+
+__all__ = ["add_parser", "run"]
+
+SECONDS = 300
+INTERRUPTED = 130
+HEADERS = ("lap", "time s")
+
+DESCRIPTION = """\
+Search the fastest three laps of a track from the grid, in the game, and write them to a file: a
+ghost. A ghost drives as any driver does: `sb3-torcs watch GHOST`, `sb3-torcs evaluate GHOST`.
+
+The search begins with the fastest of these drives: the agent's, and those of the robots that have
+the same car. It drives the race again and again. On the way it restores the engine's snapshots to
+try some dozen ways on, a few seconds far, and takes the best.
+
+It uses all cores. With --rollouts the same seed finds the same ghost on any machine; what can be
+found in --seconds depends on the machine. Ctrl-C ends the search and keeps what was found.
+"""
+
+
+def add_parser(subparsers: Any) -> None:
+    """
+    :param subparsers: of the command
+    """
+    parser = subparsers.add_parser(
+        "optimize-lap",
+        help="search a faster lap around an agent's drive",
+        description=DESCRIPTION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add("agent", metavar="AGENT", help=MODEL_HELP)
+    add("--track", metavar="T", help="default: that of the training, or aalborg")
+    add("--car", metavar="C", help="default: that of the training, or car1-trb1")
+    add("--seconds", type=positive, metavar="S",
+        help=f"how long to search; default: {SECONDS}, or no limit with --rollouts")  # fmt: skip
+    add("--rollouts", type=positive, metavar="N", help="end after so many tries")
+    add("--seed", type=seed, default=0, metavar="S", help="of all random numbers; default: 0")
+    add("--action-repeat", type=positive, metavar="N",
+        help="control ticks of 0.02 s per timestep; default: that of the training")  # fmt: skip
+    add("--alone", action="store_true", help="begin with the agent's drive, not with a robot's")
+    add("--out", metavar="FILE.npz", help="the ghost; default: ghost-AGENT-TRACK.npz")
+    add("--trust", action="store_true", help=TRUST_HELP)
+    add("--json", action="store_true", help="print one JSON object and nothing else")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """
+    :param args: from the command line
+    :return: the exit status
+    """
+    from sb3_torcs.agents.models import driver_name
+    from sb3_torcs.errors import InvalidOption
+    from sb3_torcs.training.lap_starts import ghost_environment
+
+    kwargs = ghost_environment(args.agent, args.track, args.car)
+    if args.action_repeat is not None:
+        kwargs["action_repeat"] = args.action_repeat
+    name, track = driver_name(args.agent), str(kwargs["track"]).rpartition("/")[2]
+    out = writable_file(args.out or f"ghost-{name}-{track.removesuffix('.xml')}.npz", (".npz",))
+    with quiet_output(args.json):
+        ghost, state, stopped = _search(args, kwargs)
+    if ghost is None:
+        raise InvalidOption(
+            f"no whole race was found in {state.rollouts} rollouts, {state.seconds:.0f} s; "
+            "give more --seconds"
+        )
+    ghost.write(out)
+    standing, *flying = ghost.lap_times
+    figures = {
+        "track": track,
+        "car": kwargs["car"],
+        "agent": args.agent,
+        "standing_lap": standing,
+        "flying_lap": min(flying),
+        "rollouts": state.rollouts,
+        "seconds": round(state.seconds, 1),
+        "ghost": str(out),
+    }
+    if args.json:
+        print_json(figures)
+    else:
+        print(f"{track}, {kwargs['car']}: {state.rollouts} rollouts, {state.seconds:.0f} s")
+        rows = [(f"{number}", f"{time:.3f}") for number, time in enumerate(ghost.lap_times, 1)]
+        print(table(HEADERS, rows))
+        print(f"ghost: {out}")
+    return INTERRUPTED if stopped else 0
+
+
+def _search(args: argparse.Namespace, kwargs: dict[str, Any]) -> tuple[Ghost | None, State, bool]:
+    """Search until the budget is used up or somebody stops it; return the best, and whether."""
+    from sb3_torcs.training.lap_search import Budget, LapSearch
+    from sb3_torcs.training.lap_starts import find_starts
+
+    starts = find_starts(args.agent, kwargs, alone=args.alone, trust=args.trust)
+    first = starts[0]
+    print(
+        f"beginning with {first.driver}: {', '.join(f'{lap:.3f}' for lap in first.lap_times)} s",
+        file=sys.stderr,
+    )
+    seconds = args.seconds or (None if args.rollouts else SECONDS)
+    limits = {"seconds": seconds, "rollouts": args.rollouts}
+    budget = Budget(**{name: limit for name, limit in limits.items() if limit})
+    search = LapSearch(args.agent, kwargs, starts, seed=args.seed)
+    stopped = False
+    try:
+        for _ in _shown(search, budget):
+            pass
+    except KeyboardInterrupt:
+        stopped = True
+    finally:
+        search.close()
+    return search.ghost, search.state(), stopped
+
+
+def _shown(search: LapSearch, budget: Budget) -> Iterator[State]:
+    """Search, and show on standard error how far it has come."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = BarColumn(), TimeElapsedColumn(), TextColumn("{task.description}")
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("the first race", total=1.0)
+        for state in search.run(budget):
+            share = max(state.rollouts / budget.rollouts, state.seconds / budget.seconds)
+            progress.update(task, completed=min(share, 1.0), description=_spoken(state))
+            yield state
+
+
+def _spoken(state: State) -> str:
+    rollouts = f"{state.rollouts} rollouts"
+    if state.ghost is None:
+        return f"{rollouts}, the first race"
+    standing, *flying = state.ghost.lap_times
+    return f"{rollouts}, {state.races} races, flying {min(flying):.3f} s, standing {standing:.3f} s"

@@ -1,0 +1,299 @@
+"""The search for a lap, and the ghosts that come out of it."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from stable_baselines3.common.buffers import ReplayBuffer
+
+import sb3_torcs  # noqa: F401  registers the environments
+from sb3_torcs.agents.ghosts import GhostDriver, demonstration, read_ghost
+from sb3_torcs.agents.models import driver_name, driver_record, load_driver
+from sb3_torcs.backends.native import make_engine, make_rollouts
+from sb3_torcs.cli import main
+from sb3_torcs.errors import InvalidOption, ModelMismatch
+from sb3_torcs.evaluation import evaluate
+from sb3_torcs.torcs.installation import find_game
+from sb3_torcs.torcs.starting_list import AGENT
+from sb3_torcs.training import lap_search
+from sb3_torcs.training.lap_line import Line, lap_of, repeated
+from sb3_torcs.training.lap_search import Budget, LapSearch
+from sb3_torcs.training.lap_starts import find_starts, ghost_environment
+
+pytestmark = pytest.mark.usefixtures("game")
+
+TRACK = "a-speedway"
+GAINS = (0.15, 2.0, 0.15)
+ONE_RACE = 1_000  # rollouts: more than a race of the tiny search takes, less than two
+
+
+@pytest.fixture(scope="module")
+def tiny():
+    """A search with few and short candidates."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(lap_search, "CANDIDATES", 2)
+        patch.setattr(lap_search, "GENERATIONS", 1)
+        patch.setattr(lap_search, "HORIZON", 2.0)
+        patch.setattr(lap_search, "STRIDE", 1.0)
+        yield
+
+
+@pytest.fixture(scope="module")
+def starts(game):
+    return find_starts("scripted", ghost_environment("scripted", TRACK, None))
+
+
+def searched(starts, threads=2, seed=0):
+    kwargs = ghost_environment("scripted", TRACK, None)
+    search = LapSearch("scripted", kwargs, starts, threads=threads, seed=seed)
+    for _ in search.run(Budget(rollouts=ONE_RACE)):
+        pass
+    search.close()
+    return search.ghost
+
+
+@pytest.fixture(scope="module")
+def ghost(tiny, starts):
+    return searched(starts)
+
+
+@pytest.fixture
+def file(ghost, tmp_path):
+    return ghost.write(tmp_path / "ghost.npz")
+
+
+def cars_of(ghost):
+    return [(*step.car[:23], *step.car.wheel_speeds) for step in ghost.drive()]
+
+
+# ---- The search -----------------------------------------------------------------------------
+
+
+def test_it_is_faster_than_what_it_began_with(ghost, starts):
+    assert min(ghost.lap_times[1:]) < min(starts[0].lap_times[1:])
+    assert len(ghost.lap_times) == 3
+
+
+def test_a_seed_finds_the_same_ghost_on_any_number_of_threads(ghost, starts):
+    again = searched(starts, threads=1)
+    np.testing.assert_array_equal(again.actions, ghost.actions)
+    assert again.lap_times == ghost.lap_times
+    assert not np.array_equal(searched(starts, seed=1).actions, ghost.actions)
+
+
+def test_a_ghost_drives_again_to_the_bit(ghost):
+    assert cars_of(ghost) == cars_of(ghost)
+
+
+def test_an_evaluation_of_a_ghost_gives_its_lap_times(ghost):
+    env = ghost.make_env()
+    (race,) = evaluate(env, GhostDriver(ghost))
+    env.close()
+    assert (race.end, race.damage, tuple(race.lap_times)) == ("laps", 0.0, ghost.lap_times)
+
+
+def test_a_search_begins_with_the_fastest_driver_or_with_the_agent_alone(starts):
+    assert [start.seconds for start in starts] == sorted(start.seconds for start in starts)
+    assert "inferno:3" in [start.driver for start in starts]
+    kwargs = ghost_environment("scripted", TRACK, None)
+    (own,) = find_starts("scripted", kwargs, alone=True)
+    assert own.driver == "scripted"
+
+
+def test_a_driver_that_does_not_finish_alone_is_refused():
+    kwargs = ghost_environment("ddpg-aalborg", "dirt-1", None)
+    with pytest.raises(InvalidOption, match=r"ddpg-aalborg finishes no race .* --alone"):
+        find_starts("ddpg-aalborg", kwargs, alone=True)
+
+
+def test_a_ghost_drives_in_the_environment_of_the_agent():
+    kwargs = ghost_environment("ddpg-roads", "forza", "155-DTM")
+    assert (kwargs["track"], kwargs["car"], kwargs["laps"]) == ("forza", "155-DTM", 3)
+    kept = driver_record("ddpg-roads").env_kwargs
+    assert all(kwargs[name] == kept[name] for name in ("reward", "action_repeat") if name in kept)
+
+
+# ---- Candidates -----------------------------------------------------------------------------
+
+
+@pytest.fixture
+def engines():
+    made = [make_engine(find_game(), TRACK, [AGENT]) for _ in range(2)]
+    for engine in made:
+        engine.start()
+    yield made
+    for engine in made:
+        engine.close()
+
+
+def test_without_offsets_a_candidate_repeats_a_drive_to_the_bit(engines, starts):
+    rollouts = make_rollouts(engines)
+    steps = 100
+    (first,), (lasted,) = rollouts.follow(starts[0].rows, GAINS, np.zeros((1, steps, 3)), 5)
+    paths, _ = rollouts.follow(first, GAINS, np.zeros((3, steps, 3)), 5)
+    assert lasted == steps
+    for path in paths:
+        np.testing.assert_array_equal(path, first)
+
+
+def test_a_candidate_lasts_until_it_leaves_the_road(engines, starts):
+    rollouts = make_rollouts(engines)
+    offsets = np.zeros((2, 150, 3))
+    offsets[1, 100:, 0] = 1.0
+    paths, lasted = rollouts.follow(starts[0].rows, GAINS, offsets, 5)
+    assert lasted[0] == 150 > lasted[1] >= 100
+    np.testing.assert_array_equal(paths[0, :101, :5], paths[1, :101, :5])
+
+
+def test_drives_go_on_from_the_mark_and_back(engines, starts):
+    rollouts = make_rollouts(engines)
+    line = starts[0].rows
+    (path,), _ = rollouts.follow(line, GAINS, np.zeros((1, 20, 3)), 5)
+    for part in (path[:10], path[10:20]):
+        rollouts.drive(part, 5)
+    assert engines[0].read(0)[:23] == engines[1].read(0)[:23]
+    assert engines[0].read(0).distance_raced == path[20, 1]
+    rollouts.go_back(2)
+    assert engines[1].read(0).distance_raced == path[0, 1]
+    with pytest.raises(InvalidOption, match="going back 1 drives of 0"):
+        rollouts.go_back(1)
+
+
+def test_a_gain_is_time_against_the_line():
+    rows = np.zeros((5, 7))
+    rows[:, 0], rows[:, 1], rows[:, 4] = np.arange(5) * 0.1, np.arange(5) * 2.0, 20.0
+    line = Line(rows)
+    end = np.array([[0.25, 6.0, 0.0, 0.0, 20.0, 0.0, 0.0]])
+    assert line.gain(rows[0], end).tolist() == pytest.approx([0.05])
+    beside = end + np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0])
+    assert line.gain(rows[0], beside).tolist() == pytest.approx([0.04])
+
+
+def test_a_lap_is_put_behind_itself():
+    rows = np.zeros((40, 7))
+    rows[:, 0], rows[:, 1] = np.arange(40) * 0.1, np.arange(40) * 2.5
+    lap = lap_of(rows, 20.0, 50.0)
+    twice = repeated(lap, 50.0, (0, 1))
+    np.testing.assert_allclose(np.diff(twice[:, 1]), 2.5)
+    np.testing.assert_allclose(np.diff(twice[:, 0]), 0.1)
+
+
+# ---- Files and drivers ----------------------------------------------------------------------
+
+
+def test_a_ghost_is_read_as_it_was_written(ghost, file):
+    read = read_ghost(file)
+    np.testing.assert_array_equal(read.actions, ghost.actions)
+    assert (read.env_kwargs, read.lap_times, read.agent, read.rollouts) == (
+        ghost.env_kwargs, ghost.lap_times, "scripted", ghost.rollouts,
+    )  # fmt: skip
+    assert [path.name for path in file.parent.iterdir()] == ["ghost.npz"]
+
+
+def broken(kind, path):
+    """Write a file that is no ghost."""
+    if kind == "text":
+        path.write_text("no ghost")
+    elif kind == "pickle":
+        np.savez(path, actions=np.array([{}], dtype=object), record=np.array("{}"))
+    elif kind == "bomb":
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("actions.npy", b"\0" * 2**25)
+    else:
+        record = {"version": 2 if kind == "newer" else 1, "env_kwargs": {}}
+        np.savez(path, actions=np.zeros((1, 3), "f4"), record=np.array(json.dumps(record)))
+
+
+@pytest.mark.parametrize("kind", ["text", "pickle", "bomb", "newer", "empty"])
+def test_what_is_no_ghost_is_refused(tmp_path, kind):
+    path = tmp_path / "x.npz"
+    broken(kind, path)
+    with pytest.raises(ModelMismatch, match=r"is not a ghost \(.+\); give one that"):
+        read_ghost(path)
+
+
+def test_a_ghost_that_is_not_there_is_said(tmp_path):
+    with pytest.raises(InvalidOption, match="there is no ghost"):
+        driver_record(tmp_path / "x.npz")
+
+
+def test_a_ghost_is_a_driver_like_others(file):
+    record = driver_record(file)
+    assert (record.env_id, record.env_kwargs["track"]) == ("Torcs-v0", TRACK)
+    assert driver_name(file) == "ghost"
+    with gym.make("Torcs-v0", track=TRACK) as env:
+        assert isinstance(load_driver(file, env), GhostDriver)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "said"),
+    [({"track": "b-speedway"}, "track 'a-speedway', not 'b-speedway'"),
+     ({"track": TRACK, "action_repeat": 2}, "action_repeat 5, not 2")],
+)  # fmt: skip
+def test_a_ghost_drives_no_other_race(file, kwargs, said):
+    with gym.make("Torcs-v0", **kwargs) as env, pytest.raises(ModelMismatch, match=said):
+        load_driver(file, env)
+
+
+def test_after_its_last_action_a_ghost_brakes(ghost):
+    action, state = GhostDriver(ghost).predict(np.zeros(29, "f4"), len(ghost.actions))
+    assert (action[1], state) == (0.0, len(ghost.actions))
+    assert action[2] > 0.0
+
+
+def test_a_demonstration_fits_a_replay_buffer(ghost):
+    rows = demonstration(ghost)
+    env = ghost.make_env()
+    buffer = ReplayBuffer(len(rows.rewards), env.observation_space, env.action_space, "cpu")
+    env.close()
+    for row in zip(*rows, strict=True):
+        seen, after, action, reward, terminated, truncated = row
+        buffer.add(seen, after, action, reward, terminated | truncated, [{}])
+    assert buffer.full
+    assert not rows.terminated.any()
+    assert rows.truncated.tolist() == [False] * (len(rows.truncated) - 1) + [True]
+    np.testing.assert_array_equal(rows.observations[1:], rows.next_observations[:-1])
+
+
+# ---- The command ----------------------------------------------------------------------------
+
+
+def words(path, *more):
+    return ["optimize-lap", "scripted", "--track", TRACK, "--out", str(path), *more]
+
+
+def test_the_command_writes_a_ghost_that_evaluate_drives(tiny, ghost, tmp_path, capsys):
+    path = tmp_path / "lap.npz"
+    assert main(words(path, "--rollouts", str(ONE_RACE), "--json")) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert list(said) == [
+        "track", "car", "agent", "standing_lap", "flying_lap", "rollouts", "seconds", "ghost",
+    ]  # fmt: skip
+    assert (said["standing_lap"], said["flying_lap"]) == (
+        ghost.lap_times[0], min(ghost.lap_times[1:]),
+    )  # fmt: skip
+    assert main(["evaluate", str(path), "--json"]) == 0
+    (race,) = json.loads(capsys.readouterr().out)["episodes"]
+    assert race["lap_times"] == list(ghost.lap_times)
+
+
+def test_a_budget_without_a_whole_race_is_said(tiny, tmp_path, capsys):
+    assert main(words(tmp_path / "lap.npz", "--rollouts", "3")) == 2
+    assert "no whole race was found" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_interrupted_search_keeps_what_it_found(tiny, ghost, tmp_path, monkeypatch, capsys):
+    def interrupted(search, budget):
+        search.ghost = ghost
+        yield search.state()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(LapSearch, "run", interrupted)
+    assert main(words(tmp_path / "lap.npz")) == 130
+    assert "ghost: " in capsys.readouterr().out
+    assert read_ghost(tmp_path / "lap.npz").lap_times == ghost.lap_times
