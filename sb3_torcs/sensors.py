@@ -82,14 +82,16 @@ OBSERVATION_SIZE = sum(sensor.size for sensor in SENSORS)
 
 PREVIEW = (
     Sensor("bends_ahead", "", INTERVALS, "-", -1.0, 1.0, 1.0, "opposite"),
-    Sensor("widths_ahead", "", INTERVALS, "m", 0.0, 40.0, 1.0 / 20.0),
+    Sensor("widths_ahead", "", INTERVALS, "m", -20.0, 20.0, 1.0 / 10.0),
     Sensor("slopes_ahead", "", INTERVALS, "m/m", -0.4, 0.4, 5.0),
 )
 """The road ahead, in the mean over intervals that are short near the car and long far from it.
 
 Of a bend with the radius R it shows 50 m / (50 m + R), positive to the left. So the whole range
 from a straight to a hairpin lies in (-1, 1), changes smoothly while the car moves on, and goes
-nearly with 1 / speed at which the bend can be driven.
+nearly with 1 / speed at which the bend can be driven. Widths are told as their difference from the
+first interval's: most roads are equally wide everywhere, and many inputs that stay the same disturb
+learning.
 """
 USUAL_BEND = 1.0 / 50.0  # [1/m] seen as 0.5
 
@@ -271,8 +273,10 @@ def _scale_preview(
     """
     means = np.empty((QUANTITIES, INTERVALS))
     look_ahead(sums, step, distance, means)
+    width = means[1, 0]
     for i in range(INTERVALS):
         means[0, i] /= abs(means[0, i]) + USUAL_BEND
+        means[1, i] -= width
     for i in range(means.size):
         numbers[i] = _scaled(means[i // INTERVALS, i % INTERVALS], _PREVIEW_AT + i)
 

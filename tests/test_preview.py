@@ -23,13 +23,12 @@ from sb3_torcs.errors import InvalidOption
 from sb3_torcs.evaluation.protocol import race_environment
 from sb3_torcs.policies.mirror import mirror_observations
 from sb3_torcs.sensors import GROUPS, View, feature_slices, sensors_of_size
-from sb3_torcs.tracks.profile import DISTANCES, INTERVALS, look_ahead, road_profile
+from sb3_torcs.tracks.profile import INTERVALS, look_ahead, road_profile
 from sb3_torcs.tracks.track import Segment, Track
 from sb3_torcs.vec_env import TorcsVecEnv
 
 BOTH = ("base", "preview")
 BENDS, WIDTHS, SLOPES = list(feature_slices(BOTH).values())[-3:]
-ENDS = np.array(DISTANCES[1:])
 
 
 @pytest.fixture(params=["TorcsLite-v0", "Torcs-v0"])
@@ -56,15 +55,24 @@ def seen(track, distance):
 def test_the_numbers_are_means_over_intervals_that_begin_at_the_car():
     """A kilometre: straight and wide, then a bend, then another one that climbs."""
     road = ([300.0, 500.0, 200.0], [0.0, 0.01, -0.02], [12.0, 8.0, 8.0], [0.0, 0.0, 10.0])
-    curvature, width, slope = ahead(road_profile(*map(np.array, road)), 230.0)
-    before = ENDS <= 70.0
-    assert np.allclose(curvature[before], 0.0, atol=1e-15)
-    assert curvature[6] == pytest.approx(0.01 * 5.0 / 20.0)  # 55 to 75 m ahead: 5 m of the bend
-    assert np.allclose(curvature[7:], 0.01)
-    assert width[6] == pytest.approx(12.0 - 4.0 * 5.0 / 20.0)
-    assert np.allclose(width[before], 12.0)
+    curvature, width, slope = ahead(road_profile(*map(np.array, road)), 235.0)
+    assert np.allclose(curvature[:4], 0.0, atol=1e-15)
+    assert curvature[4] == pytest.approx(0.01 * 15.0 / 20.0)  # 60 to 80 m ahead: 15 m of the bend
+    assert np.allclose(curvature[5:], 0.01)
+    assert width[4] == pytest.approx(12.0 - 4.0 * 15.0 / 20.0)
+    assert np.allclose(width[:4], 12.0)
     assert np.allclose(slope, 0.0)
-    assert np.allclose(ahead(road_profile(*map(np.array, road)), 800.0)[2, :10], 0.05)
+    assert np.allclose(ahead(road_profile(*map(np.array, road)), 800.0)[2, :9], 0.05)
+
+
+def test_widths_are_told_as_differences(oval):
+    """From 12 m to 8 m: 4 m less, of which 10 m are 1."""
+    wide = oval.segments[0]._replace(width_start=12.0, width_end=12.0)
+    narrow = [s._replace(width_start=8.0, width_end=8.0) for s in oval.segments[1:]]
+    track = Track("narrowing", "oval", (wide, *narrow), grid=oval.grid)
+    widths = seen(track, 250.0)[WIDTHS]
+    assert np.allclose(widths[:3], 0.0)
+    assert np.allclose(widths[4:], -0.4)
 
 
 def test_the_view_goes_on_across_the_start_line(oval):
@@ -78,15 +86,15 @@ def test_the_view_goes_on_across_the_start_line(oval):
 def test_a_bend_is_seen_by_its_radius(oval):
     """50 m to the left is 0.5."""
     observation = seen(oval, 301.0)
-    assert np.allclose(observation[BENDS][:9], 0.5)
-    assert np.allclose(observation[WIDTHS], 0.5)
+    assert np.allclose(observation[BENDS][:8], 0.5)
+    assert np.allclose(observation[WIDTHS], 0.0)
     assert np.array_equal(observation[SLOPES], np.zeros(INTERVALS))
 
 
 def test_the_numbers_change_smoothly_while_the_car_moves_on(oval):
-    """By no more in 10 cm than its share of the shortest interval."""
+    """By no more in 10 cm than a bend's share of the shortest interval."""
     rows = np.array([seen(oval, d)[29:] for d in np.arange(0.0, oval.length, 0.1)])
-    assert np.abs(np.diff(rows, axis=0)).max() < 0.04
+    assert np.abs(np.diff(rows, axis=0)).max() < 0.015
 
 
 def test_the_game_has_hills_and_the_fallback_none(game):

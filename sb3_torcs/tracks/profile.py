@@ -24,8 +24,9 @@ __all__ = [
     "road_profile",
 ]
 
-DISTANCES = (0, 5, 10, 20, 30, 40, 55, 75, 100, 130, 170, 220, 290, 400)
-"""[m] ahead of the car, at which the intervals of a preview meet: short ones near the car."""
+DISTANCES = (0, 15, 30, 45, 60, 80, 100, 125, 155, 190, 230, 280, 340, 400)
+"""[m] ahead of the car, at which the intervals of a preview meet: short ones near the car, but so
+long that a fast car needs some timesteps for each, and its numbers do not jump."""
 INTERVALS = len(DISTANCES) - 1
 QUANTITIES = 3  # curvature, width, slope
 
