@@ -126,13 +126,14 @@ def checked_sensors(sensors: Sequence[SensorsName]) -> tuple[SensorsName, ...]:
     :return: the same in the order of the table
     :raises InvalidOption: if one is unknown or missing
     """
-    names = () if isinstance(sensors, str) else tuple(sensors)
-    if "base" not in names or len(set(names)) < len(names) or not GROUPS.keys() >= set(names):
+    listed = isinstance(sensors, Sequence) and not isinstance(sensors, str)
+    names = [name for name in GROUPS if listed and name in sensors]
+    if "base" not in names or len(names) < len(sensors):
         others = ", ".join(repr(name) for name in GROUPS if name != "base")
         raise InvalidOption(
             f"sensors is {sensors!r}; expected a list with 'base', and any of {others}, each once"
         )
-    return tuple(name for name in GROUPS if name in names)
+    return tuple(names)
 
 
 def feature_slices(sensors: Sequence[SensorsName] = ("base",)) -> dict[str, slice]:

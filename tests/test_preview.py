@@ -196,7 +196,7 @@ def test_races_with_different_sensors_cannot_be_driven_at_once():
 
 
 @pytest.mark.parametrize(
-    "choice", ["base", (), ("preview",), ("base", "previews"), ("base", "base")]
+    "choice", ["base", (), ("preview",), ("base", "previews"), ("base", "base"), 3, ["base", []]]
 )
 def test_other_sensors_are_refused(choice):
     with pytest.raises(InvalidOption, match=r"expected a list with 'base', and any of 'preview'"):
