@@ -30,14 +30,15 @@ class Engine:
         plib: bytes,
         track: bytes,
         session: str,
-        car: str,
         entries: Sequence[tuple[str, int]],
+        cars: Sequence[str],  # of the agents, by their index
         laps: int,
-        angles: Sequence[float],  # (19,) [rad]
-        road_speed: bool = False,  # whether the gearbox goes by it
+        angles: Sequence[Sequence[float]],  # (agents or 1, 19) [rad]
+        road_speed: Sequence[bool] = (),  # of the agents: whether the gearbox goes by it
+        flagged: bool = False,  # whether agents are flagged off
     ) -> None: ...
     @property
-    def agent(self) -> int: ...
+    def agents(self) -> list[int]: ...  # their cars, by their index
     @property
     def ended(self) -> bool: ...
     def start(self) -> None: ...
@@ -51,7 +52,20 @@ class Engine:
         ticks: int,
         clutch: float = 0.0,
     ) -> CarState: ...
+    def hold(
+        self,
+        car: int,
+        steering: float,
+        throttle: float,
+        brake: float,
+        gear: int | None,
+        clutch: float = 0.0,
+    ) -> None: ...
+    def drive(self, ticks: int) -> None: ...
     def advance(self, ticks: int) -> None: ...
+    def retire(self, car: int) -> None: ...
+    def rejoin(self, car: int, position: float, error: float, speed: float) -> None: ...
+    def finished(self, car: int) -> bool: ...  # whether it was flagged off
     def read(self, car: int) -> CarState: ...
     def set_noise(self, seed: int | None) -> None: ...
     def set_conditions(self, grip: float, mass: float) -> None: ...
@@ -61,7 +75,7 @@ class Engine:
     def focus(self, car: int, direction: float) -> FloatArray: ...  # (5,) [m]
     def appearance(self) -> bytes: ...  # for the game's window to draw it
     def close(self) -> None: ...
-    def controls(self, car: int) -> tuple[float, float, float, int]: ...
+    def controls(self, car: int) -> tuple[float, float, float, int, float]: ...
     def car_name(self, car: int) -> str: ...
     def gears(self, car: int) -> int: ...  # forward ones
     def laps(self, car: int) -> list[tuple[float, int]]: ...  # time [s], damage
@@ -87,7 +101,8 @@ class Fleet:
     def finish(self) -> None: ...
     def step(
         self,
-        indices: npt.NDArray[np.int64],  # (n,) of the engines
+        indices: npt.NDArray[np.int64],  # (n,) of the engines; rows of one follow each other
+        seats: npt.NDArray[np.int64],  # (n,) which car; -1 is the first agent's
         controls: FloatArray,  # (n, 5) as of Controls; a gear of nan is the gearbox's choice
         ticks: npt.NDArray[np.int64],  # (n,)
         cars: FloatArray,  # (n, 82) filled, as of CarState

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, MutableMapping
+from collections.abc import Callable, Iterator, MutableMapping, Sequence
 from functools import partial
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.wrappers import OrderEnforcing
+import numpy.typing as npt
+from gymnasium.wrappers import OrderEnforcing, TimeLimit
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
+from sb3_torcs.backends.seats import SharedRace
 from sb3_torcs.car import is_count
 from sb3_torcs.envs.batch import Batch, Timestep
 from sb3_torcs.envs.racing import RacingEnv, RacingInfo
+from sb3_torcs.envs.torcs_race import RaceCarEnv, make_race
 from sb3_torcs.errors import EnvClosed, InvalidOption
 
 __all__ = ["RaceInfo", "TorcsVecEnv"]
@@ -85,13 +88,21 @@ class TorcsVecEnv(DummyVecEnv):
     It returns what ``DummyVecEnv`` over the same environments in ``Monitor`` returns, to the bit,
     in less time. ``make_vec_env`` and the RL Zoo can use it in the place of ``DummyVecEnv``.
 
+    With several ``agents`` each car of each race is an environment: those of the first race come
+    first. When the episode of a car ends, the car rejoins its race: it is put down in the middle of
+    the longest stretch of road without cars, repaired and rolling, and its next episode begins
+    there, while the others race on. A race is over when each of its agents has ended the episode
+    that it began the race with; episodes that began later are then truncated, with ``"race"`` as
+    their ``end``, and the next race begins for all.
+
     :param races: their number, or functions that make the environments. Wrappers may be
         ``Monitor``, ``TimeLimit`` and ``OrderEnforcing`` only
-    :param agents: cars that learn in each race: 1
+    :param agents: cars that learn in each race
     :param threads: that share the work, at least 1; ``None`` is one per core, and one per race at
         most
     :param env_id: ``"Torcs-v0"`` or ``"TorcsLite-v0"``
-    :param env_kwargs: as of ``gym.make``, the same for all races
+    :param env_kwargs: as of ``gym.make``, the same for all races; with several agents those of
+        :func:`~sb3_torcs.envs.torcs_race.make_race`
     :raises InvalidOption: if an option has a value that is not allowed
     """
 
@@ -105,15 +116,22 @@ class TorcsVecEnv(DummyVecEnv):
         **env_kwargs: Any,
     ) -> None:
         self._batch: Batch | None = None
-        if agents != 1:
-            raise InvalidOption(f"agents is {agents!r}; expected 1: one car learns in each race")
+        if not is_count(agents):
+            raise InvalidOption(f"agents is {agents!r}; expected a whole number >= 1")
         if threads is not None and not is_count(threads):
             raise InvalidOption(f"threads is {threads!r}; expected a whole number >= 1, or None")
         if isinstance(races, (list, tuple)) and races:
             if env_kwargs:
                 names = ", ".join(env_kwargs)
                 raise InvalidOption(f"{names} is for races made here; give it to your functions")
+            if agents != 1:
+                raise InvalidOption(
+                    f"agents is {agents}, with functions that make environments of one; give the "
+                    "number of races"
+                )
             makers = list(races)
+        elif is_count(races) and agents > 1:
+            makers = _made(races, agents, env_id, env_kwargs)  # type: ignore[arg-type]
         elif is_count(races):
             makers = [partial(_monitored, env_id, env_kwargs)] * int(races)  # type: ignore[arg-type]
         else:
@@ -128,6 +146,7 @@ class TorcsVecEnv(DummyVecEnv):
         self.threads = self._batch.threads
         self._elapsed = np.zeros(self.num_envs, np.int64)  # timesteps of the episodes
         self._limits = np.full(self.num_envs, NO_LIMIT)
+        self._shared = _shared_races([race.racing for race in self._races])
         self._watched = [i for i, race in enumerate(self._races) if race.is_watched]
 
     @property
@@ -143,13 +162,23 @@ class TorcsVecEnv(DummyVecEnv):
         self._envs = envs
         self._driving = False
 
+    def reset(self) -> VecEnvObs:
+        """
+        Begin an episode in each environment.
+
+        :return: observations
+        """
+        for race in self._shared:
+            race.end()
+        return super().reset()
+
     def step_wait(self) -> VecEnvStepReturn:
         """
-        Hold an action in each race.
+        Hold an action in each environment.
 
         :return: observations, rewards, dones and infos
-        :raises InvalidAction: if there is not one action per race, or one is invalid; then no
-            race has been driven
+        :raises InvalidAction: if there is not one action per environment, or one is invalid; then
+            no race has been driven
         """
         if self._batch is None:
             raise EnvClosed("step after close; make a new environment")
@@ -160,6 +189,7 @@ class TorcsVecEnv(DummyVecEnv):
         dones = np.zeros(self.num_envs, np.bool_)
         infos: list[Any] = [RaceInfo(timestep, i) for i in range(self.num_envs)]
         over = timestep.ended | (self._elapsed + 1 >= self._limits)
+        self._end_races(over)
         self._elapsed += ~over
         failures: list[Exception] = []
         for i, finished in enumerate(over.tolist()):
@@ -179,6 +209,17 @@ class TorcsVecEnv(DummyVecEnv):
         if failures:
             raise failures[0]
         return timestep.observations, rewards, dones, infos
+
+    def _end_races(self, over: npt.NDArray[np.bool_]) -> None:
+        """End the races all of whose first episodes are over; with them end all their others."""
+        for race, members in self._shared.items():
+            ending = {number for number, i in enumerate(members) if over[i]}
+            if ending and race.is_over(ending):
+                race.end()
+                for i in members:
+                    if not over[i]:
+                        self._races[i].racing.end_race()
+                over[members] = True
 
     def _finish(self, i: int, timestep: Timestep) -> tuple[float, bool, dict[str, Any]]:
         """Take the last timestep of an episode through all wrappers, and reset."""
@@ -299,6 +340,32 @@ class _Race:
         if self._limit is not None:
             self._limit._elapsed_steps = elapsed
         self._noted = elapsed
+
+
+def _made(races: int, agents: int, env_id: str, env_kwargs: dict[str, Any]) -> list[EnvMaker]:
+    """Make races of several agents; return a function for each environment."""
+    if env_id != "Torcs-v0":
+        raise InvalidOption(
+            f"agents is {agents}, and {env_id} has one car in each race; races are of Torcs-v0"
+        )
+    options = dict(env_kwargs)
+    steps = options.pop("max_episode_steps", gym.spec(env_id).max_episode_steps)
+    envs = [env for _ in range(races) for env in make_race(agents, **options)]
+    return [partial(_limited, env, steps) for env in envs]
+
+
+def _limited(env: RacingEnv, steps: int | None) -> gym.Env[Any, Any]:
+    limited: gym.Env[Any, Any] = env if steps in (None, -1) else TimeLimit(env, steps)
+    return Monitor(limited)
+
+
+def _shared_races(envs: Sequence[RacingEnv]) -> dict[SharedRace, list[int]]:
+    """Return the races of several agents, and the indices of their environments."""
+    members: dict[SharedRace, list[int]] = {}
+    for i, env in enumerate(envs):
+        if isinstance(env, RaceCarEnv):
+            members.setdefault(env.seat.race, []).append(i)
+    return members
 
 
 def _monitored(env_id: str, env_kwargs: dict[str, Any]) -> gym.Env[Any, Any]:

@@ -8,7 +8,7 @@ from sb3_torcs.bench import torcs as bench_torcs
 from sb3_torcs.bench.learning import training_share
 from sb3_torcs.bench.stages import KEYS, stages
 from sb3_torcs.bench.updates import default_updates, products_of_an_update
-from sb3_torcs.bench.vec_env import vec_env
+from sb3_torcs.bench.vec_env import race, vec_env
 from sb3_torcs.errors import BackendUnavailable
 
 
@@ -18,7 +18,7 @@ def test_every_figure_is_measured_once_or_empty(monkeypatch):
     measurements = stages(0.01)
     figures = measurements["resets"]()
     assert list(figures) == ["lite_reset_ms"]
-    assert len(set(KEYS)) == len(KEYS) == 23
+    assert len(set(KEYS)) == len(KEYS) == 24
 
 
 def test_the_environments_are_measured_in_the_same_run(monkeypatch):
@@ -90,6 +90,12 @@ def test_races_at_once_are_measured_by_their_names(monkeypatch):
     assert list(figures) == ["vec_env_timesteps_per_s", "vec_env_two_threads_ratio"]
     assert min(figures.values()) > 0.0
     assert set(figures) < set(KEYS)
+
+
+@pytest.mark.usefixtures("game")
+def test_a_race_is_measured_by_its_name():
+    (rate,) = (race(0.0001, agents=2)[key] for key in KEYS if key.startswith("race_"))
+    assert rate > 0.0
 
 
 def test_one_core_has_no_second_thread_to_measure(monkeypatch):

@@ -382,7 +382,7 @@ class TestStarts:
         cars = [backend.engine.read(i) for i in range(3)]
         places = [around(car.distance_from_start, find_length("aalborg")) for car in cars]
         assert places == sorted(places, reverse=True)
-        assert backend.engine.agent == place - 1
+        assert backend.engine.agents == [place - 1]
 
     def test_the_last_place_is_the_default(self, rng):
         backend = NativeBackend("aalborg", opponents=("inferno", "bt", "tita"))
@@ -539,7 +539,7 @@ class TestAmongRobots:
                 break
         assert own.damage > 0
         assert own.opponents.min() < 6.0
-        assert any(engine.read(i).damage > 0 for i in range(4) if i != engine.agent)
+        assert any(engine.read(i).damage > 0 for i in range(4) if i not in engine.agents)
 
     def test_the_wall_damages(self, rng):
         backend = NativeBackend("michigan")

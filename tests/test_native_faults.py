@@ -518,7 +518,12 @@ WRONG = {
         "engine(entries=[('bt', 3)]).replay(np.zeros((3, 3)), True)", "InvalidOption"
     ),
     "nobody at all": ("engine(entries=[])", "InvalidOption"),
-    "two agents": ("engine(entries=[AGENT, AGENT])", "InvalidOption"),
+    "the same agent twice": ("engine(entries=[AGENT, AGENT])", "InvalidOption"),
+    "to hold no car": ("engine().hold(9999, 0, 0, 0, None)", "InvalidOption"),
+    "to retire no car": ("engine().retire(9999)", "InvalidOption"),
+    "to rejoin with no car": ("engine().rejoin(9999, 0, 0, 9)", "InvalidOption"),
+    "to rejoin nowhere": ("engine().rejoin(0, math.nan, 0, 9)", "InvalidOption"),
+    "finish of no car": ("engine().finished(9999)", "InvalidOption"),
     "controls of two numbers": ("engine().replay(np.zeros((3, 2)), True)", "InvalidAction"),
     "before the start": ("engine().start_at(-1.0, 0, 0, 0)", "InvalidOption"),
     "nowhere": ("engine().start_at(math.nan, 0, 0, 0)", "InvalidOption"),
@@ -571,7 +576,7 @@ class TestCalls:
             lambda: engine.advance(1), lambda: engine.read(0), lambda: engine.controls(0),
             lambda: engine.car_name(0), lambda: engine.laps(0), lambda: engine.set_noise(1),
             lambda: engine.set_origin(0, 0), lambda: engine.update_physics(1),
-            lambda: engine.replay(np.zeros((1, 3)), True), lambda: engine.agent,
+            lambda: engine.replay(np.zeros((1, 3)), True), lambda: engine.agents,
             lambda: engine.ended, lambda: engine.focus(0, 0.0), engine.appearance,
         ]  # fmt: skip
         for call in calls:

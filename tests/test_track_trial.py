@@ -148,7 +148,7 @@ def test_known_tracks_need_no_trial(monkeypatch):
     monkeypatch.setattr(track_trial, "load_road", lambda *words: pytest.fail("was tried"))
     game = find_game()
     for path in game.tracks().values():
-        arguments = {"car": "car1-trb1", "session": "practice", "laps": 0}
+        arguments = {"cars": ["car1-trb1"], "session": "practice", "laps": 0}
         try_race(path, engine_arguments(game, path, [("", 0)], **arguments))
 
 
@@ -171,7 +171,7 @@ def test_what_is_no_fault_of_the_file_is_not_blamed_on_it(monkeypatch):
     monkeypatch.setattr(sys, "path", [])
     path = find_game().tracks()["road/g-track-1"]
     with pytest.raises(BackendUnavailable, match=r"cannot be tried .*No module named '"):
-        track_trial.load_road(path, {"entries": []})
+        track_trial.load_road(path, {"entries": [], "cars": []})
 
 
 class TestRoad:

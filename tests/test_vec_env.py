@@ -360,7 +360,7 @@ class Own(TorcsLiteEnv):
     [
         ({"races": 0}, "races is 0; expected a whole number >= 1"),
         ({"races": "two"}, "races is 'two'"),
-        ({"agents": 2}, "agents is 2; expected 1"),
+        ({"agents": 0}, "agents is 0; expected a whole number >= 1"),
         ({"threads": 0}, "threads is 0; expected a whole number >= 1, or None"),
         ({"races": [partial(gym.make, LITE)], "laps": 1}, "laps is for races made here"),
         ({"races": [partial(gym.make, "CartPole-v1")]}, "is no racing environment"),

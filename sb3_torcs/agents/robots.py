@@ -139,4 +139,4 @@ def _ticks(engine: Any, cars: int) -> Iterator[tuple[int, CarState, tuple[Any, .
     while not engine.ended:
         engine.advance(1)
         for number in range(cars):
-            yield number, engine.read(number), engine.controls(number)
+            yield number, engine.read(number), engine.controls(number)[:4]

@@ -7,12 +7,12 @@ from collections.abc import Iterable, Sequence
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import numpy.typing as npt
 
 from sb3_torcs.actions import checked_gearbox
+from sb3_torcs.backends.seats import SeatWorld, profile_of
 from sb3_torcs.car import (
     DEFAULT_CAR,
     MANY_LAPS,
@@ -26,19 +26,21 @@ from sb3_torcs.errors import BackendUnavailable, InvalidOption, TrackFileError
 from sb3_torcs.sensors import RangeFinderName, range_finder_angles
 from sb3_torcs.torcs.building import build_command
 from sb3_torcs.torcs.installation import Game, find_game
-from sb3_torcs.torcs.race_setup import SCR_SERVER, SESSIONS, RaceSetup, Session
+from sb3_torcs.torcs.race_setup import SCR_SERVER, SESSIONS, RaceSetup, Session, session_for
 from sb3_torcs.torcs.starting_list import AGENT, starting_list
 from sb3_torcs.torcs.track_names import TrackFile, find_track
 from sb3_torcs.torcs.trial_child import encoded
 from sb3_torcs.tracks.catalogue import load_track
-from sb3_torcs.tracks.profile import RoadProfile, game_profile
+from sb3_torcs.tracks.profile import RoadProfile
 from sb3_torcs.tracks.track import Track
 from sb3_torcs.tracks.trial import check_road, engine_arguments, try_race
 
 if TYPE_CHECKING:
     from sb3_torcs._engine import Engine, Rollouts
 
-__all__ = ["Fleet", "NativeBackend", "check_layout", "make_engine", "make_rollouts"]
+__all__ = [
+    "Fleet", "NativeBackend", "check_layout", "make_engine", "make_grid", "make_rollouts",
+]  # fmt: skip
 
 MIN_SHIFT = 1.0  # [m] between the game's frame and the track's, from which positions are moved
 
@@ -48,23 +50,25 @@ def make_engine(
     track: str | os.PathLike[str] | TrackFile,
     entries: Sequence[tuple[str, int]],
     *,
-    car: str = DEFAULT_CAR,
+    car: str | Sequence[str] = DEFAULT_CAR,
     session: Session = "practice",
     laps: int = 0,
     angles: FloatArray | None = None,
-    gearbox: str = "automatic",
+    gearbox: str | Sequence[str] = "automatic",
+    flagged: bool = False,
 ) -> Engine:
     """
     Load a race of the real game.
 
     :param game: the installation
     :param track: ``"aalborg"``, ``"road/aalborg"``, or the path of an XML file
-    :param entries: the starting list: robots' names and indices, and :data:`AGENT` at most once
-    :param car: the agent's
+    :param entries: the starting list: robots' names and indices, and agents, ``("", 0)`` and up
+    :param car: of all agents, or one for each
     :param session: whose rules and grid count, ``"practice"`` or ``"race"``
     :param laps: of the race; 0 drives on
-    :param angles: (19,) of the range finders [rad], left negative
-    :param gearbox: the agent's; see :data:`sb3_torcs.actions.GEARBOXES`
+    :param angles: (19,) of the range finders [rad], left negative; or (agents, 19)
+    :param gearbox: of all agents, or one for each; see :data:`sb3_torcs.actions.GEARBOXES`
+    :param flagged: whether agents are flagged off after the last lap, as robots are
     :return: the engine, not yet started
     :raises InvalidOption: if a driver is named twice, or there is no such session
     :raises BackendUnavailable: if the extension or the game is missing, or not as expected
@@ -77,22 +81,30 @@ def make_engine(
     native = _extension()
     if session not in SESSIONS:
         raise InvalidOption(f"session is {session!r}; expected {' or '.join(SESSIONS)}")
-    game.find_car(car)
+    agents = sum(name == AGENT[0] for name, _ in entries)
+    cars = _for_each(car, agents)
+    for name in cars:
+        game.find_car(name)
     for name, index in entries:
         if entries.count((name, index)) > 1:
             raise InvalidOption(
                 f"{name or 'agent'}:{index} is named twice; name another driver of it, "
                 "`sb3-torcs robots` lists them"
             )
-        if (name, index) != AGENT:
+        if name != AGENT[0]:
             game.find_robot(name, index)
     path = find_track(track, game).path
     load_track(path)  # reports a broken file before the game's own loader reads it
-    race = engine_arguments(game, path, entries, car=car, session=session, laps=laps)
+    race = engine_arguments(game, path, entries, cars=cars, session=session, laps=laps)
     try_race(path, race)
     angles = range_finder_angles("scr") if angles is None else angles
-    road_speed = checked_gearbox(gearbox) == "road_speed"
-    engine: Engine = native.Engine(**encoded(race), angles=angles.tolist(), road_speed=road_speed)
+    gearboxes = [checked_gearbox(choice) for choice in _for_each(gearbox, agents)]
+    engine: Engine = native.Engine(
+        **encoded(race),
+        angles=np.broadcast_to(angles, (max(agents, 1), angles.shape[-1])).tolist(),
+        road_speed=[choice == "road_speed" for choice in gearboxes],
+        flagged=flagged,
+    )
     try:
         check_road(path, engine.road())
     except TrackFileError:
@@ -101,8 +113,56 @@ def make_engine(
     return engine
 
 
-_profiles: WeakKeyDictionary[Track, RoadProfile] = WeakKeyDictionary()
-"""Of tracks that were looked ahead on. Races on one track share it."""
+def _for_each(choice: str | Sequence[str], agents: int) -> list[str]:
+    """Repeat what is for all agents; a race of robots has it once."""
+    return [choice] * max(agents, 1) if isinstance(choice, str) else list(choice)
+
+
+def _align(engine: Engine, track: Track) -> None:
+    """Move positions into the track's frame: the game counts one track's origin otherwise."""
+    there = engine.track_summary()
+    x, y, _ = track.pose(0.0)
+    if abs(x - there["x"]) > MIN_SHIFT or abs(y - there["y"]) > MIN_SHIFT:
+        engine.set_origin(x - there["x"], y - there["y"])
+
+
+def make_grid(
+    track: str | Path,
+    car: str,
+    *,
+    agents: int,
+    range_finders: RangeFinderName | Sequence[float] = "scr",
+    opponents: Sequence[str] = (),
+    laps: int | None = None,
+    grid_place: int | None = None,
+    gearbox: str = "automatic",
+    flagged: bool = False,
+) -> list[SeatWorld]:
+    """
+    Load a race of several agents, for a :class:`~sb3_torcs.backends.seats.SharedRace`.
+
+    :param track: as of :class:`NativeBackend`
+    :param car: of all agents
+    :param agents: their number
+    :param range_finders: as of :class:`NativeBackend`
+    :param opponents: robots
+    :param laps: of the race, for which robots take fuel; ``None`` drives on
+    :param grid_place: of the first agent, whom the others follow; ``None`` is behind all robots
+    :param gearbox: as of :class:`NativeBackend`
+    :param flagged: whether agents are flagged off after the last lap
+    :return: the cars of the agents
+    """
+    game = find_game()
+    entries = starting_list(game, opponents, grid_place, agents)
+    file = find_track(track, game)
+    angles = range_finder_angles(range_finders)
+    engine = make_engine(
+        game, file, entries, car=car, session=session_for(entries), laps=checked_laps(laps) or 0,
+        angles=angles, gearbox=gearbox, flagged=flagged,
+    )  # fmt: skip
+    road = load_track(file.path)
+    _align(engine, road)
+    return [SeatWorld(engine, seat, road, angles) for seat in engine.agents]
 
 
 def make_rollouts(engines: Sequence[Engine]) -> Rollouts:
@@ -173,19 +233,17 @@ class NativeBackend:
             gearbox=gearbox,
         )
         self.track: Track = load_track(file.path)
-        self._agent = entries.index(AGENT)
-        self.gears = self.engine.gears(self._agent)
+        self.seat = entries.index(AGENT)  # in the starting list
+        self.gears = self.engine.gears(self.seat)
         self._noise = sensor_noise
         self._conditions = 1.0, 1.0
-        self._align()
+        _align(self.engine, self.track)
         self._drive: list[Any] = []  # steps since the reset, for copies
 
     @cached_property
     def profile(self) -> RoadProfile:
         """The road with its hills; see :class:`~sb3_torcs.backends.base.Backend`."""
-        if self.track not in _profiles:
-            _profiles[self.track] = game_profile(self.engine.road())
-        return _profiles[self.track]
+        return profile_of(self.engine, self.track)
 
     def race_setup(self) -> RaceSetup:
         """
@@ -201,13 +259,6 @@ class NativeBackend:
             "race" if self._settings["opponents"] else "practice",
             self.car,
         )
-
-    def _align(self) -> None:
-        """Move positions into the track's frame: the game counts one track's origin otherwise."""
-        there = self.engine.track_summary()
-        x, y, _ = self.track.pose(0.0)
-        if abs(x - there["x"]) > MIN_SHIFT or abs(y - there["y"]) > MIN_SHIFT:
-            self.engine.set_origin(x - there["x"], y - there["y"])
 
     def set_conditions(self, grip: float, mass: float) -> None:
         """Change the next episode's world; see :class:`~sb3_torcs.backends.base.Backend`."""
@@ -229,7 +280,7 @@ class NativeBackend:
         else:
             self.engine.start_at(*start)
         self._drive.append((start, noise, conditions))
-        self._state: CarState = self.engine.read(self._agent)
+        self._state: CarState = self.engine.read(self.seat)
         return self._state
 
     def step(self, controls: Controls, ticks: int) -> CarState:
@@ -257,7 +308,7 @@ class NativeBackend:
         :param direction: against the car's axis [rad], left negative
         :return: (5,) distances to the road's edge [m] at 1 degree from each other; -1 off the road
         """
-        return self.engine.focus(self._agent, direction)
+        return self.engine.focus(self.seat, direction)
 
     def save(self) -> Any:
         """
@@ -301,14 +352,17 @@ class Fleet:
     """
     Several worlds that are driven at once, by threads that live as long as this object.
 
-    :param backends: each only once
+    :param backends: each only once; seats of one race follow each other
     :param threads: that drive, with the calling one among them
     """
 
-    def __init__(self, backends: Sequence[NativeBackend], threads: int) -> None:
+    def __init__(self, backends: Sequence[NativeBackend | SeatWorld], threads: int) -> None:
         self._backends = list(backends)
         self._begun: dict[int, tuple[Controls, int]] = {}  # the latest step of each
-        self._fleet = _extension().Fleet([backend.engine for backend in backends], threads)
+        engines = list(dict.fromkeys(backend.engine for backend in backends))
+        self._engines = np.array([engines.index(backend.engine) for backend in backends])
+        self._seats = np.array([backend.seat for backend in backends])
+        self._fleet = _extension().Fleet(engines, threads)
 
     def begin(self, index: int, controls: Controls, ticks: int) -> None:
         """
@@ -341,13 +395,14 @@ class Fleet:
         cars: FloatArray,
     ) -> list[int]:
         """Drive some of them; see :class:`~sb3_torcs.backends.base.Fleet`."""
-        failed: list[int] = self._fleet.step(worlds, controls, ticks, cars)
+        engines, seats = self._engines[worlds], self._seats[worlds]
+        failed: list[int] = self._fleet.step(engines, seats, controls, ticks, cars)
         return failed
 
     def failure(self, world: int) -> Exception:
         """Return what stopped a race; see :class:`~sb3_torcs.backends.base.Fleet`."""
         try:
-            self._fleet.wait(world)
+            self._fleet.wait(int(self._engines[world]))
         except Exception as error:
             return error
         raise AssertionError("the race has not failed")

@@ -178,7 +178,9 @@ class ScrBackend:
     def profile(self) -> RoadProfile:
         """The road with its hills as the engine loads it, since the server does not send them."""
         path = find_track(self._settings["track"], self._game).path
-        race = engine_arguments(self._game, path, [AGENT], car=self.car, session="practice", laps=0)
+        race = engine_arguments(
+            self._game, path, [AGENT], cars=[self.car], session="practice", laps=0
+        )
         return game_profile(load_road(path, race))
 
     @property

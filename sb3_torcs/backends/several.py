@@ -103,7 +103,8 @@ def worlds_of(backend: Backend) -> tuple[Backend, ...]:
 
     :param backend: one world, or several
     """
-    return backend.worlds if isinstance(backend, SeveralWorlds) else (backend,)
+    worlds: tuple[Backend, ...] = getattr(backend, "worlds", (backend,))
+    return worlds
 
 
 def world_index(backend: Backend) -> int:
@@ -112,4 +113,4 @@ def world_index(backend: Backend) -> int:
 
     :param backend: one world, or several
     """
-    return backend.index if isinstance(backend, SeveralWorlds) else 0
+    return int(getattr(backend, "index", 0))

@@ -10,7 +10,7 @@ from sb3_torcs.bench.learning import training_rate, training_share
 from sb3_torcs.bench.policy import measure
 from sb3_torcs.bench.torcs import Figures
 from sb3_torcs.bench.updates import default_updates
-from sb3_torcs.bench.vec_env import vec_env
+from sb3_torcs.bench.vec_env import race, vec_env
 from sb3_torcs.errors import BackendUnavailable
 
 __all__ = ["KEYS", "stages"]
@@ -29,6 +29,7 @@ KEYS = (
     "torcs_vector2_ratio",
     "vec_env_timesteps_per_s",
     "vec_env_two_threads_ratio",
+    "race_car_ticks_per_s",
     "scr_ticks_per_s",
     "scr_reset_ms",
     "game_frames_per_s",
@@ -54,7 +55,7 @@ def stages(seconds: float) -> dict[str, Callable[[], Figures]]:
     :param seconds: to spend on all of them, about [s]
     :return: by name; each returns some of the figures
     """
-    share = seconds / 6.0
+    share = seconds / 7.0
     return {
         "environments": lambda: environments(share),
         "resets": resets,
@@ -63,6 +64,7 @@ def stages(seconds: float) -> dict[str, Callable[[], Figures]]:
         "game loads": _where_it_is(torcs.loads),
         "game threads": _where_it_is(lambda: torcs.vector(share)),
         "races at once": _where_it_is(lambda: vec_env(share)),
+        "one race": _where_it_is(lambda: race(share)),
         "SCR": _where_it_is(lambda: scr.ticks(share)),
         "SCR resets": _where_it_is(scr.resets),
         "pictures": _where_it_is(scr.pictures),

@@ -17,7 +17,17 @@ import numpy.typing as npt
 
 from sb3_torcs.car import FloatArray
 
-__all__ = ["REPEAT", "TORCS", "Figures", "loads", "resets", "scripted_actions", "ticks", "vector"]
+__all__ = [
+    "REPEAT",
+    "TORCS",
+    "Figures",
+    "loads",
+    "resets",
+    "scripted_actions",
+    "scripted_batches",
+    "ticks",
+    "vector",
+]
 
 TORCS = "sb3_torcs:Torcs-v0"
 REPEAT = 5  # control ticks per timestep, the default
@@ -158,7 +168,7 @@ def vector(seconds: float) -> Figures:
     if len(os.sched_getaffinity(0)) < 2:
         return {"torcs_vector2_ratio": None}
     one, two = (gym.make_vec(TORCS, num_envs=RACES, threads=threads) for threads in (1, 2))
-    actions = _scripted_batches(one)
+    actions = scripted_batches(one.reset(seed=0)[0], one.step, BATCHES)
     measurements: list[Callable[[], float]] = [
         lambda: _sweep(one, actions),
         lambda: _sweep(two, actions),
@@ -179,15 +189,20 @@ def vector(seconds: float) -> Figures:
     return {"torcs_vector2_ratio": statistics.median(ratios)}
 
 
-def _scripted_batches(envs: gym.vector.VectorEnv[Any, Any, Any]) -> Actions:
-    """Let the scripted driver choose actions for all races, from the grid on."""
+def scripted_batches(observations: Any, step: Callable[[Any], Any], number: int) -> Actions:
+    """
+    Let the scripted driver choose actions for many cars at once.
+
+    :param observations: from a reset
+    :param step: of a vector environment; returns the next observations first
+    :param number: of actions
+    """
     from sb3_torcs.agents.scripted import ScriptedDriver
 
     driver, actions = ScriptedDriver(), []
-    observations, _ = envs.reset(seed=0)
-    for _ in range(BATCHES):
+    for _ in range(number):
         actions.append(driver.predict(observations)[0])
-        observations = envs.step(actions[-1])[0]
+        observations = step(actions[-1])[0]
     return actions
 
 

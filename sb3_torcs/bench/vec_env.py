@@ -1,4 +1,4 @@
-"""How fast ``TorcsVecEnv`` is, on one thread and on two."""
+"""How fast ``TorcsVecEnv`` is: many races on one thread and on two, and many cars in one race."""
 
 from __future__ import annotations
 
@@ -11,14 +11,24 @@ from typing import TYPE_CHECKING
 import gymnasium as gym
 import numpy as np
 
-from sb3_torcs.bench.torcs import RACES, TORCS, Actions, Figures, scripted_actions
+from sb3_torcs.bench.torcs import (
+    RACES,
+    REPEAT,
+    TORCS,
+    Actions,
+    Figures,
+    scripted_actions,
+    scripted_batches,
+)
 
 if TYPE_CHECKING:
     from sb3_torcs.vec_env import TorcsVecEnv
 
-__all__ = ["vec_env"]
+__all__ = ["race", "vec_env"]
 
 TIMESTEPS = 100  # of a drive
+AGENTS = 8  # in one race
+RACE_TIMESTEPS = 300  # of one: the field has spread by then
 PART = 20  # timesteps per measurement by the wall clock: short enough for an idle moment
 
 
@@ -51,6 +61,28 @@ def vec_env(seconds: float) -> Figures:
         "vec_env_timesteps_per_s": statistics.median(processor),
         "vec_env_two_threads_ratio": max(fast) / max(slow) if several else None,
     }
+
+
+def race(seconds: float, agents: int = AGENTS) -> Figures:
+    """
+    Measure one race of several agents on one thread, five ticks per timestep.
+
+    :param seconds: of processor time, at least one turn [s]
+    :param agents: in the race
+    :return: ``race_car_ticks_per_s``: control ticks of all cars, the median over the turns
+    """
+    from sb3_torcs.vec_env import TorcsVecEnv
+
+    envs = TorcsVecEnv(1, agents, threads=1)
+    envs.seed(0)
+    actions = scripted_batches(envs.reset(), envs.step, RACE_TIMESTEPS)
+    rates: list[float] = []
+    begin = time.process_time()
+    while not rates or time.process_time() - begin < seconds:
+        envs.seed(0)
+        rates += _rates(envs, actions, len(actions), time.process_time)
+    envs.close()
+    return {"race_car_ticks_per_s": REPEAT * statistics.median(rates)}
 
 
 def _rates(

@@ -25,6 +25,8 @@ torcs_vector2_ratio       the gain by a second thread in gym.make_vec with 16 ra
                           gain by a second process with bare engines
 vec_env_timesteps_per_s   TorcsVecEnv on one thread: 16 races of Torcs-v0, five ticks per timestep
 vec_env_two_threads_ratio the gain by a second thread in the same, at best
+race_car_ticks_per_s      TorcsVecEnv on one thread: ticks of all cars of a race of eight agents,
+                          five per timestep
 scr_ticks_per_s           env.step with backend="scr", five ticks per timestep
 scr_reset_ms              resets with backend="scr"
 game_frames_per_s         render_mode="game" at 640x480

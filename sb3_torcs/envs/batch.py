@@ -16,6 +16,7 @@ from sb3_torcs.backends.lite.backend import LiteBackend
 from sb3_torcs.backends.lite.fleet import LiteFleet
 from sb3_torcs.backends.native import Fleet as NativeFleet
 from sb3_torcs.backends.native import NativeBackend
+from sb3_torcs.backends.seats import SeatWorld
 from sb3_torcs.backends.several import world_index, worlds_of
 from sb3_torcs.car import CAR_RECORD, CarState, Controls, FloatArray, car_from_record
 from sb3_torcs.envs.compiled import COMPILED, read_actions, value_timesteps
@@ -106,7 +107,8 @@ class Batch:
     def __init__(self, envs: Sequence[RacingEnv], threads: int | None = None) -> None:
         self.envs = list(envs)
         number = len(self.envs)
-        self.threads = min(threads or len(os.sched_getaffinity(0)), number)
+        races = {id(getattr(env.backend, "race", env)) for env in self.envs}
+        self.threads = min(threads or len(os.sched_getaffinity(0)), len(races))
         layouts = {(env.layout.names, env.layout.high) for env in self.envs}
         if len(layouts) > 1:
             raise InvalidOption(
@@ -365,7 +367,7 @@ def fleet_of(worlds: Sequence[Backend], threads: int) -> Fleet:
     :param threads: that drive
     :raises InvalidOption: if worlds of that kind cannot be driven at once
     """
-    native = [world for world in worlds if isinstance(world, NativeBackend)]
+    native = [world for world in worlds if isinstance(world, (NativeBackend, SeatWorld))]
     lite = [world for world in worlds if isinstance(world, LiteBackend)]
     if len(native) == len(worlds):
         return NativeFleet(native, threads)

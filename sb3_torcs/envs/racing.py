@@ -92,6 +92,9 @@ def racing_info(
     return info  # type: ignore[return-value]  # Gymnasium says dict, and it is one
 
 
+TRUNCATING = ("laps", "race")
+"""The ends of an episode that are no fault of the driver's."""
+
 ENDS = ("", "laps", "off_track", "backwards", "damage")
 """Why an episode ends because of the state of the car, by the index that :func:`end_of` returns."""
 
@@ -191,7 +194,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         self.car: CarState | None = None
         self._controls = Controls(0.0, 0.0, 0.0)
         self._viewer: Any = None
-        self._closed = False
+        self._closed = self._race_is_over = False
 
     def __getstate__(self) -> dict[str, Any]:
         return {
@@ -271,6 +274,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         self._controls = Controls(0.0, 0.0, 0.0)
         self.patience = STUCK_TICKS if start is not None and start.speed > 0.0 else GRACE_TICKS
         self.standing = 0
+        self._race_is_over = False
         if self.render_mode == "human":
             self.render()
         seen = self.view.encode(self.car, self.backend)
@@ -348,7 +352,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         info = racing_info(after, lap_time, terms, end)
         if self.render_mode == "human":
             self.render()
-        truncated = end == "laps"
+        truncated = end in TRUNCATING
         terminated = end is not None and not truncated
         seen = self.view.encode(after, self.backend)
         return seen, sum(terms.values()), terminated, truncated, info
@@ -399,6 +403,10 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         if standing == 0:
             self.patience = STUCK_TICKS
 
+    def end_race(self) -> None:
+        """Truncate the episode with the next timestep: the race that others share is over."""
+        self._race_is_over = True
+
     def _end(self, car: CarState) -> str | None:
         """Return why the episode ends, or ``None`` if it goes on."""
         reason = end_of(car, math.inf if self.laps is None else self.laps)
@@ -406,9 +414,12 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
             return ENDS[reason]
         if not stands(car):
             self.standing, self.patience = 0, STUCK_TICKS
-            return None
+            return self._end_of_race()
         self.standing += self.action_repeat
-        return "stuck" if self.standing > self.patience else None
+        return "stuck" if self.standing > self.patience else self._end_of_race()
+
+    def _end_of_race(self) -> str | None:
+        return "race" if self._race_is_over else None
 
     def _draw_start(self) -> Start | None:
         if self._start == "grid":

@@ -80,13 +80,35 @@ Controls controls_of(double steering, double throttle, double brake, std::option
             gear.value_or(AUTOMATIC_GEAR), static_cast<float>(clutch)};
 }
 
-std::array<double, RANGE_FINDERS> angles_of(const std::vector<double>& angles) {
-    if (angles.size() != RANGE_FINDERS)
-        throw Error("InvalidOption",
-                    "range finders have " + std::to_string(angles.size()) + " angles, expected 19");
-    std::array<double, RANGE_FINDERS> array;
-    std::copy(angles.begin(), angles.end(), array.begin());
-    return array;
+std::vector<Angles> angles_of(const std::vector<std::vector<double>>& lists) {
+    std::vector<Angles> arrays;
+    for (const std::vector<double>& angles : lists) {
+        if (angles.size() != RANGE_FINDERS)
+            throw Error("InvalidOption", "range finders have " + std::to_string(angles.size()) +
+                                             " angles, expected 19");
+        std::copy(angles.begin(), angles.end(), arrays.emplace_back().begin());
+    }
+    return arrays;
+}
+
+// Agents take their car and gearbox from the lists, by their index.
+std::vector<Entry> entries_of(const std::vector<std::pair<std::string, int>>& names,
+                              const std::vector<std::string>& cars,
+                              const std::vector<bool>& road_speed) {
+    std::vector<Entry> entries;
+    for (const auto& [name, index] : names) {
+        Entry& entry = entries.emplace_back();
+        entry.module = name;
+        entry.index = index;
+        if (!entry.is_agent()) continue;
+        const auto agent = static_cast<std::size_t>(index);
+        if (index < 0 || agent >= cars.size())
+            throw Error("InvalidOption", "agent " + std::to_string(index) + " has no car; " +
+                                             std::to_string(cars.size()) + " are named");
+        entry.car = cars[agent];
+        if (agent < road_speed.size() && road_speed[agent]) entry.gearbox = Gearbox::ROAD_SPEED;
+    }
+    return entries;
 }
 
 const std::vector<Engine*>& checked(const std::vector<Engine*>& engines) {
@@ -98,16 +120,19 @@ const std::vector<Engine*>& checked(const std::vector<Engine*>& engines) {
 // Reads orders from arrays with one row per order. Controls are those of sb3_torcs.car.Controls; a
 // gear of NaN leaves the choice to the gearbox. Arrivals are written into the rows of `cars`.
 std::vector<Fleet::Order> orders_of(const py::array_t<std::int64_t, py::array::c_style>& indices,
+                                    const py::array_t<std::int64_t, py::array::c_style>& seats,
                                     const py::array_t<double, py::array::c_style>& controls,
                                     const py::array_t<std::int64_t, py::array::c_style>& ticks,
                                     py::array_t<double, py::array::c_style>& cars) {
     constexpr py::ssize_t NUMBERS = sizeof(Reading) / sizeof(double);
     const py::ssize_t number = indices.size();
-    if (indices.ndim() != 1 || ticks.ndim() != 1 || ticks.size() != number ||
-        controls.ndim() != 2 || controls.shape(0) != number || controls.shape(1) != 5 ||
-        cars.ndim() != 2 || cars.shape(0) != number || cars.shape(1) != NUMBERS)
-        throw py::type_error("expected indices (n,), controls (n, 5), ticks (n,), cars (n, " +
-                             std::to_string(NUMBERS) + ")");
+    if (indices.ndim() != 1 || ticks.ndim() != 1 || ticks.size() != number || seats.ndim() != 1 ||
+        seats.size() != number || controls.ndim() != 2 || controls.shape(0) != number ||
+        controls.shape(1) != 5 || cars.ndim() != 2 || cars.shape(0) != number ||
+        cars.shape(1) != NUMBERS)
+        throw py::type_error(
+            "expected indices and seats (n,), controls (n, 5), ticks (n,), cars (n, " +
+            std::to_string(NUMBERS) + ")");
     const auto asked = controls.unchecked<2>();
     Reading* const arrivals = reinterpret_cast<Reading*>(cars.mutable_data());
     std::vector<Fleet::Order> orders;
@@ -115,7 +140,7 @@ std::vector<Fleet::Order> orders_of(const py::array_t<std::int64_t, py::array::c
     for (py::ssize_t i = 0; i < number; i++) {
         std::optional<int> gear;
         if (!std::isnan(asked(i, 3))) gear = static_cast<int>(asked(i, 3));
-        orders.push_back({static_cast<std::size_t>(indices.at(i)),
+        orders.push_back({static_cast<std::size_t>(indices.at(i)), static_cast<int>(seats.at(i)),
                           controls_of(asked(i, 0), asked(i, 1), asked(i, 2), gear, asked(i, 4)),
                           static_cast<int>(ticks.at(i)), arrivals + i});
     }
@@ -217,18 +242,20 @@ PYBIND11_MODULE(_engine, module) {
     py::class_<Engine>(module, "Engine", "One race of the real game.")
         .def(py::init([](const std::string& data, const std::string& libraries,
                          const std::string& plib, const std::string& track,
-                         const std::string& session, const std::string& car,
-                         const std::vector<std::pair<std::string, int>>& entries, int laps,
-                         const std::vector<double>& angles, bool road_speed) {
-                 const Gearbox gearbox = road_speed ? Gearbox::ROAD_SPEED : Gearbox::ENGINE_SPEED;
-                 RaceOptions options{track, session, car, {}, laps, gearbox};
-                 for (const auto& [name, index] : entries) options.entries.push_back({name, index});
+                         const std::string& session,
+                         const std::vector<std::pair<std::string, int>>& entries,
+                         const std::vector<std::string>& cars, int laps,
+                         const std::vector<std::vector<double>>& angles,
+                         const std::vector<bool>& road_speed, bool flagged) {
+                 RaceOptions options{track, session, entries_of(entries, cars, road_speed), laps,
+                                     flagged};
                  const WithoutPython released;
                  Game& game = Game::open(data, libraries, plib);
                  return std::make_unique<Engine>(game, std::move(options), angles_of(angles));
              }),
-             py::kw_only(), "data"_a, "libraries"_a, "plib"_a, "track"_a, "session"_a, "car"_a,
-             "entries"_a, "laps"_a, "angles"_a, "road_speed"_a = false)
+             py::kw_only(), "data"_a, "libraries"_a, "plib"_a, "track"_a, "session"_a, "entries"_a,
+             "cars"_a, "laps"_a, "angles"_a, "road_speed"_a = std::vector<bool>{},
+             "flagged"_a = false)
         .def("start",
              [](Engine& engine) {
                  const WithoutPython released;
@@ -248,19 +275,48 @@ PYBIND11_MODULE(_engine, module) {
                 {
                     const WithoutPython released;
                     Engine::Access race(engine);
-                    Engine::check_agent(*race);
-                    race->drive(controls, ticks);
-                    reading = engine.read(*race, race->agent());
+                    const int agent = Engine::first_agent(*race);
+                    race->hold(agent, controls);
+                    race->drive(ticks);
+                    reading = engine.read(*race, agent);
                 }
                 return as_state(reading);
             },
             "steering"_a, "throttle"_a, "brake"_a, "gear"_a, "ticks"_a, "clutch"_a = 0.0,
-            "Hold controls for some ticks; returns the agent's car as the fields of CarState.")
+            "Hold controls for some ticks; returns the first agent's car as the fields of "
+            "CarState.")
+        .def(
+            "hold",
+            [](Engine& engine, int car, double steering, double throttle, double brake,
+               std::optional<int> gear, double clutch) {
+                const Controls controls = controls_of(steering, throttle, brake, gear, clutch);
+                Engine::Access race(engine);
+                Engine::check_agent(*race, car);
+                race->hold(car, controls);
+            },
+            "car"_a, "steering"_a, "throttle"_a, "brake"_a, "gear"_a, "clutch"_a = 0.0,
+            "Say what an agent does from its next call on.")
+        .def(
+            "retire", [](Engine& engine, int car) { engine.retire(car); },
+            "Take a car off the road and out of the race.")
+        .def(
+            "rejoin",
+            [](Engine& engine, int car, double position, double error, double speed) {
+                engine.rejoin(car, Start{0.0, position, error, speed});
+            },
+            "Put an agent's car down in the middle of the longest free stretch of road, rolling.")
         .def("advance",
              [](Engine& engine, int ticks) {
                  const WithoutPython released;
-                 engine.drive(Controls{0.0f, 0.0f, 1.0f, 0, 0.0f}, ticks);
+                 engine.advance(ticks);
              })
+        .def(
+            "drive",
+            [](Engine& engine, int ticks) {
+                const WithoutPython released;
+                engine.drive(ticks);
+            },
+            "ticks"_a, "Drive on; each agent does what it was last told to hold.")
         .def("read", [](Engine& engine, int car) { return as_state(engine.read(car)); })
         .def("set_noise", &Engine::set_noise)
         .def(
@@ -280,10 +336,16 @@ PYBIND11_MODULE(_engine, module) {
                  Engine::check_car(*race, car);
                  const Control& control = race->car(car).control;
                  return py::make_tuple(control.steering, control.throttle, control.brake,
-                                       control.gear);
+                                       control.gear, control.clutch);
              })
-        .def_property_readonly("agent",
-                               [](Engine& engine) { return Engine::Access(engine)->agent(); })
+        .def_property_readonly("agents",
+                               [](Engine& engine) { return Engine::Access(engine)->agents(); })
+        .def("finished",
+             [](Engine& engine, int car) {
+                 const Engine::Access race(engine);
+                 Engine::check_car(*race, car);
+                 return race->finished(car);
+             })
         .def_property_readonly("ended",
                                [](Engine& engine) { return Engine::Access(engine)->ended(); })
         .def("car_name",
@@ -380,14 +442,16 @@ PYBIND11_MODULE(_engine, module) {
         .def(
             "step",
             [](Fleet& fleet, const py::array_t<std::int64_t, py::array::c_style>& indices,
+               const py::array_t<std::int64_t, py::array::c_style>& seats,
                const py::array_t<double, py::array::c_style>& controls,
                const py::array_t<std::int64_t, py::array::c_style>& ticks,
                py::array_t<double, py::array::c_style>& cars) {
-                const std::vector<Fleet::Order> orders = orders_of(indices, controls, ticks, cars);
+                const std::vector<Fleet::Order> orders =
+                    orders_of(indices, seats, controls, ticks, cars);
                 const WithoutPython released;
                 return fleet.step(orders);
             },
-            "indices"_a, "controls"_a, "ticks"_a, py::arg("cars").noconvert(),
+            "indices"_a, "seats"_a, "controls"_a, "ticks"_a, py::arg("cars").noconvert(),
             "Drive several at once; writes their cars, and returns the rows of those that failed.")
         .def("finish", [](Fleet& fleet) {
             const WithoutPython released;

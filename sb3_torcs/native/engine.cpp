@@ -45,17 +45,29 @@ CarAppearance appearance_of(const CarElement& car) {
     return looks;
 }
 
+// Agents have the indices 0, 1, ... in any order.
+void check_entries(const std::vector<Entry>& entries, std::size_t angles) {
+    std::vector<int> agents;
+    for (const Entry& entry : entries)
+        if (entry.is_agent()) agents.push_back(entry.index);
+    std::sort(agents.begin(), agents.end());
+    bool numbered = true;
+    for (std::size_t i = 0; i < agents.size(); i++) numbered &= agents[i] == static_cast<int>(i);
+    if (entries.empty() || !numbered || angles != std::max<std::size_t>(agents.size(), 1))
+        throw Error("InvalidOption",
+                    std::to_string(entries.size()) + " drivers, " + std::to_string(agents.size()) +
+                        " of them agents, and range finders of " + std::to_string(angles) +
+                        "; expected one driver or more, agents numbered from 0, "
+                        "and range finders for each agent");
+}
+
 }  // namespace
 
-Engine::Engine(Game& game, RaceOptions options, std::array<double, RANGE_FINDERS> angles)
-    : angles_(angles), forks_(count_forks()) {
-    const auto agents = std::count_if(options.entries.begin(), options.entries.end(),
-                                      [](const Entry& entry) { return entry.module.empty(); });
-    if (options.entries.empty() || agents > 1)
-        throw Error("InvalidOption", std::to_string(options.entries.size()) + " drivers, " +
-                                         std::to_string(agents) +
-                                         " of them agents; expected one or more, and one agent at "
-                                         "most");
+Engine::Engine(Game& game, RaceOptions options, std::vector<Angles> angles)
+    : forks_(count_forks()) {
+    check_entries(options.entries, angles.size());
+    for (const Entry& entry : options.entries)
+        angles_.push_back(angles[entry.is_agent() ? static_cast<std::size_t>(entry.index) : 0]);
     const PlainRounding rounding;
     race_ = std::make_unique<Race>(game, std::move(options));
 }
@@ -83,10 +95,9 @@ Engine::Access::Access(Engine& engine) : engine_(engine) {
 
 void Engine::start() { Access(*this)->start(); }
 
-void Engine::start(const Start& start) {
-    Access race(*this);
-    check_agent(*race);
-    const double length = race->track().length;
+namespace {
+
+void check_start(const Start& start, double length) {
     if (!is_valid(start, length))
         throw Error("InvalidOption",
                     "start at " + std::to_string(start.distance) + " m, place across " +
@@ -94,10 +105,37 @@ void Engine::start(const Start& start) {
                         std::to_string(start.heading_error) + " rad, " +
                         std::to_string(start.speed) + " m/s; expected 0 to " +
                         std::to_string(length) + " m, -5 to 5, -2 pi to 2 pi, 0 to 200 m/s");
+}
+
+}  // namespace
+
+void Engine::start(const Start& start) {
+    Access race(*this);
+    (void)first_agent(*race);
+    check_start(start, race->track().length);
     race->start(start);
 }
 
-void Engine::drive(const Controls& controls, int ticks) { Access(*this)->drive(controls, ticks); }
+void Engine::drive(int ticks) { Access(*this)->drive(ticks); }
+
+void Engine::advance(int ticks) {
+    Access race(*this);
+    for (const int agent : race->agents()) race->hold(agent, {0.0f, 0.0f, 1.0f, 0, 0.0f});
+    race->drive(ticks);
+}
+
+void Engine::retire(int car) {
+    Access race(*this);
+    check_car(*race, car);
+    race->retire(car);
+}
+
+void Engine::rejoin(int car, const Start& start) {
+    Access race(*this);
+    check_agent(*race, car);
+    check_start(start, race->track().length);
+    race->rejoin(car, start);
+}
 
 void Engine::set_noise(std::optional<std::uint64_t> seed) {
     Access race(*this);
@@ -135,9 +173,17 @@ void Engine::close() {
     race_.reset();
 }
 
-void Engine::check_agent(const Race& race) {
-    if (race.agent() < 0)
+int Engine::first_agent(const Race& race) {
+    if (race.agents().empty())
         throw Error("InvalidOption", "this race has robots only; put the agent into its list");
+    return race.agents().front();
+}
+
+void Engine::check_agent(const Race& race, int car) {
+    check_car(race, car);
+    if (!race.is_agent(car))
+        throw Error("InvalidOption", "car " + std::to_string(car) +
+                                         " is a robot's, which drives itself; name an agent's");
 }
 
 void Engine::check_car(const Race& race, int car) {
@@ -202,7 +248,8 @@ Reading Engine::read(Race& race, int index) {
         static_cast<double>(car.race.position),
     };
     for (std::size_t i = 0; i < 4; i++) reading.wheel_speeds[i] = car.priv.wheel[i].spin;
-    range_finders(car, angles_.data(), reading.range_finders.data());
+    range_finders(car, angles_[static_cast<std::size_t>(index)].data(),
+                  reading.range_finders.data());
     opponents(car, race.cars(), race.cars_number(), reading.opponents.data());
     if (noise_) add_noise(*noise_, reading.range_finders.data(), reading.opponents.data());
     return reading;
@@ -210,11 +257,12 @@ Reading Engine::read(Race& race, int index) {
 
 void Engine::replay(const std::vector<Controls>& controls, bool sensors) {
     Access race(*this);
-    check_agent(*race);
+    const int agent = first_agent(*race);
     double sum = 0.0;
     for (const Controls& control : controls) {
-        race->drive(control, 1);
-        if (sensors) sum += read(*race, race->agent()).range_finders[0];
+        race->hold(agent, control);
+        race->drive(1);
+        if (sensors) sum += read(*race, agent).range_finders[0];
     }
     if (!std::isfinite(sum)) throw Error("BackendUnavailable", "a sensor read no number");
 }

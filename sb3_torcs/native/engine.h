@@ -20,6 +20,8 @@ constexpr int GEAR_SCALAR = 15;
 constexpr int LAPS_SCALAR = 18;
 constexpr int POSITION_SCALAR = 22;
 
+using Angles = std::array<double, RANGE_FINDERS>;  // [rad] left negative
+
 struct Reading {
     std::array<double, SCALARS> scalars;
     std::array<double, 4> wheel_speeds;
@@ -51,14 +53,18 @@ private:
 
 class Engine {
 public:
-    Engine(Game& game, RaceOptions options, std::array<double, RANGE_FINDERS> angles);
+    // `angles` of the range finders of each agent; those of the first are the robots', too.
+    Engine(Game& game, RaceOptions options, std::vector<Angles> angles);
     ~Engine();
     Engine(const Engine&) = delete;
     Engine& operator=(const Engine&) = delete;
 
     void start();
     void start(const Start& start);
-    void drive(const Controls& controls, int ticks);
+    void drive(int ticks);
+    void advance(int ticks);  // agents stand on their brakes
+    void retire(int car);
+    void rejoin(int car, const Start& start);
     Reading read(int car);
     void set_noise(std::optional<std::uint64_t> seed);
     void set_conditions(const Conditions& conditions);  // for the starts that follow
@@ -94,11 +100,12 @@ public:
     Reading read(Race& race, int car);
 
     static void check_car(const Race& race, int car);
-    static void check_agent(const Race& race);
+    static int first_agent(const Race& race);  // its car
+    static void check_agent(const Race& race, int car);
 
 private:
     std::unique_ptr<Race> race_;
-    std::array<double, RANGE_FINDERS> angles_;
+    std::vector<Angles> angles_;  // of each car
     std::optional<Generator> noise_;
     double x_ = 0.0, y_ = 0.0;
     std::atomic<bool> busy_{false};

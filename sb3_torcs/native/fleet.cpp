@@ -1,5 +1,8 @@
 #include "fleet.h"
 
+#include <algorithm>
+#include <utility>
+
 namespace torcs {
 
 Fleet::Fleet(const std::vector<Engine*>& engines, int threads)
@@ -8,21 +11,24 @@ Fleet::Fleet(const std::vector<Engine*>& engines, int threads)
 }
 
 void Fleet::begin(std::size_t index, const Controls& controls, int ticks) {
-    begin({index, controls, ticks, &tasks_.at(index).reading});
+    begin({{index, FIRST_AGENT, controls, ticks, &tasks_.at(index).reading}});
 }
 
-void Fleet::begin(const Order& order) {
-    pool_.wait(order.index);
-    Task& task = tasks_[order.index];
-    task.controls = order.controls;
-    task.ticks = order.ticks;
-    task.arrival = order.arrival;
-    pool_.begin(order.index);
+void Fleet::begin(std::vector<Order> orders) {
+    const std::size_t index = orders.front().index;
+    pool_.wait(index);
+    tasks_[index].orders = std::move(orders);
+    pool_.begin(index);
 }
 
 std::vector<std::size_t> Fleet::step(const std::vector<Order>& orders) {
     for (const Order& order : orders) (void)tasks_.at(order.index);  // before any of them drives
-    for (const Order& order : orders) begin(order);
+    for (auto first = orders.begin(); first != orders.end();) {
+        const auto last = std::find_if(
+            first, orders.end(), [&](const Order& order) { return order.index != first->index; });
+        begin({first, last});
+        first = last;
+    }
     std::vector<std::size_t> failed;
     for (std::size_t i = 0; i < orders.size(); i++) {
         pool_.wait(orders[i].index);
@@ -43,9 +49,13 @@ void Fleet::work(std::size_t index) {
     task.failure = nullptr;
     try {
         Engine::Access race(*task.engine);
-        Engine::check_agent(*race);
-        race->drive(task.controls, task.ticks);
-        *task.arrival = task.engine->read(*race, race->agent());
+        for (Order& order : task.orders) {
+            if (order.car == FIRST_AGENT) order.car = Engine::first_agent(*race);
+            Engine::check_agent(*race, order.car);
+            race->hold(order.car, order.controls);
+        }
+        race->drive(task.orders.front().ticks);
+        for (const Order& order : task.orders) *order.arrival = task.engine->read(*race, order.car);
     } catch (...) {
         task.failure = std::current_exception();
     }

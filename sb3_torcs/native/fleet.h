@@ -22,28 +22,29 @@ public:
     // Drive until all have arrived.
     void finish() { pool_.finish(); }
 
-    // What one engine drives, and where its car is written when it has arrived.
+    // What a car drives, and where it is written when it has arrived.
     struct Order {
-        std::size_t index;
+        std::size_t index;  // of the engine
+        int car;            // an agent's; FIRST_AGENT is the first one's
         Controls controls;
         int ticks;
         Reading* arrival;
     };
-    // Drive several engines until all have arrived. Returns the indices of the orders that failed;
-    // their arrivals are not written, and `wait` throws their errors.
+    static constexpr int FIRST_AGENT = -1;
+    // Drive several engines until all have arrived; orders for one engine follow each other, and
+    // are for as many ticks. Returns the indices of the orders that failed; their arrivals are not
+    // written, and `wait` throws their errors.
     std::vector<std::size_t> step(const std::vector<Order>& orders);
 
 private:
     struct Task {
         Engine* engine;
-        Controls controls;
-        int ticks;
-        Reading* arrival;
+        std::vector<Order> orders;
         Reading reading;  // where an order names no other record
         std::exception_ptr failure;
     };
 
-    void begin(const Order& order);
+    void begin(std::vector<Order> orders);
     void work(std::size_t index);
 
     std::vector<Task> tasks_;

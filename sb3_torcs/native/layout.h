@@ -151,6 +151,7 @@ enum Wheel : int { FRONT_RIGHT = 0, FRONT_LEFT = 1, REAR_RIGHT = 2, REAR_LEFT = 
 
 enum CarStatus : int {
     IN_PIT = 0x1,
+    OUT_OF_RACE = 0x2,
     NOT_SIMULATED = 0xff,
     FINISHED = 0x100,
     BROKEN = 0x200,

@@ -99,6 +99,27 @@ std::vector<double> put_down(const Field& field, const Start& start,
     return distances;
 }
 
+void put_down_rolling(const Field& field, CarElement& car, const Start& start, float rest_height) {
+    const float width = segment_at(*field.manager->track, start.distance)->width;
+    place(field, car, static_cast<float>(start.distance),
+          static_cast<float>((1.0 + start.track_position) * 0.5 * width),
+          static_cast<float>(start.heading_error), rest_height);
+    // What the simulation would hand out after its next step.
+    const SimulatedCar& simulated = (*field.simulated)[car.index];
+    TrackPosition& position = car.pub.track;
+    position.to_left = width - position.to_right;
+    position.to_middle = position.to_right - 0.5f * width;
+    car.pub.global = simulated.global;
+    car.pub.speed = 0.0f;
+    car.priv.fuel = simulated.fuel;
+    car.priv.engine_speed = simulated.engine_speed;
+    for (int i = 0; i < 4; i++) car.priv.wheel[i].spin = simulated.wheel[i].spin;
+    // The gearbox of the simulation is in neutral, and goes into the gear that the car seems to
+    // have.
+    car.priv.gear = car.control.gear = gear_for(field, car, start.speed);
+    give_speed(field, car, start.speed);
+}
+
 void come_to_rest(const Field& field, Situation& situation) {
     field.simulation->update(&situation, PHYSICS_STEP, -1);
     settle(field, situation, SETTLING_STEPS, true);

@@ -45,6 +45,10 @@ void settle(const Field& field, Situation& situation, int steps, bool in_gear);
 std::vector<double> put_down(const Field& field, const Start& start,
                              const std::vector<float>& rest_heights);
 
+// Puts one car down among others that drive, rolling in the gear for its speed; its springs come to
+// rest while it drives.
+void put_down_rolling(const Field& field, CarElement& car, const Start& start, float rest_height);
+
 // Lets cars that were put down come to rest.
 void come_to_rest(const Field& field, Situation& situation);
 

@@ -10,6 +10,7 @@
 #include "checks.h"
 #include "errors.h"
 #include "gearbox.h"
+#include "sensors.h"
 
 namespace torcs {
 
@@ -208,10 +209,14 @@ void Race::load_cars() {
     world_->cars = make<CarElement>(number);
     world_->order = make<CarElement*>(number);
     world_->records = make<Record>(number);
+    world_->controls = make<Controls>(number);
     world_->manager.cars = world_->cars;
     world_->manager.situation = &world_->situation;
     world_->manager.track = track_;
     set_rules();
+    agents_.resize(static_cast<std::size_t>(
+        std::count_if(options_.entries.begin(), options_.entries.end(),
+                      [](const Entry& entry) { return entry.is_agent(); })));
     for (int i = 0; i < number; i++) {
         CarElement& car = world_->cars[i];
         car.index = i;
@@ -223,6 +228,8 @@ void Race::load_cars() {
 
     simulation_.init(number, track_, rules_.fuel_factor, rules_.damage_factor);
     simulated_ = simulation_library_->require<SimulatedCar**>("SimCarTable");
+    stop_colliding_ = simulation_library_->require<void (*)(SimulatedCar*, int)>(
+        "_Z19SimCollideRemoveCarP4tCari");
     for (int i = 0; i < number; i++) {
         world_->cars[i].race.best_lap_counts = true;
         place_on_grid(world_->cars[i]);
@@ -239,11 +246,12 @@ void Race::load_driver(CarElement& car, const Entry& entry) {
     car.race.position = car.index + 1;
     car.race.remaining_laps = world_->situation.laps;
     car.robot = make<Robot>();
-    std::string car_name = options_.car;
-    if (entry.module.empty()) {
-        agent_ = car.index;
+    std::string car_name = entry.car;
+    if (entry.is_agent()) {
+        agents_[static_cast<std::size_t>(entry.index)] = car.index;
         *car.robot = agent_robot();
-        copy_name(car.info.name, "agent");
+        copy_name(car.info.name,
+                  entry.index == 0 ? "agent" : "agent " + std::to_string(entry.index + 1));
         copy_name(car.info.team, "agent");
         copy_name(car.priv.module, "agent");
     } else {
@@ -361,7 +369,8 @@ void Race::place_on_grid(CarElement& car) {
 }
 
 Field Race::field() const {
-    return {world_->cars, cars_number(), agent_,          &world_->manager,
+    const int first = agents_.empty() ? -1 : agents_.front();
+    return {world_->cars, cars_number(), first,           &world_->manager,
             &simulation_, simulated_,    game_.to_global, game_.road_height};
 }
 
@@ -444,20 +453,22 @@ void Race::set_grip(double grip) {
     grip_ = grip;
 }
 
-// The agent's car gets the mass of the episode.
-void Race::load_agent() {
-    if (agent_ < 0 || conditions_.mass == 1.0) return;
-    SimulatedCar& car = (*simulated_)[agent_];
+// The agents' cars get the mass of the episode.
+void Race::load_agents() {
+    if (conditions_.mass == 1.0) return;
     const auto factor = static_cast<float>(conditions_.mass);
-    car.mass *= factor;
-    car.inverse_mass /= factor;
-    for (float& inverse : car.inverse_inertia) inverse /= factor;
+    for (const int agent : agents_) {
+        SimulatedCar& car = (*simulated_)[agent];
+        car.mass *= factor;
+        car.inverse_mass /= factor;
+        for (float& inverse : car.inverse_inertia) inverse /= factor;
+    }
 }
 
 void Race::start() {
     restore(on_grid_);
     set_grip(conditions_.grip);
-    load_agent();
+    load_agents();
 }
 
 void Race::start(const Start& start) {
@@ -475,7 +486,7 @@ void Race::start_elsewhere(const Start& start) {
     Hosted hosted(host_);
     Situation& situation = world_->situation;
     const std::vector<double> distances = put_down(field(), start, rest_heights_);
-    load_agent();
+    load_agents();
     {
         std::lock_guard<std::mutex> lock(game_.mutex);  // robots may read files, as when loaded
         announce();
@@ -490,33 +501,38 @@ void Race::start_elsewhere(const Start& start) {
     situation.delta_time = ROBOT_STEP;
     world_->last_call = -ROBOT_STEP;
     for (int i = 0; i < cars_number(); i++) {
-        CarElement& car = world_->cars[i];
-        Record& record = world_->records[i];
-        give_speed(field(), car, start.speed);
-        record.flying = true;
-        record.previous = car.pub.track;  // it may have settled across the line
-        manage(car);
-        const int ahead = crossings_of(car, distances[static_cast<std::size_t>(i)], track_->length,
-                                       start.distance == 0.0);
-        car.race.crossings = std::max(ahead, 0);
-        car.race.remaining_laps -= car.race.crossings;
-        record.backwards = std::max(-ahead, 0);
-        measure_distance(car);
-        record.start_distance = car.race.distance_raced;
+        give_speed(field(), world_->cars[i], start.speed);
+        begin_on_the_way(i, start, distances[static_cast<std::size_t>(i)]);
     }
     sort();
 }
 
+// Counts laps and distance from where a car has been put down.
+void Race::begin_on_the_way(int index, const Start& start, double distance) {
+    CarElement& car = world_->cars[index];
+    Record& record = world_->records[index];
+    record.flying = true;
+    record.previous = car.pub.track;  // it may have settled across the line
+    manage(car);
+    const int ahead = crossings_of(car, distance, track_->length, start.distance == 0.0);
+    car.race.crossings = std::max(ahead, 0);
+    car.race.remaining_laps -= car.race.crossings;
+    record.backwards = std::max(-ahead, 0);
+    measure_distance(car);
+    record.start_distance = car.race.distance_raced;
+}
+
 // ---- Driving ------------------------------------------------------------------------------------
 
-void Race::drive(const Controls& controls, int ticks) {
+void Race::hold(int index, const Controls& controls) { world_->controls[index] = controls; }
+
+void Race::drive(int ticks) {
     if (ticks < 0)
         throw Error("InvalidOption",
                     "ticks is " + std::to_string(ticks) + "; expected a whole number >= 0");
     Hosted hosted(host_);
-    world_->controls = controls;
-    // In a race with an agent, its environment decides when the race is over.
-    const auto over = [this] { return agent_ < 0 && ended(); };
+    // In a race without a flag, environments decide when it is over.
+    const auto over = [this] { return has_flag() && ended(); };
     for (int i = 0; i < ticks && !over(); i++) {
         step();
         while (!call_is_due() && !over()) step();
@@ -572,7 +588,7 @@ void Race::call_drivers() {
     for (int i = 0; i < situation.cars_number; i++) {
         CarElement& car = *world_->order[i];
         if (car.pub.status & NOT_SIMULATED) continue;
-        if (car.index == agent_)
+        if (is_agent(car.index))
             drive_agent(car);
         else
             car.robot->drive(car.robot->index, &car, &situation);
@@ -582,7 +598,7 @@ void Race::call_drivers() {
 
 void Race::drive_agent(CarElement& car) {
     if (world_->situation.state == PRESTART) return;
-    const Controls& controls = world_->controls;
+    const Controls& controls = world_->controls[car.index];
     car.control.steering = controls.steering;
     car.control.throttle = controls.throttle;
     car.control.brake = controls.brake;
@@ -600,7 +616,8 @@ void Race::shift(CarElement& car) const {
     const float shift_up = SHIFT_UP * priv.red_line;
     const int gear = std::max(priv.gear, 1);
     float engine_speed = priv.engine_speed;
-    if (options_.gearbox == Gearbox::ROAD_SPEED) {
+    const Entry& entry = options_.entries[static_cast<std::size_t>(car.index)];
+    if (entry.gearbox == Gearbox::ROAD_SPEED) {
         const float radius = (*simulated_)[car.index].wheel[REAR_RIGHT].radius;
         engine_speed = std::max(car.pub.local.vel.x, 0.0f) / radius * ratio[gear];
         if (gear == 1) {
@@ -615,6 +632,72 @@ void Race::shift(CarElement& car) const {
         car.control.gear = gear + 1;
     else if (gear > 1 && engine_speed * ratio[gear - 1] / ratio[gear] < SHIFT_DOWN * priv.red_line)
         car.control.gear = gear - 1;
+}
+
+// ---- Leaving and rejoining ----------------------------------------------------------------------
+
+// Takes a car out of the collision library, as the simulation does with a wreck.
+void Race::lift(CarElement& car) {
+    stop_colliding_(*simulated_ + car.index, cars_number());
+    if (car.race.pit && car.pub.status & IN_PIT) car.race.pit->occupied_by = -1;
+}
+
+void Race::retire(int index) {
+    Hosted hosted(host_);
+    CarElement& car = world_->cars[index];
+    if (car.pub.status & OUT_OF_RACE) return;
+    lift(car);
+    car.pub.status = (car.pub.status & ~IN_PIT) | OUT_OF_RACE;
+}
+
+// Along the road from the start line, [m].
+double Race::free_place(int index) const {
+    const double length = track_->length;
+    std::vector<double> taken;
+    for (int i = 0; i < cars_number(); i++)
+        if (i != index && !(car(i).pub.status & NOT_SIMULATED & ~IN_PIT))
+            taken.push_back(distance_along(car(i), length));
+    if (taken.empty()) return grid_distance(index);
+    std::sort(taken.begin(), taken.end());
+    double begin = taken.back() - length, widest = 0.0, place = 0.0;
+    for (const double end : taken) {
+        if (end - begin > widest) {
+            widest = end - begin;
+            place = begin + 0.5 * widest;
+        }
+        begin = end;
+    }
+    return place < 0.0 ? place + length : place;
+}
+
+void Race::rejoin(int index, const Start& start) {
+    Hosted hosted(host_);
+    CarElement& car = world_->cars[index];
+    Record& record = world_->records[index];
+    lift(car);
+    car.pub.status = 0;
+    const Start there = {free_place(index), start.track_position, start.heading_error, start.speed};
+    put_down_rolling(field(), car, there, rest_heights_[static_cast<std::size_t>(index)]);
+    CarRace& race = car.race;
+    while (race.penalties.first) {
+        Penalty* penalty = race.penalties.first;
+        race.penalties.first = penalty->next;
+        arena_.release(penalty);
+    }
+    race.penalties.last = &race.penalties.first;
+    race.best_lap_time = race.last_lap_time = race.total_time = race.delta_best_lap_time = 0.0;
+    race.penalty_time = race.top_speed = 0.0f;
+    race.best_lap_counts = true;
+    race.remaining_laps = world_->situation.laps;
+    const int room = record.laps_room;
+    LapRecord* laps = record.laps;
+    record = Record{};
+    record.laps = laps;
+    record.laps_room = room;
+    record.lap_began = static_cast<float>(world_->situation.time);
+    world_->controls[index] = Controls{};
+    begin_on_the_way(index, there, there.distance);
+    sort();
 }
 
 // ---- Reading and keeping ------------------------------------------------------------------------

@@ -19,22 +19,25 @@
 
 namespace torcs {
 
-// A driver of the starting list: a robot of the game, or without a module the agent.
+// How a gearbox chooses an agent's gears, where the agent does not.
+enum class Gearbox { ENGINE_SPEED, ROAD_SPEED };
+
+// A driver of the starting list: a robot of the game, or without a module an agent.
 struct Entry {
     std::string module;
-    int index = 0;
-};
+    int index = 0;         // of the module's drivers, or of the agents
+    std::string car = {};  // an agent's
+    Gearbox gearbox = Gearbox::ENGINE_SPEED;
 
-// How the gearbox chooses the agent's gears, where the agent does not.
-enum class Gearbox { ENGINE_SPEED, ROAD_SPEED };
+    bool is_agent() const { return module.empty(); }
+};
 
 struct RaceOptions {
     std::string track;    // path of its XML
     std::string session;  // of the game's race managers, "practice" or "quickrace"
-    std::string car;      // the agent's
     std::vector<Entry> entries;
-    int laps = 0;  // 0 drives on
-    Gearbox gearbox = Gearbox::ENGINE_SPEED;
+    int laps = 0;          // 0 drives on
+    bool flagged = false;  // whether agents are flagged off, as robots are in a race of their own
 };
 
 struct Controls {
@@ -64,7 +67,7 @@ struct Result {
 // What an episode may change of the world; 1 is as it is.
 struct Conditions {
     double grip = 1.0;  // of all ground
-    double mass = 1.0;  // of the agent's car, and of its inertia
+    double mass = 1.0;  // of each agent's car, and of its inertia
 };
 
 struct Snapshot {
@@ -104,11 +107,19 @@ public:
     // For the starts that follow.
     void set_conditions(const Conditions& conditions);
 
-    // Hold the agent's controls for some intervals between two calls of drivers.
-    void drive(const Controls& controls, int ticks);
+    // What an agent does from its next call on.
+    void hold(int index, const Controls& controls);
+    // Drives for some intervals between two calls of drivers.
+    void drive(int ticks);
+    // Takes a car off the road and out of the race; nobody sees it or hits it any more.
+    void retire(int index);
+    // Puts a car down in the middle of the longest stretch of road without cars, rolling, undamaged
+    // and without a lap; where along the road `start` says does not count.
+    void rejoin(int index, const Start& start);
     // The physics alone, for comparison: no drivers, no rules.
     void update_physics(int steps);
     bool ended() const;
+    bool finished(int index) const { return world_->records[index].finished; }
 
     Snapshot save() const;
     void restore(const Snapshot& snapshot);
@@ -121,7 +132,10 @@ public:
     const CarElement& car(int index) const { return world_->cars[index]; }
     CarElement* const* cars() const { return world_->order; }
     int cars_number() const { return world_->situation.cars_number; }
-    int agent() const { return agent_; }     // -1 if there is none
+    const std::vector<int>& agents() const { return agents_; }  // their cars, by their index
+    bool is_agent(int index) const {
+        return options_.entries[static_cast<std::size_t>(index)].is_agent();
+    }
     float height(int index) const;           // [m] of the mass centre above the road
     double distance_raced(int index) const;  // [m] since the start
     std::vector<LapRecord> laps(int index) const;
@@ -145,8 +159,8 @@ private:
     struct World {
         Situation situation;
         RaceManager manager;
-        double last_call;  // [s] when drivers were called
-        Controls controls;
+        double last_call;    // [s] when drivers were called
+        Controls* controls;  // of each car; those of robots are not read
         CarElement** order;
         CarElement* cars;
         Record* records;
@@ -179,8 +193,12 @@ private:
     void prepare();
     void start_elsewhere(const Start& start);
     void set_grip(double grip);
-    void load_agent();
+    void load_agents();
+    void begin_on_the_way(int index, const Start& start, double distance);
+    void lift(CarElement& car);
+    double free_place(int index) const;
 
+    bool has_flag() const { return options_.flagged || agents_.empty(); }
     void step();
     bool call_is_due() const;
     void keep_rolling();
@@ -221,7 +239,8 @@ private:
     Rules rules_{};
     World* world_ = nullptr;
     SimulatedCar** simulated_ = nullptr;
-    int agent_ = -1;
+    void (*stop_colliding_)(SimulatedCar*, int cars) = nullptr;  // of the simulation
+    std::vector<int> agents_;
     int set_up_ = 0;                   // drivers that know the track
     std::vector<float> rest_heights_;  // [m] of each car's mass centre over the road, standing
     Snapshot unannounced_, on_grid_;

@@ -101,8 +101,8 @@ bool Race::cross_line(CarElement& car, Record& record) {
         record.lap_began = static_cast<float>(situation.time);
     }
     record.top_speed = record.lowest_speed = race.lowest_speed = car.pub.local.vel.x;
-    // No car is flagged off in a race with an agent: its environment decides when the race is over.
-    if (agent_ < 0 && (race.remaining_laps < 0 || situation.state == FINISHING)) {
+    // In a race without a flag, environments decide when it is over.
+    if (has_flag() && (race.remaining_laps < 0 || situation.state == FINISHING)) {
         car.pub.status |= FINISHED;
         situation.state = FINISHING;
         record.finished = true;

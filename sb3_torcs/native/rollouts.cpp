@@ -17,9 +17,9 @@ constexpr double MOST_ASIDE = 2.0;  // [m] that a car steers back at once
 constexpr double FULL_THROTTLE = 0.98;
 
 Waypoint where(const Race& race) {
-    const CarElement& car = race.car(race.agent());
+    const CarElement& car = race.car(race.agents().front());
     return {race.situation().time,
-            race.distance_raced(race.agent()),
+            race.distance_raced(race.agents().front()),
             car.pub.track.to_middle,
             heading_error(car),
             car.pub.local.vel.x,
@@ -68,7 +68,7 @@ Controls controls_of(const Waypoint& now) {
 }
 
 bool on_road(const Waypoint& car, const Race& race) {
-    return std::abs(car.offset) <= 0.5 * race.car(race.agent()).pub.track.segment->width;
+    return std::abs(car.offset) <= 0.5 * race.car(race.agents().front()).pub.track.segment->width;
 }
 
 }  // namespace
@@ -132,12 +132,15 @@ void Rollouts::work(std::size_t index) {
 
 void Rollouts::work(Place& place) {
     Engine::Access race(*place.engine);
-    Engine::check_agent(*race);
+    const int agent = Engine::first_agent(*race);
     if (job_ == Job::MARK) place.marks.clear();
     if (job_ == Job::GO_BACK) place.marks.resize(place.marks.size() - drives_);
     if (job_ != Job::MARK) race->restore(place.marks.back());
     if (job_ == Job::DRIVE)
-        for (const Waypoint& waypoint : *path_) race->drive(controls_of(waypoint), ticks_);
+        for (const Waypoint& waypoint : *path_) {
+            race->hold(agent, controls_of(waypoint));
+            race->drive(ticks_);
+        }
     if (job_ == Job::MARK || job_ == Job::DRIVE) place.marks.push_back(race->save());
     if (job_ != Job::FOLLOW) return;
     for (std::size_t candidate = next_++; candidate < order_->candidates; candidate = next_++) {
@@ -152,7 +155,7 @@ void Rollouts::follow(Race& race, std::size_t candidate) const {
     Waypoint* path = order.paths + candidate * (order.steps + 1);
     const std::vector<Waypoint>& line = *order.line;
     path[0] = where(race);
-    const CarElement& car = race.car(race.agent());
+    const CarElement& car = race.car(race.agents().front());
     const int damage = car.priv.damage;
     const bool counted = car.race.best_lap_counts;
     std::size_t cursor = 0;
@@ -161,7 +164,8 @@ void Rollouts::follow(Race& race, std::size_t candidate) const {
         Waypoint& now = path[step];
         now = controlled(now, line_at(line, now, cursor), offsets[step], order.gains);
         try {
-            race.drive(controls_of(now), order.ticks);
+            race.hold(race.agents().front(), controls_of(now));
+            race.drive(order.ticks);
         } catch (const Error& error) {
             if (std::string(error.python_class) != "CarLost") throw;
             break;

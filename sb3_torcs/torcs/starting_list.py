@@ -1,4 +1,4 @@
-"""The starting list: the agent among the game's robots."""
+"""The starting list: agents among the game's robots."""
 
 from __future__ import annotations
 
@@ -8,23 +8,28 @@ from sb3_torcs.car import is_count
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.torcs.installation import Game
 
-__all__ = ["AGENT", "starting_list"]
+__all__ = ["AGENT", "GRID_SLOTS", "starting_list"]
 
 AGENT = ("", 0)
-"""The agent's entry in a starting list; robots have a name and an index."""
+"""The entry of the first agent in a starting list; robots have a name and an index."""
+
+GRID_SLOTS = 20
+"""[-] For which the grids of the game's tracks have room."""
 
 
 def starting_list(
-    game: Game, opponents: Sequence[str], grid_place: int | None
+    game: Game, opponents: Sequence[str], grid_place: int | None, agents: int = 1
 ) -> list[tuple[str, int]]:
     """
     Make the starting list.
 
     :param game: the installation
     :param opponents: robots, e.g. ``("inferno", "berniw:3")``
-    :param grid_place: of the agent among them, 1 in front; ``None`` is behind them all
-    :return: names and indices, and :data:`AGENT`
-    :raises InvalidOption: if there is no such slot, or the opponents are no list
+    :param grid_place: of the first agent among them, 1 in front; ``None`` is behind them all
+    :param agents: that follow each other
+    :return: names and indices, and those of the agents: no name, and 0, 1 and so on
+    :raises InvalidOption: if there is no such slot, or not enough of them, or the opponents are no
+        list
     :raises UnknownRobot: if there is no such robot
     """
     if not isinstance(opponents, (list, tuple)) or not all(isinstance(o, str) for o in opponents):
@@ -37,5 +42,11 @@ def starting_list(
         raise InvalidOption(
             f"grid_place is {grid_place!r}; expected 1 to {len(entries) + 1}, or None"
         )
-    entries.insert(slot - 1, AGENT)
+    if not is_count(agents) or agents + len(entries) > GRID_SLOTS:
+        raise InvalidOption(
+            f"agents is {agents!r}, with {len(entries)} opponents; expected a whole number from 1, "
+            f"and no more than {GRID_SLOTS} cars in all, which is what a grid has room for"
+        )
+    name, first = AGENT
+    entries[slot - 1 : slot - 1] = [(name, first + number) for number in range(agents)]
     return entries

@@ -65,7 +65,7 @@ def engine_arguments(
     path: Path,
     entries: Sequence[tuple[str, int]],
     *,
-    car: str,
+    cars: Sequence[str],
     session: Session,
     laps: int,
 ) -> dict[str, Any]:
@@ -74,8 +74,8 @@ def engine_arguments(
 
     :param game: the installation
     :param path: of the track's file
-    :param entries: the starting list; the agent is ``("", 0)``
-    :param car: the agent's
+    :param entries: the starting list; agents are ``("", 0)``, ``("", 1)`` and so on
+    :param cars: the agents'
     :param session: whose rules and grid count
     :param laps: of the race; 0 drives on
     :return: arguments by name
@@ -86,8 +86,8 @@ def engine_arguments(
         "plib": str(game.extra_libraries or ""),
         "track": str(path),
         "session": SESSIONS[session],
-        "car": car,
         "entries": list(entries),
+        "cars": list(cars),
         "laps": laps,
     }
 
@@ -160,8 +160,8 @@ def load_road(path: Path, race: dict[str, Any]) -> FloatArray:
     :return: (n_segments, 15) its road, as of the engine
     :raises TrackFileError: if the game's loader crashes or hangs
     """
-    race = {**race, "angles": [0.0] * RANGE_FINDERS}
-    robots = len(race["entries"]) - 1
+    race = {**race, "angles": [[0.0] * RANGE_FINDERS] * len(race["cars"])}
+    robots = len(race["entries"]) - len(race["cars"])
     task = {
         "owner": os.getpid(),
         "seconds": COMPUTING + COMPUTING_PER_ROBOT * robots,
@@ -237,6 +237,6 @@ def check_track(game: Game, race: RaceSetup, file: Path) -> None:
     try_race(
         file,
         engine_arguments(
-            game, file, agent + robots, car=race.car, session=race.session, laps=race.laps
+            game, file, agent + robots, cars=[race.car], session=race.session, laps=race.laps
         ),
     )

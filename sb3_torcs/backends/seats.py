@@ -1,0 +1,222 @@
+"""Several agents in one race of the real game: each has a seat, the world of its environment."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, NoReturn
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from sb3_torcs.car import CarState, Controls, FloatArray, Start
+from sb3_torcs.errors import InvalidOption
+from sb3_torcs.tracks.profile import RoadProfile, game_profile
+from sb3_torcs.tracks.track import Track
+
+if TYPE_CHECKING:
+    from sb3_torcs._engine import Engine
+
+__all__ = ["REJOIN_SPEED", "Seat", "SeatWorld", "SharedRace", "profile_of"]
+
+REJOIN_SPEED = 20.0
+"""[m/s] of a car that is put back on the road, where no start was drawn for it."""
+
+
+_profiles: WeakKeyDictionary[Track, RoadProfile] = WeakKeyDictionary()
+"""Of tracks that were looked ahead on. Races on one track share it."""
+
+
+def profile_of(engine: Engine, track: Track) -> RoadProfile:
+    """
+    Return the road of a race with its hills.
+
+    :param engine: of the race
+    :param track: the same road as it was read from its file
+    """
+    if track not in _profiles:
+        _profiles[track] = game_profile(engine.road())
+    return _profiles[track]
+
+
+class SeatWorld:
+    """
+    The car of an agent in a race that is loaded.
+
+    :param engine: that all cars of the race share
+    :param seat: of the car, in the starting list
+    :param track: of the race
+    :param angles: (19,) of the car's range finders [rad], left negative
+    """
+
+    def __init__(self, engine: Engine, seat: int, track: Track, angles: FloatArray) -> None:
+        self.engine, self.seat, self.track = engine, seat, track
+        self.range_finder_angles = angles
+        self.car = engine.car_name(seat)
+        self.gears = engine.gears(seat)
+
+    @cached_property
+    def profile(self) -> RoadProfile:
+        """The road with its hills; see :class:`~sb3_torcs.backends.base.Backend`."""
+        return profile_of(self.engine, self.track)
+
+    def arrive(self, controls: Controls, ticks: int, state: CarState) -> None:
+        """Take the result of a step, of which nothing has to be remembered."""
+
+
+class SharedRace:
+    """
+    A race whose agents begin and end their episodes one by one.
+
+    It begins on the grid, or with the whole field somewhere on the road. An agent whose episode
+    ends rejoins: its car is put down in the middle of the longest stretch of road without cars,
+    repaired, and its next episode begins there, while the others race on. When all agents have
+    ended the episode that they began the race with, the race is over, and the next reset begins
+    another one, on a track and in a field that are drawn again.
+
+    :param grids: the cars of the agents, of each race that can be drawn
+    :param noise: whether sensors err as those of the SCR server's ``-noisy``
+    """
+
+    def __init__(self, grids: Sequence[Sequence[SeatWorld]], noise: bool = False) -> None:
+        self.grids = [tuple(grid) for grid in grids]
+        self.index = 0  # of the present grid
+        self.agents = len(self.grids[0])
+        self._noise = noise
+        self._waiting: set[int] = set()  # agents that have not begun an episode in this race
+        self._lasting: set[int] = set()  # agents whose first episode in this race goes on
+        self._open = self.agents
+        self.seats = [Seat(self, number) for number in range(self.agents)]
+
+    def world(self, number: int) -> SeatWorld:
+        """
+        Return the car of an agent in the present race.
+
+        :param number: of the agent
+        """
+        return self.grids[self.index][number]
+
+    def is_over(self, ending: set[int]) -> bool:
+        """
+        Check whether the race is over when some episodes end.
+
+        :param ending: numbers of the agents whose episodes end now
+        """
+        return self._lasting <= ending
+
+    def end(self) -> None:
+        """End the race: the next reset of an agent begins another."""
+        self._waiting, self._lasting = set(), set()
+
+    def begins_with(self, number: int) -> bool:
+        """
+        Check whether the next reset of an agent begins a race.
+
+        :param number: of the agent
+        """
+        return number not in self._waiting and self._lasting <= {number}
+
+    def reset(self, number: int, rng: np.random.Generator, start: Start | None) -> CarState:
+        """
+        Begin an episode of an agent.
+
+        :param number: of the agent
+        :param rng: the generator of its environment
+        :param start: of the field if a race begins; where along the road does not count for a car
+            that rejoins; nothing counts for one that begins a race with another
+        :return: the car
+        """
+        world = self.world(number)
+        if self.begins_with(number):
+            self._begin(rng, start, world.engine)
+            self._waiting = set(range(self.agents)) - {number}
+            self._lasting = set(range(self.agents))
+        elif number in self._waiting:
+            self._waiting.discard(number)
+        else:
+            self._lasting.discard(number)
+            _, *place = start or Start(0.0, speed=REJOIN_SPEED)
+            world.engine.rejoin(world.seat, *place)
+        return world.engine.read(world.seat)
+
+    def _begin(self, rng: np.random.Generator, start: Start | None, engine: Engine) -> None:
+        engine.set_noise(int(rng.integers(2**63)) if self._noise else None)
+        if start is None:
+            engine.start()
+        else:
+            engine.start_at(*start)
+
+    def leave(self) -> None:
+        """Close the race when the last seat is left."""
+        self._open -= 1
+        if self._open == 0:
+            for grid in self.grids:
+                grid[0].engine.close()
+
+
+class Seat:
+    """
+    The world of one agent of a shared race; see :class:`~sb3_torcs.backends.base.Backend`.
+
+    :param race: that it is in
+    :param number: of the agent, from 0
+    """
+
+    def __init__(self, race: SharedRace, number: int) -> None:
+        self.race, self.number = race, number
+        self.worlds = tuple(grid[number] for grid in race.grids)
+        self.gears = min(world.gears for world in self.worlds)
+        self.range_finder_angles = self.worlds[0].range_finder_angles
+        self._closed = False
+
+    @property
+    def index(self) -> int:
+        """Which of the worlds is driven."""
+        return self.race.index
+
+    @property
+    def track(self) -> Track:
+        """The track of the present race."""
+        return self.worlds[self.index].track
+
+    @property
+    def profile(self) -> RoadProfile:
+        """The road of the present race with its hills."""
+        return self.worlds[self.index].profile
+
+    @property
+    def car(self) -> str:
+        """The agent's car in the present race."""
+        return self.worlds[self.index].car
+
+    def draw_track(self, rng: np.random.Generator) -> None:
+        """Choose the next race, if it begins now; see ``Backend``."""
+        if self.race.begins_with(self.number):
+            self.race.index = int(rng.integers(len(self.worlds)))
+
+    def reset(self, rng: np.random.Generator, start: Start | None) -> CarState:
+        """Begin an episode; see :meth:`SharedRace.reset`."""
+        return self.race.reset(self.number, rng, start)
+
+    def step(self, controls: Controls, ticks: int) -> NoReturn:
+        """Refuse to drive one car of several."""
+        del controls, ticks
+        raise InvalidOption(
+            f"the {self.race.agents} agents of this race drive at once; step the whole vector "
+            "environment"
+        )
+
+    def close(self) -> None:
+        """Leave the race, which is closed by the last one."""
+        if not self._closed:
+            self._closed = True
+            self.race.leave()
+
+    def __reduce__(self) -> NoReturn:
+        raise InvalidOption(
+            "an environment that shares its race with others cannot be copied or sent to another "
+            "process; make the whole vector environment there"
+        )
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> NoReturn:
+        self.__reduce__()

@@ -1,0 +1,441 @@
+"""Many agents in one race: the engine drives them at once, and each has its own episodes."""
+
+from __future__ import annotations
+
+import pickle
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from stable_baselines3 import DDPG, PPO
+
+from sb3_torcs.agents.scripted import ScriptedDriver
+from sb3_torcs.backends.native import Fleet, make_engine, make_grid
+from sb3_torcs.backends.seats import REJOIN_SPEED
+from sb3_torcs.car import CAR_RECORD, CONTROL_TICK
+from sb3_torcs.envs.torcs_race import make_race
+from sb3_torcs.errors import CarLost, InvalidAction, InvalidOption
+from sb3_torcs.torcs.installation import find_game
+from sb3_torcs.vec_env import TorcsVecEnv
+
+TRACK = "g-track-1"
+TWO = [("bt", 2), ("", 0), ("inferno", 3), ("", 1)]
+GAS, TURN = [0.0, 1.0, 0.0], [1.0, 1.0, 0.0]
+
+
+@pytest.fixture(autouse=True)
+def _game(game):
+    """Nothing here works without it."""
+
+
+@pytest.fixture
+def race():
+    """Load races, and close them afterwards."""
+    made = []
+
+    def load(entries=TWO, **options):
+        made.append(make_engine(find_game(), TRACK, entries, session="race", **options))
+        made[-1].start()
+        return made[-1]
+
+    yield load
+    for engine in made:
+        engine.close()
+
+
+@pytest.fixture
+def make():
+    """Make vector environments, and close them afterwards."""
+    made = []
+
+    def make(*args, **options):
+        made.append(TorcsVecEnv(*args, **{"track": TRACK, **options}))
+        return made[-1]
+
+    yield make
+    for envs in made:
+        envs.close()
+
+
+def seen(engine, cars=4):
+    """Everything that can be read of a race, to the bit."""
+    return [np.hstack(engine.read(car)).tobytes() for car in range(cars)]
+
+
+def hold(engine, controls):
+    for car, row in zip(engine.agents, controls, strict=True):
+        engine.hold(car, *row)
+
+
+def random_controls(ticks, agents=2):
+    rng = np.random.default_rng(0)
+    return [
+        [(*rng.uniform([-0.2, 0.3, 0.0], [0.2, 1.0, 0.1]), None) for _ in range(agents)]
+        for _ in range(ticks)
+    ]
+
+
+def drive(engine, controls):
+    """Hold controls for a tick each; return what was seen after each."""
+    answers = []
+    for row in controls:
+        hold(engine, row)
+        engine.drive(1)
+        answers.append(seen(engine))
+    return answers
+
+
+class TestEngine:
+    def test_recorded_controls_give_the_recorded_race(self, race):
+        """With the gears, too, which gearboxes chose the first time."""
+        first = race()
+        controls, recorded = random_controls(300), []
+        repeated = []
+        for row in controls:
+            hold(first, row)
+            first.drive(1)
+            recorded.append(seen(first))
+            gears = [first.controls(car)[3] for car in first.agents]
+            repeated.append([(*asked[:3], gear) for asked, gear in zip(row, gears, strict=True)])
+        assert {gear for row in repeated for *_, gear in row} >= {1, 2}
+        assert drive(race(), repeated) == recorded
+
+    def test_a_fleet_drives_all_agents_of_a_race_as_one_by_one(self, race):
+        one, other = race(), race()
+        controls = random_controls(60)
+        states = np.empty((2, CAR_RECORD.itemsize // 8))
+        grid = [_Seat(other, car) for car in other.agents]
+        fleet = Fleet(grid, threads=2)
+        for row in controls:
+            hold(one, row)
+            one.drive(5)
+            asked = np.array([[*numbers[:3], np.nan, 0.0] for numbers in row])
+            assert fleet.step(np.arange(2), asked, np.full(2, 5), states) == []
+            found = [states[agent].tobytes() for agent in range(2)]
+            assert found == [seen(one)[car] for car in one.agents]
+
+    def test_agents_have_a_car_and_a_gearbox_each(self, race):
+        engine = race(
+            [("", 0), ("", 1)], car=["car1-trb1", "baja-bug"], gearbox=["road_speed", "automatic"]
+        )
+        assert [engine.car_name(car) for car in engine.agents] == ["car1-trb1", "baja-bug"]
+        hold(engine, [(0.0, 1.0, 0.0, None)] * 2)
+        engine.drive(10)
+        clutches = [engine.controls(car)[4] for car in engine.agents]
+        assert clutches[0] > 0.0 == clutches[1]
+
+    def test_a_snapshot_holds_what_agents_hold_and_who_has_left(self, race):
+        engine = race()
+        drive(engine, random_controls(100))
+        engine.retire(1)
+        engine.rejoin(3, 0.2, 0.0, 15.0)
+        moment = engine.save()
+        after = drive(engine, random_controls(50))
+        engine.rejoin(1, 0.0, 0.0, 30.0)
+        engine.restore(moment)
+        assert drive(engine, random_controls(50)) == after
+
+    def test_no_one_is_flagged_off_unless_asked(self, race):
+        """In a race that is flagged, the others are when they cross the line after the winner."""
+        for flagged in (False, True):
+            engine = race([("", 0), ("bt", 2)], laps=1, flagged=flagged)
+            while engine.read(1).laps < 2 and not engine.finished(1):
+                hold(engine, [(0.0, 0.0, 1.0, None)])
+                engine.drive(50)
+            assert (engine.finished(1), engine.finished(0)) == (flagged, False)
+
+
+class _Seat:
+    """What a fleet has to know of a car."""
+
+    def __init__(self, engine, seat):
+        self.engine, self.seat = engine, seat
+
+
+class TestLeavingAndRejoining:
+    def test_nobody_sees_or_hits_a_car_that_has_retired(self, race):
+        """The car behind drives straight through where it stands."""
+        engine = race([("", 0), ("", 1)])
+        hold(engine, [(0.0, 0.0, 1.0, None), (0.0, 0.5, 0.0, None)])
+        engine.drive(5)
+        assert engine.read(1).opponents.min() < 20.0
+        before = seen(engine, 1)
+        engine.retire(0)
+        assert engine.read(1).opponents.min() == 200.0
+        hold(engine, [(0.0, 1.0, 0.0, None), (0.1, 0.5, 0.0, None)])
+        engine.drive(300)
+        assert engine.read(0).distance_raced == np.frombuffer(before[0])[13]
+        assert (engine.read(1).damage, engine.read(1).race_position) == (0.0, 1)
+        engine.retire(0)  # a second time changes nothing
+
+    def test_it_is_in_the_middle_of_the_longest_free_stretch(self, race):
+        engine = race()
+        drive(engine, random_controls(400))
+        others = sorted(engine.read(car).distance_from_start for car in (0, 1, 2))
+        length = engine.track_summary()["length"]
+        engine.rejoin(3, 0.25, 0.1, 12.0)
+        car = engine.read(3)
+        gaps = np.diff([*others, others[0] + length])
+        middle = others[int(gaps.argmax())] + 0.5 * gaps.max()
+        assert car.distance_from_start == pytest.approx(middle % length, abs=0.01)  # floats
+        assert car.track_position == pytest.approx(0.25, abs=1e-4)
+        assert car.heading_error == pytest.approx(0.1, abs=1e-4)
+        assert (car.speed_x, car.damage, car.laps, car.last_lap_time) == (12.0, 0.0, 0, 0.0)
+        assert (car.distance_raced, car.race_position, car.fuel) == (0.0, 4, 94.0)
+
+    def test_the_others_race_on_as_if_nothing_had_happened(self, race):
+        """But for the standings, and what they see."""
+        engine = race()
+        drive(engine, random_controls(100))
+        before = [engine.read(car)[:13] for car in (0, 1, 2)]
+        engine.rejoin(3, 0.0, 0.0, 20.0)
+        assert [engine.read(car)[:13] for car in (0, 1, 2)] == before
+
+    @pytest.mark.parametrize("speed", [0.0, 20.0, 60.0])
+    def test_it_stands_on_its_springs_and_drives_off(self, race, speed):
+        engine = race()
+        drive(engine, random_controls(50))
+        rest = engine.read(3).height
+        for _ in range(20):
+            engine.rejoin(3, 0.0, 0.0, speed)
+            begin = engine.read(3)
+            for _ in range(10):
+                engine.hold(3, 0.0, 0.5, 0.0, None)
+                engine.drive(1)
+                car = engine.read(3)
+                assert abs(car.height - rest) < 0.1  # [m] wings press it down
+                assert abs(car.speed_x - begin.speed_x) < 3.0  # [m/s] no gear brakes it
+        assert car.damage == 0.0
+        assert car.distance_raced == pytest.approx(10 * CONTROL_TICK * speed, rel=0.1, abs=0.1)
+
+    def test_its_laps_begin_anew(self, race):
+        engine = race([("", 0)], laps=5)
+        engine.start_at(engine.track_summary()["length"] - 100.0, 0.0, 0.0, 50.0)
+        while engine.read(0).laps < 1:
+            engine.rejoin(0, 0.0, 0.0, 50.0) if engine.read(0).off_track else None
+            step_of_script(engine)
+        engine.rejoin(0, 0.0, 0.0, 20.0)
+        assert (engine.read(0).laps, engine.laps(0)) == (0, [])
+
+
+def step_of_script(engine):
+    from sb3_torcs.actions import controls_from_action
+    from sb3_torcs.sensors import encode
+
+    action, _ = ScriptedDriver().predict(encode(engine.read(0)))
+    engine.hold(0, *controls_from_action(action))
+    engine.drive(5)
+
+
+class TestMistakes:
+    @pytest.mark.parametrize(
+        "entries", [[("", 1)], [("", 0), ("", 2)], [("", -1)], [("", 0), ("", 0)]]
+    )
+    def test_agents_are_numbered_from_zero(self, race, entries):
+        with pytest.raises(InvalidOption, match=r"expected one driver or more|named twice|no car"):
+            race(entries)
+
+    @pytest.mark.parametrize("call", ["hold", "rejoin"])
+    def test_a_robot_drives_itself(self, race, call):
+        numbers = (0.0, 0.0, 0.0, None) if call == "hold" else (0.0, 0.0, 0.0)
+        with pytest.raises(InvalidOption, match="car 0 is a robot's"):
+            getattr(race(), call)(0, *numbers)
+
+    def test_more_cars_than_grid_slots(self):
+        with pytest.raises(InvalidOption, match=r"agents is 19, with 2 opponents; .* 20 cars"):
+            make_grid(TRACK, "car1-trb1", agents=19, opponents=["bt", "inferno"])
+
+    @pytest.mark.parametrize("agents", [0, -1, 1.5, True, None])
+    def test_no_number_of_agents(self, agents):
+        with pytest.raises(InvalidOption, match="agents is"):
+            TorcsVecEnv(1, agents)
+
+    def test_controls_that_arrive_late(self):
+        with pytest.raises(InvalidOption, match="delay is for a race of one agent"):
+            make_race(2, delay=3)
+
+    def test_worlds_with_one_car(self):
+        with pytest.raises(InvalidOption, match=r"TorcsLite-v0 has one car in each race"):
+            TorcsVecEnv(1, 2, env_id="TorcsLite-v0")
+        with pytest.raises(InvalidOption, match="environments of one; give the number of races"):
+            TorcsVecEnv([lambda: gym.make("Torcs-v0")], 2)
+
+    def test_one_car_alone_cannot_be_driven_or_copied(self, make):
+        envs = make(1, 2)
+        envs.reset()
+        env = envs.envs[0]
+        with pytest.raises(InvalidOption, match="2 agents of this race drive at once"):
+            env.step(np.array(GAS, np.float32))
+        with pytest.raises(InvalidOption, match="cannot be copied"):
+            pickle.dumps(env.unwrapped)
+
+    def test_no_number_drives_nobody(self, make):
+        envs = make(1, 3)
+        envs.reset()
+        before = [car.time for car in envs.get_attr("car")]
+        with pytest.raises(InvalidAction, match="steering is nan"):
+            envs.step(np.array([GAS, [np.nan, 0.0, 0.0], GAS], np.float32))
+        assert [car.time for car in envs.get_attr("car")] == before
+        envs.step(np.array([GAS] * 3, np.float32))
+
+
+def by_hand(agents, actions, **options):
+    """What a vector environment is held to: each car asked and valued alone, until one ends."""
+    envs = make_race(agents, track=TRACK, **options)
+    observations = [[env.reset(seed=seed)[0] for seed, env in enumerate(envs)]]
+    engine = envs[0].backend.worlds[0].engine
+    rewards, ended = [], False
+    for row in actions:
+        for env, action in zip(envs, row, strict=True):
+            ((controls, _),) = env.begin_step(action)
+            engine.hold(env.backend.worlds[0].seat, *controls)
+        engine.drive(5)
+        answers = [env.finish_step(lambda env=env: _read(env)) for env in envs]
+        rewards.append([np.float32(answer[1]) for answer in answers])
+        ended = any(answer[2] or answer[3] for answer in answers)
+        if ended:
+            break
+        observations.append([answer[0] for answer in answers])
+    for env in envs:
+        env.close()
+    assert ended, "no episode ended: little was compared"
+    return observations, rewards
+
+
+def _read(env):
+    world = env.backend.worlds[0]
+    return world.engine.read(world.seat)
+
+
+def random_actions(steps, cars):
+    rng = np.random.default_rng(5)
+    low, high = [-0.3, 0.2, 0.0], [0.3, 1.0, 0.2]
+    return [rng.uniform(low, high, (cars, 3)).astype(np.float32) for _ in range(steps)]
+
+
+class TestVectorEnvironment:
+    @pytest.mark.parametrize("options", [{}, {"opponents": ["bt"], "start": "random"}])
+    def test_it_is_each_car_driven_by_hand(self, make, options):
+        actions = random_actions(200, 3)
+        observations, rewards = by_hand(3, actions, **options)
+        envs = make(1, 3, **options)
+        envs.seed(0)
+        assert np.array_equal(envs.reset(), observations[0])
+        for step, action in enumerate(actions[: len(rewards)]):
+            found = envs.step(action)
+            assert np.array_equal(found[1], rewards[step]), f"step {step}"
+            if step + 1 < len(observations):
+                assert np.array_equal(found[0], observations[step + 1]), f"step {step}"
+
+    def test_threads_change_nothing(self, make):
+        answers = []
+        for threads in (1, 2):
+            envs = make(2, 3, threads=threads, opponents=["bt"], sensor_noise=True)
+            envs.seed(1)
+            digest = [envs.reset().tobytes()]
+            for action in random_actions(150, 6):
+                observations, rewards, dones, _ = envs.step(action)
+                digest += [observations.tobytes(), rewards.tobytes(), dones.tobytes()]
+            answers.append(digest)
+        assert answers[0] == answers[1]
+
+    def test_a_car_whose_episode_ends_rejoins_and_the_others_race_on(self, make):
+        envs = make(1, 3)
+        envs.seed(0)
+        envs.reset()
+        dones = np.zeros(3, bool)
+        while not dones.any():
+            before = envs.get_attr("car")
+            _, _, dones, infos = envs.step(np.array([TURN, GAS, GAS], np.float32))
+        assert dones.tolist() == [True, False, False]
+        first, *others = envs.get_attr("car")
+        assert infos[0]["end"] == "off_track"
+        assert infos[0]["terminal_observation"].shape == (29,)
+        assert (first.distance_raced, first.speed_x) == (0.0, REJOIN_SPEED)
+        assert [car.time for car in others] == [first.time] * 2
+        assert [car.time > was.time for car, was in zip(others, before[1:], strict=True)] == [
+            True, True,
+        ]  # fmt: skip
+
+    def test_a_race_is_over_when_all_have_ended_what_they_began_it_with(self, make):
+        """Who has rejoined is truncated then, and the next race begins on the grid for all."""
+        envs = make(1, 3)
+        envs.seed(0)
+        on_grid = envs.reset()
+        ends = []
+        for step in range(400):
+            late = TURN if step > 60 else GAS
+            observations, _, dones, infos = envs.step(np.array([TURN, late, late], np.float32))
+            ends += [(i, infos[i]["end"]) for i in np.flatnonzero(dones)]
+            if dones.all():
+                break
+        assert {i for i, end in ends if end == "off_track"} >= {1, 2}
+        assert ends[-3][1] == "race" or ends[-1][1] != "race"
+        truncated = [infos[i]["TimeLimit.truncated"] for i in range(3)]
+        assert truncated == [infos[i]["end"] == "race" for i in range(3)]
+        assert any(truncated)
+        assert np.array_equal(observations, on_grid)
+
+    def test_a_time_limit_ends_an_episode_like_any_other(self, make):
+        envs = make(1, 2, max_episode_steps=7)
+        envs.reset()
+        for step in range(1, 15):
+            _, _, dones, infos = envs.step(np.array([GAS] * 2, np.float32))
+            assert dones.tolist() == [step % 7 == 0] * 2
+        assert [info["TimeLimit.truncated"] for info in infos] == [True, True]
+        assert [info["episode"]["l"] for info in infos] == [7, 7]
+
+    def test_a_reset_of_all_begins_the_race_anew(self, make):
+        envs = make(2, 2)
+        envs.seed(0)
+        first = envs.reset()
+        for action in random_actions(20, 4):
+            envs.step(action)
+        assert np.array_equal(envs.reset(), first)
+
+    def test_tracks_fields_and_grid_slots_are_drawn_for_each_race(self, make):
+        envs = make(
+            1, 2, track=[TRACK, "aalborg"], opponents=[["bt"], ["inferno", "berniw"]],
+            grid_place=[1, 2], max_episode_steps=1,
+        )  # fmt: skip
+        envs.seed(0)
+        envs.reset()
+        drawn = set()
+        for _ in range(40):
+            first, second = (env.unwrapped.backend for env in envs.envs)
+            assert first.index == second.index
+            drawn.add((first.track.name, envs.get_attr("car")[0].race_position))
+            envs.step(np.array([GAS] * 2, np.float32))
+        assert drawn == {(track, place) for track in (TRACK, "aalborg") for place in (1, 2)}
+
+    def test_a_race_that_is_lost_ends_for_its_cars_only(self, make):
+        envs = make(2, 2)
+        envs.seed(0)
+        envs.reset()
+        fleet = envs._batch._fleet
+
+        class Losing:
+            close = fleet.close
+
+            def step(self, worlds, controls, ticks, cars):
+                fleet.step(worlds, controls, ticks, cars)
+                return [0, 1]
+
+            def failure(self, world):
+                return CarLost("the car is nowhere")
+
+        envs._batch._fleet = Losing()
+        _, _, dones, infos = envs.step(np.array([GAS] * 4, np.float32))
+        envs._batch._fleet = fleet
+        assert dones.tolist() == [True, True, False, False]
+        assert [info["end"] for info in infos] == ["lost", "lost", "", ""]
+        envs.step(np.array([GAS] * 4, np.float32))
+
+    @pytest.mark.parametrize("kind", [PPO, DDPG])
+    def test_stock_algorithms_learn_from_all_cars(self, make, kind):
+        envs = make(2, 2, start="random", max_episode_steps=50)
+        options = {"n_steps": 32, "batch_size": 32} if kind is PPO else {"learning_starts": 64}
+        model = kind("MlpPolicy", envs, seed=0, device="cpu", **options)
+        model.learn(256)
+        assert model.num_timesteps == 256
+        assert all(np.isfinite(p.detach().numpy()).all() for p in model.policy.parameters())
