@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, MutableMapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -21,7 +21,7 @@ from sb3_torcs.envs.racing import RacingEnv, RacingInfo
 from sb3_torcs.envs.torcs_race import RaceCarEnv, make_race
 from sb3_torcs.errors import EnvClosed, InvalidOption
 
-__all__ = ["RaceInfo", "TorcsVecEnv"]
+__all__ = ["RaceInfo", "TorcsVecEnv", "glance"]
 
 EnvMaker = Callable[[], gym.Env[Any, Any]]
 
@@ -48,6 +48,12 @@ class RaceInfo(MutableMapping[str, Any]):
         if self._values is None and name not in RacingInfo.__annotations__:
             return False if name == TRUNCATED else default
         return self._made().get(name, default)
+
+    def glance(self) -> tuple[float, float, dict[str, float]]:
+        """Look up what :func:`glance` returns, without computing the rest."""
+        if self._values is not None:
+            return _glance(self._values)
+        return self._timestep.glance(self._race)
 
     def copy(self) -> dict[str, Any]:
         """Make a dict of it."""
@@ -79,6 +85,20 @@ class RaceInfo(MutableMapping[str, Any]):
 
     def __reduce__(self) -> tuple[type, tuple[dict[str, Any]]]:
         return dict, (self._made(),)
+
+
+def glance(info: MutableMapping[str, Any]) -> tuple[float, float, dict[str, float]]:
+    """
+    Look up what a timestep came to, at the least cost.
+
+    :param info: of the timestep
+    :return: speed [m/s], time of the lap that it completed, or 0 [s], and terms of the reward
+    """
+    return info.glance() if isinstance(info, RaceInfo) else _glance(info)
+
+
+def _glance(info: Mapping[str, Any]) -> tuple[float, float, dict[str, float]]:
+    return info["car"].speed_x, info.get("lap_time", 0.0), info.get("reward_terms", {})
 
 
 class TorcsVecEnv(DummyVecEnv):

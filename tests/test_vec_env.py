@@ -26,7 +26,7 @@ from sb3_torcs.car import CAR_RECORD, car_from_record
 from sb3_torcs.envs import batch
 from sb3_torcs.envs.torcs_lite import TorcsLiteEnv
 from sb3_torcs.errors import CarLost, EngineForked, EnvClosed, InvalidAction, InvalidOption
-from sb3_torcs.vec_env import TorcsVecEnv
+from sb3_torcs.vec_env import TorcsVecEnv, glance
 
 GAS = np.array([0.0, 1.0, 0.0], np.float32)
 LITE, TORCS = "TorcsLite-v0", "Torcs-v0"
@@ -202,6 +202,22 @@ def test_infos_are_made_when_somebody_asks(make, monkeypatch):
     assert (asked, made) == (["none", False], [])
     assert infos[0]["distance"] == infos[0]["car"].distance_raced
     assert made == [1]
+
+
+def test_a_glance_reads_what_the_info_holds_and_makes_nothing(make, monkeypatch):
+    made = []
+    monkeypatch.setattr(
+        batch, "car_from_record", lambda row: made.append(1) or car_from_record(row)
+    )
+    envs = make(2, env_id=LITE)
+    envs.reset()
+    *_, infos = envs.step(np.stack([GAS, GAS]))
+    seen = [glance(info) for info in infos]
+    assert made == []
+    for info, found in zip(infos, seen, strict=True):
+        held = dict(info)
+        assert found == (held["car"].speed_x, held["lap_time"], held["reward_terms"])
+        assert glance(info) == glance(held) == found
 
 
 def test_an_info_is_used_like_a_dict(make):

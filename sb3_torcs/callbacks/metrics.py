@@ -24,11 +24,12 @@ from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.logger import Image, Logger, TensorBoardOutputFormat
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_torcs.actions import ACTIONS, PEDALS, layout_of_width
+from sb3_torcs.actions import ACTIONS, PEDALS, ActionLayout, layout_of_width
 from sb3_torcs.agents.rollout import drive
 from sb3_torcs.car import CarState
 from sb3_torcs.errors import InvalidOption, renamed
 from sb3_torcs.tracks.track import Track
+from sb3_torcs.vec_env import glance
 
 __all__ = [
     "ENDS",
@@ -216,6 +217,27 @@ class _Steps:
         """Begin with 0 for each actuator."""
         self.saturated = [0] * len(self.names)
 
+    def count_actions(
+        self,
+        actions: npt.NDArray[np.floating],
+        layout: ActionLayout,
+        limits: tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]],
+    ) -> None:
+        """
+        Count timesteps, those with the brake, and those at limits.
+
+        :param actions: one per race
+        :param layout: that reads them
+        :param limits: of an action's numbers; values beyond them count as at the limit
+        """
+        low, high = limits
+        free = ((low < actions) & (actions < high)).sum(axis=0).tolist()
+        self.count += len(actions)
+        self.braking += sum(layout.read(row)[2] > BRAKING for row in actions.tolist())
+        self.saturated = [
+            n + len(actions) - inside for n, inside in zip(self.saturated, free, strict=True)
+        ]
+
     def add(self, other: _Steps) -> None:
         """Add the sums of another and reset that."""
         self.count += other.count
@@ -317,7 +339,7 @@ class DrivingMetricsCallback(BaseCallback):
         low, high = (np.asarray(bound, np.float64) for bound in (space.low, space.high))
         margin = SATURATED * (high - low)
         self._terms: list[dict[str, float]] = [{} for _ in range(self.training_env.num_envs)]
-        self._limits = list(zip((low + margin).tolist(), (high - margin).tolist(), strict=True))
+        self._limits = low + margin, high - margin
         self._evaluations = [
             _Watched(callback, callback.n_calls)
             for callback in callbacks_in(self.locals.get("callback"))
@@ -327,20 +349,15 @@ class DrivingMetricsCallback(BaseCallback):
     def _on_step(self) -> bool:
         # PPO has two: the actions that it drew, and those clipped for the environment.
         actions = self.locals.get("clipped_actions", self.locals["actions"])
-        pending, read = self._pending, self._layout.read
-        for action, info, done, terms in zip(
-            actions.tolist(), self.locals["infos"], self.locals["dones"], self._terms, strict=True
-        ):
-            pending.count += 1
-            pending.speed += info["car"].speed_x
-            pending.braking += read(action)[2] > BRAKING
-            for index, (low, high) in enumerate(self._limits):
-                if not low < action[index] < high:
-                    pending.saturated[index] += 1
-            for term, value in info.get("reward_terms", {}).items():
+        infos, dones = self.locals["infos"], self.locals["dones"]
+        self._pending.count_actions(actions, self._layout, self._limits)
+        for info, done, terms in zip(infos, dones.tolist(), self._terms, strict=True):
+            speed, lap_time, values = glance(info)
+            self._pending.speed += speed
+            for term, value in values.items():
                 terms[term] = terms.get(term, 0.0) + value
-            if info.get("lap_time"):
-                self._record_lap(info["lap_time"])
+            if lap_time:
+                self._record_lap(lap_time)
             if done:
                 self._record_episode(info, terms)
         if self.n_calls % RECORD_EVERY == 0:

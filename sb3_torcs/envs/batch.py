@@ -58,15 +58,26 @@ class Timestep(NamedTuple):
 
         :param race: index of the race
         """
-        car = car_from_record(self.after[race])
-        lap_time = car.last_lap_time if car.laps > self.before[race, LAPS] else 0.0
+        _, lap_time, terms = self.glance(race)
+        return racing_info(car_from_record(self.after[race]), lap_time, terms)
+
+    def glance(self, race: int) -> tuple[float, float, dict[str, float]]:
+        """
+        Read a few values of a race whose episode goes on.
+
+        :param race: index of the race
+        :return: speed [m/s], time of the lap that the timestep completed, or 0 [s], and terms of
+            the reward
+        """
+        number = self.after.item  # no view of the row: this is asked of each race
+        has_lapped = number(race, LAPS) > self.before.item(race, LAPS)
         # A race with fewer terms than another has zeros after its own.
         terms = dict(zip(self.names[race], self.terms[race], strict=False))
         terms["crash"] = 0.0
-        return racing_info(car, lap_time, terms)
+        return number(race, SPEED_X), number(race, LAST_LAP_TIME) if has_lapped else 0.0, terms
 
 
-LAPS = CarState._fields.index("laps")
+LAPS, LAST_LAP_TIME, SPEED_X = map(CarState._fields.index, ("laps", "last_lap_time", "speed_x"))
 
 
 class _Driven:
