@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from stable_baselines3 import DDPG, PPO, TD3
+from stable_baselines3 import DDPG, PPO, SAC, TD3
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -459,7 +459,7 @@ def test_lean_updates_learn_as_the_algorithm_does(algorithm, kwargs):
 
 
 @pytest.mark.parametrize(("make", "found"), [
-    (lambda: PPO("MlpPolicy", ToyRace()), "a PPO with ActorCriticPolicy"),
+    (lambda: SAC("MlpPolicy", ToyRace(), buffer_size=10), "a SAC with SACPolicy"),
     (lambda: DDPG("MlpPolicy", ToyRace(), buffer_size=10), "a DDPG with TD3Policy"),
 ])  # fmt: skip
 def test_a_model_without_the_policy_has_no_lean_updates(make, found):

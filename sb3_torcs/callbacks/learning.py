@@ -7,7 +7,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from stable_baselines3 import TD3
+from stable_baselines3 import PPO, TD3
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -17,9 +17,11 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_torcs.callbacks.switches import require_method
 from sb3_torcs.car import is_count
 from sb3_torcs.errors import InvalidOption, renamed
+from sb3_torcs.policies import ppo, updates
+from sb3_torcs.policies.ppo import LeanPPO
 from sb3_torcs.policies.replay import sample_mirrored
 from sb3_torcs.policies.split_head import SplitHeadPolicy
-from sb3_torcs.policies.updates import LeanUpdates, is_for
+from sb3_torcs.policies.updates import LeanUpdates
 from sb3_torcs.sensors import look_both_ways
 
 __all__ = ["GradientStepsCallback", "LeanUpdatesCallback", "MirrorCallback"]
@@ -90,11 +92,11 @@ class GradientStepsCallback(_WhileLearning):
 
 class LeanUpdatesCallback(_WhileLearning):
     """
-    Update DDPG or TD3 with a ``SplitHeadPolicy`` without PyTorch's record of each operation.
+    Update DDPG or TD3 with a ``SplitHeadPolicy``, or PPO, without PyTorch's record of operations.
 
-    The updates are equal but for rounding, and take about half of the time. If the policy is on a
-    GPU, or has an optimizer, an activation or a features extractor other than the default, the
-    algorithm's own ``train`` updates it.
+    The updates are equal but for rounding, and take about half of the time. PPO decides in this
+    way, too. If the policy is on a GPU, or has a part that the passes do not know (an optimizer, an
+    activation, a features extractor), then the algorithm's own methods go on.
 
     :param verbose: as in ``BaseCallback``
     """
@@ -104,26 +106,37 @@ class LeanUpdatesCallback(_WhileLearning):
 
     def _on_training_start(self) -> None:
         model = self.model
-        if not isinstance(model, TD3) or not isinstance(model.policy, SplitHeadPolicy):
+        self._updates: LeanUpdates | LeanPPO | None = None
+        if isinstance(model, PPO):
+            self._updates = LeanPPO(model) if ppo.is_for(model) else None
+        elif isinstance(model, TD3) and isinstance(model.policy, SplitHeadPolicy):
+            self._updates = LeanUpdates(model) if updates.is_for(model) else None
+        else:
             raise InvalidOption(
-                f"{type(self).__name__} updates DDPG and TD3 with SplitHeadPolicy, but the model "
-                f"is a {type(model).__name__} with {type(model.policy).__name__}; take it out of "
-                "the callbacks"
+                f"{type(self).__name__} updates PPO, and DDPG and TD3 with SplitHeadPolicy, but "
+                f"the model is a {type(model).__name__} with {type(model.policy).__name__}; take "
+                "it out of the callbacks"
             )
-        self._algorithm = model
-        self._updates = LeanUpdates(model) if is_for(model) else None
+
+    def _on_rollout_start(self) -> None:
+        super()._on_rollout_start()
+        if isinstance(self._updates, LeanPPO):
+            self._updates.begin_rollout()
+            self.model.policy.forward = self._updates.forward
 
     def _on_rollout_end(self) -> None:
+        self._undo()
         if self._updates is not None:
-            self._algorithm.train = self._train  # type: ignore[method-assign]
+            self.model.train = self._train  # type: ignore[attr-defined]
 
-    def _train(self, gradient_steps: int, batch_size: int = 100) -> None:
+    def _train(self, *arguments: Any, **keywords: Any) -> None:
         assert self._updates is not None
         self._undo()  # so that a model that is saved after Ctrl-C is a stock one
-        self._updates.train(gradient_steps, batch_size)
+        self._updates.train(*arguments, **keywords)
 
     def _undo(self) -> None:
         vars(self.model).pop("train", None)
+        vars(self.model.policy).pop("forward", None)
 
 
 class MirrorCallback(_WhileLearning):

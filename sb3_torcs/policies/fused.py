@@ -83,7 +83,7 @@ class FusedActor:
         :param features: (batch, features_dim)
         :return: (batch, actuators) in [-1, 1], and what the gradient needs
         """
-        size = kernels.actor_work(self.sizes, len(features))
+        size = kernels.stack_work(self.sizes, len(features))
         work = _take(size, dtype=weights.dtype)
         actions = np.empty((len(features), self.sizes[-1]), weights.dtype)
         gain = self.gain.astype(weights.dtype, copy=False)

@@ -32,21 +32,23 @@ from sb3_torcs.policies.layers import (
 __all__ = [
     "actor_backward",
     "actor_forward",
-    "actor_work",
     "adam",
     "difference",
     "follow",
+    "stack_backward",
+    "stack_forward",
+    "stack_work",
     "values_backward",
     "values_backward_to_actions",
     "values_forward",
     "values_work",
 ]
 
-# ------------------------------------------------------------------------------- actor
+# ------------------------------------------------------------- stacks of layers, actors
 
 
 @compiled
-def actor_work(sizes: Any, batch: int) -> int:
+def stack_work(sizes: Any, batch: int) -> int:
     """
     Count the numbers that a pass writes.
 
@@ -55,6 +57,71 @@ def actor_work(sizes: Any, batch: int) -> int:
     :return: the length of ``work``
     """
     return batch * (3 * sum(sizes[1:-1]) + len(sizes) - 2)
+
+
+@compiled
+def stack_forward(
+    weights: Any, sizes: Any, norm: bool, features: Any, work: Any, results: Any
+) -> None:
+    """
+    Pass through hidden layers and a layer of few outputs.
+
+    :param weights: of all layers
+    :param sizes: of the input, of each hidden layer, of the output
+    :param norm: with layer norms
+    :param features: (batch, features_dim)
+    :param work: written, for ``stack_backward``
+    :param results: (batch, outputs), written
+    """
+    start, at, x = 0, 0, features
+    for number in range(1, len(sizes) - 1):
+        units = sizes[number]
+        weight, bias = matrix(weights, start, sizes[number - 1], units)
+        products, y, _, deviation, at = layer(work, at, len(features), units)
+        product(x, False, weight, False, products)
+        hidden(weights[bias:], norm, products, y, deviation)
+        start, x = bias + units * (3 if norm else 1), y
+    outputs(weights[start:], x, results)
+
+
+@compiled
+def stack_backward(
+    weights: Any, sizes: Any, norm: bool, features: Any, work: Any, slope: Any, gradient: Any,
+    d_features: Any,
+) -> None:  # fmt: skip
+    """
+    Find the gradient of the weights.
+
+    :param weights: as in ``stack_forward``
+    :param sizes: as in ``stack_forward``
+    :param norm: as in ``stack_forward``
+    :param features: as in ``stack_forward``
+    :param work: from ``stack_forward``
+    :param slope: gradient of the results
+    :param gradient: of the weights, written
+    :param d_features: gradient of the features, written; or of size 0
+    """
+    batch, last = len(features), len(sizes) - 2
+    start = weights.size - sizes[-1] * (sizes[last] + 1)
+    at = stack_work(sizes, batch) - batch * (3 * sizes[last] + 1)
+    products, y, d, deviation, _ = layer(work, at, batch, sizes[last])
+    outputs_backward(weights[start:], slope, y, d, gradient[start:])
+    for number in range(last, 0, -1):
+        inputs, units = sizes[number - 1], sizes[number]
+        start -= units * (inputs + (3 if norm else 1))
+        weight, bias = matrix(weights, start, inputs, units)
+        hidden_backward(weights[bias:], norm, d, products, y, deviation, gradient[bias:])
+        d_weight, _ = matrix(gradient, start, inputs, units)
+        if number > 1:
+            at -= batch * (3 * inputs + 1)
+            products, y, below, deviation, _ = layer(work, at, batch, inputs)
+            product(y, True, d, False, d_weight)
+            product(d, False, weight, True, below)
+            d = below
+        else:
+            product(features, True, d, False, d_weight)
+            if d_features.size:
+                product(d, False, weight, True, d_features)
 
 
 @compiled
@@ -72,15 +139,7 @@ def actor_forward(
     :param work: written, for ``actor_backward``
     :param actions: (batch, actuators) in [-1, 1], written
     """
-    start, at, x = 0, 0, features
-    for number in range(1, len(sizes) - 1):
-        units = sizes[number]
-        weight, bias = matrix(weights, start, sizes[number - 1], units)
-        products, y, _, deviation, at = layer(work, at, len(features), units)
-        product(x, False, weight, False, products)
-        hidden(weights[bias:], norm, products, y, deviation)
-        start, x = bias + units * (3 if norm else 1), y
-    outputs(weights[start:], x, actions)
+    stack_forward(weights, sizes, norm, features, work, actions)
     for j in range(len(actions)):
         for o in range(len(gain)):
             actions[j, o] = np.tanh(actions[j, o] * gain[o])
@@ -105,31 +164,11 @@ def actor_backward(
     :param gradient: of the weights, written
     :param d_features: gradient of the features, written; or of size 0
     """
-    batch, last = len(features), len(sizes) - 2
     one = weights.dtype.type(1)
-    for j in range(batch):
+    for j in range(len(features)):
         for o in range(len(gain)):
             slope[j, o] *= (one - actions[j, o] * actions[j, o]) * gain[o]
-    start = weights.size - sizes[-1] * (sizes[last] + 1)
-    at = actor_work(sizes, batch) - batch * (3 * sizes[last] + 1)
-    products, y, d, deviation, _ = layer(work, at, batch, sizes[last])
-    outputs_backward(weights[start:], slope, y, d, gradient[start:])
-    for number in range(last, 0, -1):
-        inputs, units = sizes[number - 1], sizes[number]
-        start -= units * (inputs + (3 if norm else 1))
-        weight, bias = matrix(weights, start, inputs, units)
-        hidden_backward(weights[bias:], norm, d, products, y, deviation, gradient[bias:])
-        d_weight, _ = matrix(gradient, start, inputs, units)
-        if number > 1:
-            at -= batch * (3 * inputs + 1)
-            products, y, below, deviation, _ = layer(work, at, batch, inputs)
-            product(y, True, d, False, d_weight)
-            product(d, False, weight, True, below)
-            d = below
-        else:
-            product(features, True, d, False, d_weight)
-            if d_features.size:
-                product(d, False, weight, True, d_features)
+    stack_backward(weights, sizes, norm, features, work, slope, gradient, d_features)
 
 
 # ----------------------------------------------------------------------------- critics

@@ -26,7 +26,9 @@ __all__ = [
 EPSILON = 1e-5
 """[-] PyTorch's own, added to the variance in a layer norm."""
 
-compiled = njit(cache=True, fastmath={"contract", "reassoc", "nsz"}, error_model="numpy")
+compiled = njit(
+    cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"}, error_model="numpy"
+)
 
 
 @compiled

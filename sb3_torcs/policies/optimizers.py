@@ -10,7 +10,7 @@ import torch as th
 
 from sb3_torcs.policies import kernels
 
-__all__ = ["LeanAdam", "with_lr_scale"]
+__all__ = ["LeanAdam", "is_usual", "with_lr_scale"]
 
 
 class _LrScale:
@@ -64,22 +64,13 @@ class LeanAdam(_LrScale, th.optim.Adam):
         :param closure: as in ``Adam``
         :return: as in ``Adam``
         """
-        if closure is not None or not self.is_usual():
+        if closure is not None or not is_usual(self):
             return super().step(closure)
         for group in self.param_groups:
             for param in group["params"]:
                 if param.grad is not None:
                     self.step_of(param, param.grad.contiguous().view(-1).numpy())
         return None
-
-    def is_usual(self) -> bool:
-        """Whether it is Adam without the options that the kernel does not know."""
-        unusual = ("amsgrad", "weight_decay", "maximize", "decoupled_weight_decay")
-        return all(
-            not any(map(group.get, unusual))
-            and all(param.is_cpu and param.is_contiguous() for param in group["params"])
-            for group in self.param_groups
-        )
 
     def step_of(self, param: th.Tensor, gradient: np.ndarray) -> None:
         """
@@ -105,6 +96,20 @@ class LeanAdam(_LrScale, th.optim.Adam):
             state["step"] = th.zeros((), dtype=th.float32)
             state["exp_avg"], state["exp_avg_sq"] = th.zeros_like(param), th.zeros_like(param)
         return [state[name].numpy().reshape(-1) for name in ("step", "exp_avg", "exp_avg_sq")]
+
+
+def is_usual(optimizer: th.optim.Optimizer) -> bool:
+    """
+    Say whether an optimizer is Adam without the options that our kernel does not know.
+
+    :param optimizer: of any kind
+    """
+    unusual = ("amsgrad", "weight_decay", "maximize", "decoupled_weight_decay")
+    return type(optimizer) in (th.optim.Adam, LeanAdam) and all(
+        not any(map(group.get, unusual))
+        and all(param.is_cpu and param.is_contiguous() for param in group["params"])
+        for group in optimizer.param_groups
+    )
 
 
 def with_lr_scale(optimizer_class: type[th.optim.Optimizer]) -> type[th.optim.Optimizer]:

@@ -12,7 +12,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_torcs.policies import kernels
 from sb3_torcs.policies.fused import FusedActor, FusedValues, array, give
-from sb3_torcs.policies.optimizers import LeanAdam
+from sb3_torcs.policies.optimizers import LeanAdam, is_usual
 from sb3_torcs.policies.split_head import SplitHeadPolicy
 
 __all__ = ["LeanUpdates", "is_for"]
@@ -145,5 +145,5 @@ def is_for(model: TD3) -> bool:
         type(model).train is TD3.train
         and policy.fuses
         and type(policy.actor.features_extractor) is FlattenExtractor
-        and all(isinstance(own, LeanAdam) and own.is_usual() for own in optimizers)
+        and all(isinstance(own, LeanAdam) and is_usual(own) for own in optimizers)
     )

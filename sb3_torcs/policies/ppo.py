@@ -1,0 +1,402 @@
+"""PPO's rollouts and updates without PyTorch's record of operations, equal but for rounding.
+
+The policy and the value function share no layer, so two threads find their gradients at once.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import PPO
+from stable_baselines3.common.distributions import DiagGaussianDistribution
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.torch_layers import FlattenExtractor
+from stable_baselines3.common.type_aliases import RolloutBufferSamples
+from stable_baselines3.common.utils import explained_variance
+from torch import nn
+
+from sb3_torcs.policies import kernels
+from sb3_torcs.policies.flat import Slot
+from sb3_torcs.policies.fused import array
+from sb3_torcs.policies.layers import compiled
+from sb3_torcs.policies.optimizers import is_usual
+
+__all__ = ["LeanPPO", "is_for"]
+
+NO_FEATURES = np.empty((0, 0), np.float32)
+"""In place of their gradient, which nobody needs."""
+
+LOG_ROOT_TAU = np.float32(math.log(math.sqrt(math.tau)))
+ENTROPY = 0.5 + 0.5 * math.log(math.tau)  # of a Gaussian whose standard deviation is 1
+SPARE = 1e-6  # PyTorch adds it to the norm by which it divides
+TINY = np.float32(1e-8)  # SB3 adds it to the standard deviation of advantages
+
+
+class Figures(NamedTuple):
+    """What a batch came to, for the log."""
+
+    policy_loss: float
+    clip_fraction: float
+    approx_kl: float
+    value_loss: float
+    entropy_loss: float
+
+
+class _Stack:
+    """
+    The layers of the policy or of the value function, as a part of a vector.
+
+    :param hidden: layers, with ReLU in between
+    :param last: layer
+    :param start: where the part begins
+    """
+
+    def __init__(self, hidden: nn.Module, last: nn.Linear, start: int) -> None:
+        layers = [each for each in hidden.children() if isinstance(each, nn.Linear)] + [last]
+        self.sizes = (layers[0].in_features, *(each.out_features for each in layers))
+        self.parameters = [own for each in layers for own in (each.weight, each.bias)]
+        self.slots = [
+            Slot(tuple(own.shape), own.dim() == 2 and own is not last.weight)
+            for own in self.parameters
+        ]
+        self.part = slice(start, start + sum(map(th.numel, self.parameters)))
+        self._rooms: dict[int, np.ndarray] = {}
+
+    def room(self, batch: int) -> np.ndarray:
+        """
+        Take the work space of a pass. It stays in the cache of the thread that uses it.
+
+        :param batch: number of rows
+        :return: always the same
+        """
+        if batch not in self._rooms:
+            size = kernels.stack_work(self.sizes, batch)
+            self._rooms[batch] = np.empty(size, np.float32)
+        return self._rooms[batch]
+
+
+class LeanPPO:
+    """
+    Decides and updates in the place of a model's policy and of its ``train``.
+
+    :param model: for which :func:`is_for` is true
+    """
+
+    def __init__(self, model: PPO) -> None:
+        self.model, self.policy = model, model.policy
+        policy, first = self.policy, self.policy.log_std.numel()
+        hidden = policy.mlp_extractor
+        self.actor = _Stack(hidden.policy_net, policy.action_net, first)  # type: ignore[arg-type]
+        self.critic = _Stack(hidden.value_net, policy.value_net, self.actor.part.stop)
+        self.parameters = [policy.log_std, *self.actor.parameters, *self.critic.parameters]
+        self.slots = [Slot((first,), False), *self.actor.slots, *self.critic.slots]
+        self.weights, self.gradient, self.mean, self.square = np.zeros(
+            (4, self.critic.part.stop), np.float32
+        )
+        self.log_std = self.weights[:first]
+        self.count = 0  # steps of Adam
+
+    # ------------------------------------------------------------------------ rollouts
+
+    def begin_rollout(self) -> None:
+        """Take over the parameters of the policy."""
+        self._read(self.weights, [own.detach() for own in self.parameters])
+
+    def forward(
+        self, obs: th.Tensor, deterministic: bool = False
+    ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+        """
+        Decide as the policy does, with the parameters that it had when the rollout began.
+
+        :param obs: (batch, features)
+        :param deterministic: as of the policy
+        :return: actions, values of the observations, and logarithms of the actions' probabilities
+        """
+        features, actor, critic = array(obs.float()), self.actor, self.critic
+        batch = len(features)
+        noise = np.zeros((batch, len(self.log_std)), np.float32)
+        if not deterministic:
+            th.from_numpy(noise).normal_()
+        actions, values, chances = np.empty_like(noise), *np.empty((2, batch), np.float32)
+        decide(
+            (self.weights[actor.part], self.log_std, self.weights[critic.part]), actor.sizes,
+            critic.sizes, (features, noise), (actor.room(batch), critic.room(batch)),
+            actions, values.reshape(-1, 1), chances,
+        )  # fmt: skip
+        return th.from_numpy(actions), th.from_numpy(values)[:, None], th.from_numpy(chances)
+
+    # ------------------------------------------------------------------------- updates
+
+    def train(self) -> None:
+        """Update the networks as ``PPO.train`` does, in its order."""
+        model, threads = self.model, th.get_num_threads()
+        self.policy.set_training_mode(True)
+        model._update_learning_rate(self.policy.optimizer)
+        th.set_num_threads(1)  # for each of the two networks
+        self._read_state()
+        try:
+            with ThreadPoolExecutor(1, initializer=th.set_num_threads, initargs=(1,)) as other:
+                figures = self._epochs(other if len(os.sched_getaffinity(0)) > 1 else None)
+        finally:
+            self._write_state()
+            th.set_num_threads(threads)
+        self._record(figures)
+
+    def _epochs(self, other: Executor | None) -> list[list[Figures]]:
+        """Pass over the rollout so often, and return the figures of the batches."""
+        model = self.model
+        figures: list[list[Figures]] = []
+        for _ in range(model.n_epochs):
+            figures.append([])
+            for batch in model.rollout_buffer.get(model.batch_size):
+                figures[-1].append(self._find_gradient(batch, other))
+                self._step()
+            model._n_updates += 1
+        return figures
+
+    def _find_gradient(self, batch: RolloutBufferSamples, other: Executor | None) -> Figures:
+        """Find the gradient of the loss, that of the value function in another thread, if any."""
+        observations = array(batch.observations.float())
+        actions, _, chances, advantages, returns = map(array, batch[1:6])
+        if self.model.normalize_advantage and len(advantages) > 1:
+            deviation = advantages.std(ddof=1)
+            advantages = (advantages - advantages.mean()) / (deviation + TINY)
+        actor, model, gradient = self.actor, self.model, self.gradient
+        entropy = float(self.log_std.sum()) + ENTROPY * len(self.log_std)
+        clip = model.clip_range(model._current_progress_remaining)  # type: ignore[operator]
+        find_value = partial(self._find_value_gradient, observations, returns)
+        running = other.submit(find_value) if other else None
+        policy_loss, clipped, kl = find_policy_gradient(
+            self.weights[actor.part], self.log_std, actor.sizes, np.float32(clip),
+            (observations, actions), (chances, advantages), actor.room(len(actions)),
+            gradient[actor.part], gradient[: len(self.log_std)],
+        )  # fmt: skip
+        gradient[: len(self.log_std)] -= np.float32(model.ent_coef)
+        value_loss = running.result() if running else find_value()
+        return Figures(policy_loss, clipped, kl, value_loss, -entropy)
+
+    def _find_value_gradient(self, observations: np.ndarray, returns: np.ndarray) -> float:
+        critic = self.critic
+        loss: float = find_value_gradient(
+            self.weights[critic.part], critic.sizes, np.float32(self.model.vf_coef),
+            observations, returns, critic.room(len(returns)), self.gradient[critic.part],
+        )  # fmt: skip
+        return loss
+
+    def _step(self) -> None:
+        """Make a step of Adam with the gradient, whose norm is limited."""
+        norm = math.sqrt(float(self.gradient @ self.gradient))
+        self.gradient *= np.float32(min(1.0, self.model.max_grad_norm / (norm + SPARE)))
+        (group,) = self.policy.optimizer.param_groups
+        self.count += 1
+        real, (beta1, beta2) = np.float32, group["betas"]
+        kernels.adam(
+            self.weights, self.gradient, self.mean, self.square, (real(beta1), real(beta2)),
+            real(group["lr"] / (1 - beta1**self.count)),
+            real((1 - beta2**self.count) ** -0.5), real(group["eps"]),
+        )  # fmt: skip
+
+    def _record(self, figures: list[list[Figures]]) -> None:
+        """Log what ``PPO.train`` logs."""
+        model, record = self.model, self.model.logger.record
+        means = Figures(*np.mean([batch for epoch in figures for batch in epoch], axis=0).tolist())
+        last, buffer = figures[-1][-1], model.rollout_buffer
+        loss = last.policy_loss + model.ent_coef * last.entropy_loss
+        record("train/entropy_loss", means.entropy_loss)
+        record("train/policy_gradient_loss", means.policy_loss)
+        record("train/value_loss", means.value_loss)
+        record("train/approx_kl", np.mean([batch.approx_kl for batch in figures[-1]]))
+        record("train/clip_fraction", means.clip_fraction)
+        record("train/loss", loss + model.vf_coef * last.value_loss)
+        explained = explained_variance(buffer.values.flatten(), buffer.returns.flatten())
+        record("train/explained_variance", explained)
+        record("train/std", float(np.exp(self.log_std).mean()))
+        record("train/n_updates", model._n_updates, exclude="tensorboard")
+        record("train/clip_range", model.clip_range(model._current_progress_remaining))  # type: ignore[operator]
+
+    # --------------------------------------------------------------------------- state
+
+    def _views(self, vector: np.ndarray) -> list[th.Tensor]:
+        """Look at the part of each parameter, in the form that the model gives it."""
+        parts = th.from_numpy(vector).split([own.numel() for own in self.parameters])
+        return [slot.of(part) for slot, part in zip(self.slots, parts, strict=True)]
+
+    def _read(self, vector: np.ndarray, tensors: Sequence[th.Tensor]) -> None:
+        for view, own in zip(self._views(vector), tensors, strict=True):
+            view.copy_(own)
+
+    def _states(self) -> list[dict[str, Any]]:
+        """Look at what Adam keeps of each parameter; begin it if needed."""
+        states = [self.policy.optimizer.state[own] for own in self.parameters]
+        for own, state in zip(self.parameters, states, strict=True):
+            if not state:
+                state["step"] = th.zeros((), dtype=th.float32)
+                state["exp_avg"], state["exp_avg_sq"] = th.zeros_like(own), th.zeros_like(own)
+        return states
+
+    def _read_state(self) -> None:
+        """Take over the parameters and what Adam keeps of them."""
+        states = self._states()
+        self.begin_rollout()
+        self._read(self.mean, [state["exp_avg"] for state in states])
+        self._read(self.square, [state["exp_avg_sq"] for state in states])
+        self.count = int(states[0]["step"].item())
+
+    @th.no_grad()
+    def _write_state(self) -> None:
+        """Give them back to the model."""
+        views = map(self._views, (self.weights, self.mean, self.square))
+        for own, state, *found in zip(self.parameters, self._states(), *views, strict=True):
+            for tensor, view in zip(
+                (own, state["exp_avg"], state["exp_avg_sq"]), found, strict=True
+            ):
+                tensor.copy_(view)
+            state["step"].fill_(self.count)
+
+
+@compiled
+def decide(
+    parameters: Any, actor_sizes: Any, critic_sizes: Any, given: Any, rooms: Any, actions: Any,
+    values: Any, chances: Any,
+) -> None:  # fmt: skip
+    """
+    Draw actions and value observations.
+
+    :param parameters: weights of the means, logarithms of the standard deviations, and weights of
+        the value function
+    :param actor_sizes: of the policy's layers
+    :param critic_sizes: of the value function's layers
+    :param given: observations, (batch, features_dim), and noise, (batch, actuators)
+    :param rooms: as ``work`` of ``stack_forward``, of each network
+    :param actions: (batch, actuators), written
+    :param values: (batch, 1), written
+    :param chances: (batch,) logarithms of the actions' probabilities, written
+    """
+    actor, log_std, critic = parameters
+    observations, noise = given
+    kernels.stack_forward(actor, actor_sizes, False, observations, rooms[0], actions)
+    kernels.stack_forward(critic, critic_sizes, False, observations, rooms[1], values)
+    deviations, two = np.exp(log_std), actions.dtype.type(2)
+    chances[:] = 0
+    for j in range(len(actions)):
+        for o in range(log_std.size):
+            z = noise[j, o]
+            actions[j, o] += z * deviations[o]
+            chances[j] -= z * z / two + log_std[o] + LOG_ROOT_TAU
+
+
+@compiled
+def find_policy_gradient(
+    weights: Any, log_std: Any, sizes: Any, clip: Any, seen: Any, kept: Any, work: Any,
+    gradient: Any, d_log_std: Any,
+) -> Any:  # fmt: skip
+    """
+    Find the gradient of PPO's clipped objective (Schulman et al., 2017, equation 7).
+
+    :param weights: of the policy's means
+    :param log_std: (actuators,) logarithms of the standard deviations
+    :param sizes: of the policy's layers
+    :param clip: range of the ratio of probabilities about 1
+    :param seen: observations and actions, (batch, ...)
+    :param kept: (batch,) logarithms of the actions' probabilities in the rollout; advantages
+    :param work: as of ``stack_forward``
+    :param gradient: of the weights, written
+    :param d_log_std: gradient of ``log_std``, written
+    :return: the loss, the share of clipped ratios, and the approximate divergence
+    """
+    observations, actions = seen
+    chances, advantages = kept
+    batch, real = len(actions), weights.dtype.type
+    one = real(1)
+    slope = np.empty(actions.shape, weights.dtype)
+    kernels.stack_forward(weights, sizes, False, observations, work, slope)
+    inverse = np.exp(-log_std)
+    d_log_std[:] = 0
+    loss, clipped, divergence = 0.0, 0, 0.0
+    for j in range(batch):
+        now = real(0)
+        for o in range(log_std.size):
+            z = (actions[j, o] - slope[j, o]) * inverse[o]
+            slope[j, o] = z
+            now -= z * z / real(2) + log_std[o] + LOG_ROOT_TAU
+        change = now - chances[j]
+        ratio = np.exp(change)
+        within = min(max(ratio, one - clip), one + clip)
+        gain, limited = advantages[j] * ratio, advantages[j] * within
+        loss -= min(gain, limited)
+        clipped += abs(ratio - one) > clip
+        divergence += ratio - one - change
+        share = -gain / real(batch) if gain <= limited else real(0)
+        for o in range(log_std.size):
+            z = slope[j, o]
+            slope[j, o] = share * z * inverse[o]
+            d_log_std[o] += share * (z * z - one)
+    kernels.stack_backward(weights, sizes, False, observations, work, slope, gradient, NO_FEATURES)
+    return loss / batch, clipped / batch, divergence / batch
+
+
+@compiled
+def find_value_gradient(
+    weights: Any, sizes: Any, coefficient: Any, observations: Any, returns: Any, work: Any,
+    gradient: Any,
+) -> float:  # fmt: skip
+    """
+    Find the gradient of the mean squared error of the values.
+
+    :param weights: of the value function
+    :param sizes: of its layers
+    :param coefficient: by which the error is multiplied in the loss
+    :param observations: (batch, features_dim)
+    :param returns: (batch,)
+    :param work: as of ``stack_forward``
+    :param gradient: of the weights, written
+    :return: the error
+    """
+    batch, real = len(returns), weights.dtype.type
+    slope = np.empty((batch, 1), weights.dtype)
+    kernels.stack_forward(weights, sizes, False, observations, work, slope)
+    loss = 0.0
+    for j in range(batch):
+        error = slope[j, 0] - returns[j]
+        loss += error * error
+        slope[j, 0] = coefficient * real(2) / real(batch) * error
+    kernels.stack_backward(weights, sizes, False, observations, work, slope, gradient, NO_FEATURES)
+    return loss / batch
+
+
+def is_for(model: PPO) -> bool:
+    """
+    Say whether lean rollouts and updates are equal to those of a model, but for rounding.
+
+    :param model: PPO
+    :return: false on a GPU, or if a part is not one that the passes know
+    """
+    policy = model.policy
+    return (
+        type(model).train is PPO.train
+        and type(policy) is ActorCriticPolicy
+        and isinstance(model.observation_space, spaces.Box)
+        and len(model.observation_space.shape) == 1
+        and type(policy.action_dist) is DiagGaussianDistribution
+        and type(policy.features_extractor) is FlattenExtractor
+        and _is_known(policy.mlp_extractor.policy_net)
+        and _is_known(policy.mlp_extractor.value_net)
+        and model.clip_range_vf is None
+        and model.target_kl is None
+        and is_usual(policy.optimizer)
+        and all(own.dtype == th.float32 for own in policy.parameters())
+    )
+
+
+def _is_known(hidden: nn.Module) -> bool:
+    """Whether hidden layers are linear ones, each followed by ReLU."""
+    kinds = [type(each) for each in hidden.children()]
+    return bool(kinds) and kinds == [nn.Linear, nn.ReLU] * (len(kinds) // 2)

@@ -1,0 +1,123 @@
+"""PPO with lean updates learns what stock PPO learns, but for rounding, and saves stock models."""
+
+import os
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3 import PPO
+from torch import nn
+from toy import ToyRace
+
+from sb3_torcs.callbacks import LeanUpdatesCallback
+from sb3_torcs.policies.ppo import LeanPPO, is_for
+
+RELU = {"activation_fn": nn.ReLU}
+SMALL = {"net_arch": {"pi": [8], "vf": [12, 6]}, **RELU}
+
+
+def make(policy_kwargs=SMALL, **kwargs):
+    """Rollouts of 40 timesteps in three unequal batches."""
+    arguments = {"n_steps": 40, "batch_size": 16, "n_epochs": 3, "learning_rate": 0.01, **kwargs}
+    with pytest.warns(UserWarning, match="truncated mini-batch"):
+        return PPO("MlpPolicy", ToyRace(), policy_kwargs=policy_kwargs, seed=0, **arguments)
+
+
+def learned(model, callback=None):
+    """What three rollouts with their updates come to, and the state of SB3's random numbers."""
+    model.set_random_seed(1)
+    model.learn(120, callback=callback)
+    buffer = model.rollout_buffer
+    return [
+        model.policy.state_dict(),
+        model.policy.optimizer.state_dict(),
+        [buffer.actions, buffer.values, buffer.log_probs, buffer.advantages],
+        th.get_rng_state(),
+        np.random.get_state()[1],  # noqa: NPY002
+    ]
+
+
+@pytest.mark.parametrize("kwargs", [
+    {}, {"ent_coef": 0.1, "vf_coef": 0.2}, {"normalize_advantage": False},
+    {"clip_range": 0.01, "max_grad_norm": 10.0},
+    {"policy_kwargs": {"net_arch": [8, 8], "log_std_init": -1.0, **RELU}},
+    {"policy_kwargs": {**SMALL, "share_features_extractor": False}},
+])  # fmt: skip
+def test_lean_updates_learn_as_ppo_does(kwargs):
+    """The same random numbers, log and state of Adam; tolerance: float32 in another order."""
+    stock, lean = make(**kwargs), make(**kwargs)
+    th.testing.assert_close(
+        learned(stock), learned(lean, LeanUpdatesCallback()), rtol=1e-4, atol=1e-4
+    )
+    logs = [dict(model.logger.name_to_value) for model in (stock, lean)]
+    assert logs[0] == pytest.approx(logs[1], rel=1e-3, abs=1e-5)
+    assert stock._n_updates == lean._n_updates == 9
+
+
+def test_one_core_learns_what_two_learn(monkeypatch):
+    """To the bit; and so does the same seed once more."""
+    found = []
+    for cores in ({0}, {0, 1}, {0, 1}):
+        monkeypatch.setattr(os, "sched_getaffinity", lambda process, cores=cores: cores)
+        found.append(learned(make(), LeanUpdatesCallback()))
+    th.testing.assert_close(found[0], found[1], rtol=0, atol=0)
+    th.testing.assert_close(found[1], found[2], rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("kwargs", [
+    {"policy_kwargs": {"net_arch": [8]}}, {"policy_kwargs": {**RELU, "net_arch": []}},
+    {"policy_kwargs": {**SMALL, "optimizer_class": th.optim.SGD}},
+    {"policy_kwargs": {**SMALL, "optimizer_kwargs": {"weight_decay": 0.1}}},
+    {"use_sde": True}, {"target_kl": 0.01}, {"clip_range_vf": 0.1},
+])  # fmt: skip
+def test_parts_that_lean_updates_do_not_know_learn_as_ever(kwargs):
+    """PPO's own methods go on: to the bit what it is without the callback."""
+    stock, lean = make(**kwargs), make(**kwargs)
+    assert not is_for(lean)
+    th.testing.assert_close(learned(stock), learned(lean, LeanUpdatesCallback()), rtol=0, atol=0)
+
+
+def test_the_model_is_a_stock_one_whenever_it_may_be_saved(monkeypatch):
+    """While it updates (Ctrl-C comes then, as a rule), and afterwards."""
+    model, found = make(), []
+    get = model.rollout_buffer.get
+
+    def noted(batch_size):
+        found.append({"train", "forward"} & {*vars(model), *vars(model.policy)})
+        return get(batch_size)
+
+    monkeypatch.setattr(model.rollout_buffer, "get", noted)
+    model.learn(120, callback=LeanUpdatesCallback())
+    assert found == [set()] * 9
+    assert not {"train", "forward"} & {*vars(model), *vars(model.policy)}
+
+
+def test_what_was_learned_before_ctrl_c_is_kept(monkeypatch):
+    model, reference = make(), make(n_epochs=1)
+    get, passes = model.rollout_buffer.get, []
+
+    def interrupted(batch_size):
+        if passes:
+            raise KeyboardInterrupt
+        passes.append(batch_size)
+        return get(batch_size)
+
+    monkeypatch.setattr(model.rollout_buffer, "get", interrupted)
+    model.set_random_seed(1)
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(40, callback=LeanUpdatesCallback())
+    reference.set_random_seed(1)
+    reference.learn(40, callback=LeanUpdatesCallback())
+    states = [each.policy.state_dict() for each in (model, reference)]
+    th.testing.assert_close(*states, rtol=0, atol=0)
+
+
+def test_a_deterministic_decision_is_the_mean():
+    model = make()
+    observations = th.rand(5, 29)
+    lean = LeanPPO(model)
+    lean.begin_rollout()
+    with th.no_grad():
+        expected = model.policy.forward(observations, deterministic=True)
+    found = lean.forward(observations, deterministic=True)
+    th.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
