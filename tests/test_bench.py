@@ -1,11 +1,14 @@
 import os
 
 import pytest
+import torch as th
 
 from sb3_torcs.bench import environments as bench
+from sb3_torcs.bench import on_policy as bench_on_policy
 from sb3_torcs.bench import scr as bench_scr
 from sb3_torcs.bench import torcs as bench_torcs
 from sb3_torcs.bench.learning import training_share
+from sb3_torcs.bench.on_policy import ppo
 from sb3_torcs.bench.stages import KEYS, stages
 from sb3_torcs.bench.updates import default_updates, products_of_an_update
 from sb3_torcs.bench.vec_env import race, vec_env
@@ -18,7 +21,7 @@ def test_every_figure_is_measured_once_or_empty(monkeypatch):
     measurements = stages(0.01)
     figures = measurements["resets"]()
     assert list(figures) == ["lite_reset_ms"]
-    assert len(set(KEYS)) == len(KEYS) == 24
+    assert len(set(KEYS)) == len(KEYS) == 26
 
 
 def test_the_environments_are_measured_in_the_same_run(monkeypatch):
@@ -98,8 +101,21 @@ def test_a_race_is_measured_by_its_name():
     assert rate > 0.0
 
 
+@pytest.mark.slow
+@pytest.mark.usefixtures("game")
+def test_learning_is_measured_on_two_cores_and_leaves_them_as_they_were(monkeypatch):
+    cores, threads = os.sched_getaffinity(0), th.get_num_threads()
+    monkeypatch.setattr(bench_on_policy, "ROLLOUTS", 2)
+    figures = ppo(0.0001)
+    assert list(figures) == ["ppo_timesteps_per_s", "ppo_dummy_timesteps_per_s"]
+    assert min(figures.values()) > 0.0
+    assert set(figures) < set(KEYS)
+    assert (os.sched_getaffinity(0), th.get_num_threads()) == (cores, threads)
+
+
 def test_one_core_has_no_second_thread_to_measure(monkeypatch):
     monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0})
+    assert set(ppo(1.0).values()) == {None}
     assert bench_torcs.vector(1.0) == {"torcs_vector2_ratio": None}
     assert vec_env(0.0001)["vec_env_two_threads_ratio"] is None
 

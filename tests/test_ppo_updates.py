@@ -112,7 +112,7 @@ def test_what_was_learned_before_ctrl_c_is_kept(monkeypatch):
     th.testing.assert_close(*states, rtol=0, atol=0)
 
 
-def test_a_deterministic_decision_is_the_mean():
+def test_a_deterministic_action_is_the_mean():
     model = make()
     observations = th.rand(5, 29)
     lean = LeanPPO(model)

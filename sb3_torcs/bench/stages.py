@@ -7,6 +7,7 @@ from collections.abc import Callable
 from sb3_torcs.bench import scr, torcs
 from sb3_torcs.bench.environments import environments, resets
 from sb3_torcs.bench.learning import training_rate, training_share
+from sb3_torcs.bench.on_policy import ppo
 from sb3_torcs.bench.policy import measure
 from sb3_torcs.bench.torcs import Figures
 from sb3_torcs.bench.updates import default_updates
@@ -40,6 +41,8 @@ KEYS = (
     "ddpg_updates_per_s",
     "ddpg_update_gflop",
     "ddpg_timesteps_per_s",
+    "ppo_timesteps_per_s",
+    "ppo_dummy_timesteps_per_s",
     "training_env_share",
 )
 """All figures, in the order they are shown; those of worlds that are not here stay empty."""
@@ -71,6 +74,7 @@ def stages(seconds: float) -> dict[str, Callable[[], Figures]]:
         "policy": lambda: _policy(share),
         "updates": lambda: default_updates(share),
         "learning": _where_it_is(lambda: training_rate(max(int(400.0 * share), 100))),
+        "PPO": _where_it_is(lambda: ppo(share)),
         "training": lambda: training_share(max(int(40.0 * share), 100)),
     }
 
