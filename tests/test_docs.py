@@ -391,7 +391,7 @@ def check_zoo(args):
 
 WRITTEN = {  # by runs and by people: files that docs name and that are not the project's
     "__pycache__", "0.monitor.csv", "args.yml", "config.yml", "monitor.csv", "my.yml", "recipe.yml",
-    "laps.csv", "report.md", "results.csv",
+    "laps.csv", "report.html", "report.md", "results.csv",
 }  # fmt: skip
 TOOLS_FLAGS = {"--logdir"}  # of TensorBoard
 NOT_IN_THE_PACKAGE = {  # Python's, Gymnasium's, SB3's, PyTorch's, the game's

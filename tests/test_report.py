@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+from browser import opened, requested, told
 from rliable.metrics import aggregate_iqm
 
 from sb3_torcs.cli import main
@@ -78,11 +79,11 @@ def test_every_seed_is_in_the_report_failures_too(study, tmp_path):
 
 def test_the_same_results_give_the_same_report_to_the_byte(study, tmp_path, capsys):
     assert main(["report", str(study), "--output", str(tmp_path / "one")]) == 0
-    assert capsys.readouterr().out == f"{tmp_path}/one/report.md\n"
+    assert capsys.readouterr().out == f"{tmp_path}/one/report.md\n{tmp_path}/one/report.html\n"
     np.random.default_rng().random()
     write_report(study, tmp_path / "two")
     names = sorted(path.name for path in (tmp_path / "one").iterdir())
-    assert names == ["learning-base.png", "report.md"]
+    assert names == ["learning-base.png", "report.html", "report.md"]
     for name in names:
         assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
 
@@ -164,6 +165,37 @@ def test_a_report_that_cannot_be_written_is_told(study, tmp_path, capsys, taken)
         (tmp_path / taken).mkdir(parents=True)
     assert main(["report", str(study), "--output", str(tmp_path / "out")]) == 2
     assert f"cannot write '{tmp_path}/out/" in capsys.readouterr().err
+
+
+def test_the_page_shows_every_seed_and_sorts_its_tables(study, tmp_path):
+    """In a browser: a curve per seed and two of the mean, no error, and no network."""
+    write_report(study, tmp_path / "out")
+    page = tmp_path / "out" / "report.html"
+    with opened(page) as browser:
+        assert told(browser) == []
+        assert requested(browser) == [page.as_uri()]
+        curves = browser.execute_script("return data.panels[0].curves.map((c) => c.text)")
+        assert curves[:3] == ["base, seed 0", "base, seed 1", "base, seed 2"]
+        column = (
+            "const [table] = [...document.querySelectorAll('table.sortable')].filter("
+            "  (t) => t.tHead.textContent.includes('model kept at'));"
+            "const header = table.tHead.rows[0].cells[3];"
+            "header.querySelector('button').click();"
+            "const rows = [...table.tBodies[0].rows];"
+            "return [header.ariaSort, rows.map((row) => row.cells[3].textContent)]"
+        )
+        assert browser.execute_script(column) == ["ascending", ["900", "7000", "7000"]]
+        assert browser.execute_script(column) == ["descending", ["7000", "7000", "900"]]
+
+
+def test_the_page_links_what_lies_beside_a_seed(study, tmp_path):
+    (study / "base-seed1").mkdir()
+    (study / "base-seed1" / "lap.html").touch()
+    write_report(study, tmp_path / "out")
+    text = (tmp_path / "out" / "report.html").read_text()
+    assert text.count("<a href=") == 1
+    assert '<a href="../study/base-seed1/lap.html">lap report</a>' in text
+    assert f"sb3-torcs evaluate {study}/base-seed0 --report" in text
 
 
 def test_the_interquartile_mean_is_rliables():

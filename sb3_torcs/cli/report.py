@@ -17,7 +17,8 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "report",
         help="write learning curves and tables of a study, with every seed",
-        description="Write report.md and its pictures. The study may still run.",
+        description="Write report.html, a page that works offline, and report.md with pictures. "
+        "The study may still run.",
     )
     parser.add_argument(
         "folder", metavar="FOLDER", help="the study's folder, e.g. logs/studies/smoke"
@@ -34,5 +35,8 @@ def run(args: argparse.Namespace) -> int:
     from sb3_torcs.studies.report import write_report
 
     folder = Path(os.path.expanduser(args.folder))
-    print(write_report(folder, Path(os.path.expanduser(args.output)) if args.output else folder))
+    output = Path(os.path.expanduser(args.output)) if args.output else folder
+    report = write_report(folder, output)
+    print(report)
+    print(report.with_suffix(".html"))
     return 0

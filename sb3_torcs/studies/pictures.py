@@ -11,14 +11,14 @@ import numpy as np
 from sb3_torcs.studies.estimates import Array, Estimate, estimate, share
 from sb3_torcs.studies.results import Results
 
-__all__ = ["NO_LAP", "draw_together", "draw_variant"]
+__all__ = ["NO_LAP", "PANELS", "curves_of", "draw_together", "draw_variant"]
 
 MANY = 10  # variants that can have colours of their own
 NO_LAP = np.inf  # [s] stands for no lap: worse than any lap time
 PANELS = (("distance", "distance of three laps [m]"), ("lap", "best flying lap so far [s]"))
 
 
-def _curves(trial: Results) -> dict[str, Array]:
+def curves_of(trial: Results) -> dict[str, Array]:
     """
     Arrange the evaluations of a trial, means over its tracks.
 
@@ -41,7 +41,7 @@ def _curves(trial: Results) -> dict[str, Array]:
 def draw_variant(variant: str, group: Sequence[Results]) -> bytes:
     """Draw distance, lap time and success of one variant over timesteps, as PNG."""
     figure, panels = _figure(group)
-    every = [_curves(trial) for trial in group]
+    every = [curves_of(trial) for trial in group]
     for panel, (name, _) in zip(panels, PANELS, strict=False):
         for curves in every:
             own = curves["timesteps"] / 1000.0, _drawable(curves[name])
@@ -65,7 +65,7 @@ def draw_together(variants: Mapping[str, Sequence[Results]]) -> bytes:
     colours = colormaps["tab10" if len(variants) <= MANY else "turbo"]
     for number, (variant, group) in enumerate(variants.items()):
         colour = colours(number if len(variants) <= MANY else number / len(variants))
-        _bands(panels, [_curves(trial) for trial in group], colour)
+        _bands(panels, [curves_of(trial) for trial in group], colour)
         panels[0].plot([], [], color=colour, label=f"{variant}: {len(group)} seeds")
     figure.legend(loc="outside lower center", ncols=3, fontsize=8)
     return _as_png(figure)

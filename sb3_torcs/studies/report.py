@@ -15,6 +15,7 @@ from sb3_torcs.errors import StudyError
 from sb3_torcs.evaluation.ladder import RUNGS
 from sb3_torcs.studies.config import slug
 from sb3_torcs.studies.estimates import Estimate, estimate
+from sb3_torcs.studies.page import Section, study_page
 from sb3_torcs.studies.pictures import NO_LAP, draw_together, draw_variant
 from sb3_torcs.studies.results import Results
 from sb3_torcs.studies.storage import RECIPE, RESULTS, ROWS, write_whole
@@ -22,6 +23,11 @@ from sb3_torcs.studies.storage import RECIPE, RESULTS, ROWS, write_whole
 __all__ = ["read_results", "write_report"]
 
 FEWEST = 3  # fewest seeds for an interval
+NOTE = (
+    "How these figures are meant is said in the evaluation protocol: a model is chosen by the "
+    "evaluations of its training, and measured afresh; *completes* is three laps in a row from "
+    "the grid without leaving the road. Intervals are 95 % stratified bootstrap intervals."
+)
 TOGETHER = "learning.png"  # the picture of all variants
 
 
@@ -80,29 +86,23 @@ def _read(row: dict[str, str]) -> dict[str, Any]:
 
 def write_report(folder: Path, output: Path) -> Path:
     """
-    Write ``report.md`` and its pictures.
+    Write ``report.html``, and ``report.md`` with its pictures, which say the same.
 
     :param folder: of the study
     :param output: folder for the report; it is made
-    :return: the report
+    :return: ``report.md``; the page lies beside it
     :raises StudyError: if there is nothing to report
     :raises OutputNotWritable: if the report cannot be written
     """
     trials = read_results(folder)
     study = trials[0].train[0]["study"]
-    lines = [
-        f"# {study}",
-        "",
-        "How these figures are meant is said in the evaluation protocol: a model is chosen by the "
-        "evaluations of its training, and measured afresh; *completes* is three laps in a row from "
-        "the grid without leaving the road. Intervals are 95 % stratified bootstrap intervals.",
-        "",
-        *_waiting(folder),
-        *_summary(trials),
-        *_seeds(trials),
-        *_ladder(trials),
-        *_shares(trials),
-    ]
+    notes = [NOTE, *_waiting(folder)]
+    sections = [_summary(trials), _seeds(trials), _ladder(trials), _shares(trials)]
+    lines = [f"# {study}", ""]
+    for note in notes:
+        lines += [note, ""]
+    for section in sections:
+        lines += _markdown(section)
     variants = _variants(trials)
     if len(variants) > 1:
         write_whole(output / TOGETHER, draw_together(variants))
@@ -119,6 +119,9 @@ def write_report(folder: Path, output: Path) -> Path:
     ]
     report = output / "report.md"
     write_whole(report, "\n".join(lines).encode())
+    plain = [note.replace("*", "") for note in notes]
+    page = study_page(study, plain, sections, variants, folder=folder, output=output)
+    write_whole(report.with_suffix(".html"), page.encode())
     return report
 
 
@@ -126,7 +129,7 @@ def _waiting(folder: Path) -> list[str]:
     """List the agents without figures, such as those that failed early."""
     recipes = sorted(folder.glob(f"*/{RECIPE}"))
     waiting = [file.parent.name for file in recipes if not (file.parent / ROWS).is_file()]
-    return [f"Not evaluated yet, and in no figure: {', '.join(waiting)}.", ""] if waiting else []
+    return [f"Not evaluated yet, and in no figure: {', '.join(waiting)}."] if waiting else []
 
 
 def _homes(trials: Sequence[Results]) -> str:
@@ -145,8 +148,9 @@ def _variants(trials: Sequence[Results]) -> dict[str, list[Results]]:
     return groups
 
 
-def _markdown(title: str, headers: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+def _markdown(section: Section) -> list[str]:
     """Lay out a section with a table; numbers stand to the right of the first column."""
+    title, headers, rows = section
     rules = ["---", *["---:"] * (len(headers) - 1)]
     cells = [[" ".join(cell.split()).replace("|", "\\|") for cell in row] for row in rows]
     return [f"## {title}", "", *(f"| {' | '.join(row)} |" for row in (headers, rules, *cells)), ""]
@@ -156,7 +160,7 @@ def _seconds(value: float | None) -> str:
     return "-" if value is None or not math.isfinite(value) else f"{value:.3f}"
 
 
-def _summary(trials: Sequence[Results]) -> list[str]:
+def _summary(trials: Sequence[Results]) -> Section:
     """One line per variant, on the track that chose the models."""
     rows = []
     for variant, group in _variants(trials).items():
@@ -182,7 +186,7 @@ def _summary(trials: Sequence[Results]) -> list[str]:
         "variant", "seeds that complete", "best flying lap s", "median s", "IQM s",
         "first whole lap: timesteps", "episodes", "minutes",
     ]  # fmt: skip
-    return _markdown(f"Summary, {_homes(trials)}", headers, rows)
+    return Section(f"Summary, {_homes(trials)}", headers, rows)
 
 
 def _completing(homes: Sequence[dict[str, Any]], seeds: int) -> str:
@@ -212,7 +216,7 @@ def _first_lap(trial: Results) -> dict[str, Any] | None:
     return next((row for row in trial.train if row["laps"] >= 1), None)
 
 
-def _seeds(trials: Sequence[Results]) -> list[str]:
+def _seeds(trials: Sequence[Results]) -> Section:
     """Every seed, failures too."""
     rows = []
     for trial in trials:
@@ -239,10 +243,10 @@ def _seeds(trials: Sequence[Results]) -> list[str]:
         "variant, seed", "completes", "laps s", "distance m", "end", "model kept at",
         "evaluations that complete", "first whole lap: timesteps", "episodes", "minutes",
     ]  # fmt: skip
-    return _markdown(f"Every seed, {_homes(trials)}", headers, rows)
+    return Section(f"Every seed, {_homes(trials)}", headers, rows)
 
 
-def _ladder(trials: Sequence[Results]) -> list[str]:
+def _ladder(trials: Sequence[Results]) -> Section:
     """How many seeds of each variant stand at least on each rung, per track."""
     rows = []
     for variant, group in _variants(trials).items():
@@ -255,10 +259,10 @@ def _ladder(trials: Sequence[Results]) -> list[str]:
             lap = _seconds(min((lap for lap in laps if lap), default=None))
             rows.append([f"{variant}, {track}", str(len(drives)), *counts, lap])
     headers = ["variant, track", "seeds", *RUNGS, "best flying lap s"]
-    return _markdown("The ladder: seeds that stand on a rung or higher", headers, rows)
+    return Section("The ladder: seeds that stand on a rung or higher", headers, rows)
 
 
-def _shares(trials: Sequence[Results]) -> list[str]:
+def _shares(trials: Sequence[Results]) -> Section:
     """How many of the tracks each seed completes."""
     rows = []
     for trial in trials:
@@ -273,4 +277,4 @@ def _shares(trials: Sequence[Results]) -> list[str]:
         ]
         rows.append([f"{trial.variant}, {trial.seed}", *cells])
     headers = ["variant, seed", "tracks completed", "of those that did not choose its model"]
-    return _markdown("Tracks completed", headers, rows)
+    return Section("Tracks completed", headers, rows)

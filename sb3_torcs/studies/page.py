@@ -1,0 +1,150 @@
+"""The report of a study as one HTML file: curves of all seeds, tables that sort, links."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from html import escape
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sb3_torcs.studies.config import slug
+from sb3_torcs.studies.estimates import Array, Estimate, estimate, share
+from sb3_torcs.studies.pictures import PANELS, curves_of
+from sb3_torcs.studies.results import Results
+from sb3_torcs.telemetry.document import OKABE_ITO, Cell, chip, document, paragraph, table
+
+__all__ = ["Section", "study_page"]
+
+SHARE = ("completes", "share of races that complete")
+BESIDE = {"lap report": "lap.html", "video": "lap.mp4"}
+"""What a seed's folder may hold, and where."""
+
+
+class Section(NamedTuple):
+    """A table of the report."""
+
+    title: str
+    headers: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+
+def study_page(
+    name: str,
+    notes: Sequence[str],
+    sections: Sequence[Section],
+    variants: Mapping[str, Sequence[Results]],
+    *,
+    folder: Path,
+    output: Path,
+) -> str:
+    """
+    Make the page of a study.
+
+    :param name: of the study
+    :param notes: what a reader should know first
+    :param sections: the tables
+    :param variants: trials by variant
+    :param folder: of the study
+    :param output: folder that the page will lie in
+    :return: HTML, which works without any other file and without a network
+    """
+    panels = _panels(variants)
+    colours = {variant: _colour(number) for number, variant in enumerate(variants)}
+    legend = " ".join(
+        f"{chip(colour)}{escape(variant)}&emsp;" for variant, colour in colours.items()
+    )
+    body = [
+        f"<header><h1>{escape(name)}</h1>",
+        *(paragraph(note) for note in notes),
+        "</header><main><h2>Learning</h2>",
+        f"<p>{legend}</p>",
+        paragraph("Thin: every seed; point at one to see which. Bold: the interquartile mean of "
+                  "the seeds, and its 95 % interval.", "note"),
+        f'<div class="panels">{"".join(_frame(panel) for panel in panels)}</div>',
+    ]  # fmt: skip
+    for section in sections:
+        body += [f"<h2>{escape(section.title)}</h2>"]
+        body += [table(section.headers, [section.rows], kind="sortable")]
+    body += ["<h2>Laps of each seed</h2>", *_links(variants, folder, output), "</main>"]
+    return document(name, "\n".join(body), {"panels": panels}, ["page_study.js"])
+
+
+def _colour(number: int) -> str:
+    return OKABE_ITO[number % len(OKABE_ITO)]
+
+
+def _frame(panel: Mapping[str, Any]) -> str:
+    return f'<div id="{panel["id"]}"></div>'
+
+
+def _panels(variants: Mapping[str, Sequence[Results]]) -> list[dict[str, Any]]:
+    """Return the three panels with the curves of all seeds."""
+    every = {variant: [curves_of(trial) for trial in group] for variant, group in variants.items()}
+    panels = []
+    for name, title in (*PANELS, SHARE):
+        curves: list[dict[str, Any]] = []
+        for number, (variant, group) in enumerate(variants.items()):
+            own = every[variant]
+            if name != SHARE[0]:
+                for trial, seed in zip(group, own, strict=True):
+                    told = f"{variant}, seed {trial.seed}"
+                    curves.append(_curve(told, number, seed["timesteps"], seed[name]))
+            curves += _mean(variant, number, own, name)
+        from_zero = "tozero" if name == "distance" else "normal"
+        panel = {"id": f"panel-{name}", "title": title, "curves": curves, "rangemode": from_zero}
+        panels.append(panel | ({"range": [-0.03, 1.03]} if name == SHARE[0] else {}))
+    return panels
+
+
+def _curve(text: str, number: int, x: Array, y: Array, **more: Any) -> dict[str, Any]:
+    """Return a curve as the script draws it; what is not finite leaves a gap."""
+    values = [round(float(value), 4) if np.isfinite(value) else None for value in y]
+    colour = _colour(number)
+    return {"text": escape(text), "colour": colour, "x": x.tolist(), "y": values, **more}
+
+
+def _mean(
+    variant: str, number: int, every: Sequence[dict[str, Array]], name: str
+) -> list[dict[str, Any]]:
+    """Return the interval and the mean of a variant's seeds, as far as all seeds are."""
+    length = min(len(curves["timesteps"]) for curves in every)
+    x = np.mean([curves["timesteps"][:length] for curves in every], axis=0)
+    scores = np.array([curves[name][:length] for curves in every])
+    figure = estimate(scores, share) if name == SHARE[0] else estimate(scores)
+    told = f"{variant}, {len(every)} seeds"
+    mean = _curve(told, number, x, figure.value, bold=True)
+    return [*_band(told, number, x, figure), mean]
+
+
+def _band(text: str, number: int, x: Array, figure: Estimate) -> list[dict[str, Any]]:
+    """Return the outline of an interval, where both of its ends are finite."""
+    whole = np.isfinite(figure.low) & np.isfinite(figure.high)
+    if whole.sum() < 2:
+        return []
+    outline = np.concatenate([figure.low[whole], figure.high[whole][::-1]])
+    around = np.concatenate([x[whole], x[whole][::-1]])
+    return [_curve(text, number, around, outline, band=True)]
+
+
+def _links(variants: Mapping[str, Sequence[Results]], folder: Path, output: Path) -> Sequence[str]:
+    """Link each seed's lap report and video, or say how to make them."""
+    rows: list[list[Cell | str]] = []
+    for variant, group in variants.items():
+        for trial in group:
+            home = folder / f"{slug(variant)}-seed{trial.seed}"
+            cells = [_link(home / file, what, output) for what, file in BESIDE.items()]
+            rows.append([f"{variant}, {trial.seed}", *cells])
+    example = folder / f"{slug(next(iter(variants)))}-seed{next(iter(variants.values()))[0].seed}"
+    how = f"sb3-torcs evaluate {example} --report {example}/lap.html --video {example}/lap.mp4"
+    told = f"A seed's lap report and video are made by: {how}. Then write this page again."
+    return [table(["variant, seed", *BESIDE], [rows], words=3), paragraph(told, "note")]
+
+
+def _link(file: Path, text: str, output: Path) -> Cell:
+    """Cell with a link to a file, if it is there."""
+    if not file.is_file():
+        return Cell("–")
+    return Cell(text, html=f'<a href="{escape(os.path.relpath(file, output))}">{text}</a>')
