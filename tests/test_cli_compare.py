@@ -5,9 +5,14 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import gymnasium as gym
+import numpy as np
 import pytest
 from made_drives import drive, log_of
 
+from sb3_torcs.agents.ghosts import Ghost
+from sb3_torcs.agents.rollout import drive as rollout
+from sb3_torcs.agents.scripted import ScriptedDriver
 from sb3_torcs.cli import main
 from sb3_torcs.evaluation import comparing
 from sb3_torcs.evaluation.comparing import compare
@@ -57,6 +62,18 @@ def test_an_agent_a_robot_and_a_saved_drive_are_compared(tmp_path, capsys):
         "distance", "braking_point", "entry_speed", "apex_speed", "exit_speed", "time_lost",
     }  # fmt: skip
     assert page.read_text().startswith("<!DOCTYPE html>")
+
+
+@pytest.mark.usefixtures("game")
+def test_a_ghost_drives_as_it_did(tmp_path):
+    """Its actions give the drive that they were taken from."""
+    kwargs = {"track": "a-speedway", "car": "car1-trb1", "action_repeat": 5, "laps": 1}
+    with gym.make("sb3_torcs:Torcs-v0", **kwargs) as env:
+        actions = np.array([step.action for step in rollout(env, ScriptedDriver(), seed=0)])
+    ghost = Ghost(kwargs, actions, (), "scripted", 0).write(tmp_path / "lap.npz")
+    first, second = compare("scripted", ghost, track="a-speedway", laps=1).comparison.drivers
+    assert second.lap.time == first.lap.time
+    assert not second.delta.any()
 
 
 def test_the_documented_json_is_what_it_prints(saved, tmp_path, capsys):

@@ -39,7 +39,7 @@ DEFAULT_TRACK = "aalborg"
 HEIGHT = 900  # [px] of a report in a notebook
 
 SAVED: dict[str, Callable[[Path], pd.DataFrame]] = {".parquet": read_drives}
-"""Who reads a file of drives, by its ending."""
+"""Who reads a file of drives, by its ending. A ghost is none: it drives again, as an agent."""
 
 
 @dataclass(frozen=True)
