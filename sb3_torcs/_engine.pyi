@@ -105,7 +105,7 @@ class Fleet:
         seats: npt.NDArray[np.int64],  # (n,) which car; -1 is the first agent's
         controls: FloatArray,  # (n, 5) as of Controls; a gear of nan is the gearbox's choice
         ticks: npt.NDArray[np.int64],  # (n,)
-        cars: FloatArray,  # (n, 82) filled, as of CarState
+        cars: FloatArray,  # (n, 111) filled, as of CarState
     ) -> list[int]: ...  # the rows that were not, of races that failed
 
 class Rollouts:

@@ -24,6 +24,8 @@ __all__ = [
     "LIMITER_RPM",
     "MANY_LAPS",
     "MAX_DAMAGE",
+    "NO_RACE",
+    "RIVALS",
     "RPM",
     "STEER_LOCK",
     "CarState",
@@ -147,6 +149,14 @@ def checked_start_speed(speed: float) -> float:
     return float(speed)
 
 
+RIVALS = 4
+"""How many cars around it a car knows."""
+
+NO_RACE = np.array([200.0, 200.0, 0.0, 0.0, 0.0, *[200.0] * RIVALS, *[0.0] * 5 * RIVALS])
+"""``CarState.race`` of a car that knows of no other, or in a world that does not tell."""
+NO_RACE.flags.writeable = False
+
+
 class CarState(NamedTuple):
     """
     The car at one moment, as a simulator knows it. Immutable; its arrays are read-only.
@@ -181,6 +191,7 @@ class CarState(NamedTuple):
     wheel_speeds: FloatArray  # (4,) [rad/s] front right, front left, rear right, rear left
     range_finders: FloatArray  # (19,) [m] to the road's edge, left to right; -1 off the road
     opponents: FloatArray  # (36,) [m] to the nearest car per 10 degree sector, 200 if none
+    race: FloatArray = NO_RACE  # (29,) what the properties below read, of races of the game
 
     @property
     def track_position(self) -> float:
@@ -192,8 +203,33 @@ class CarState(NamedTuple):
         """Whether the mass centre has left the road, as the SCR server judges it."""
         return abs(self.distance_from_axis) > 0.5 * self.track_width
 
+    @property
+    def gap_ahead(self) -> float:
+        """To the car a place before [m of road]; 200 if this is the first."""
+        return float(self.race[0])
 
-_ARRAYS = {"wheel_speeds": 4, "range_finders": 19, "opponents": 36}
+    @property
+    def gap_behind(self) -> float:
+        """To the car a place after [m of road]; 200 if this is the last."""
+        return float(self.race[1])
+
+    @property
+    def laps_left(self) -> float:
+        """Laps until the race ends, the present one included; 2**30 if it does not end."""
+        return float(self.race[2])
+
+    @property
+    def contacts(self) -> float:
+        """How often this car and another have touched; 0.5 s apart, it is another contact."""
+        return float(self.race[3])
+
+    @property
+    def faults(self) -> float:
+        """In how many of them this car has hit the other one with its front."""
+        return float(self.race[4])
+
+
+_ARRAYS = {"wheel_speeds": 4, "range_finders": 19, "opponents": 36, "race": len(NO_RACE)}
 _COUNTS = tuple(CarState._fields.index(name) for name in ("gear", "laps", "race_position"))
 _SCALARS = len(CarState._fields) - len(_ARRAYS)
 _ENDS = tuple(itertools.accumulate(_ARRAYS.values()))
@@ -207,7 +243,7 @@ def car_from_record(numbers: FloatArray) -> CarState:
     """
     Read a car from an array.
 
-    :param numbers: (82,) of a :data:`CAR_RECORD`
+    :param numbers: (111,) of a :data:`CAR_RECORD`
     :return: the car, which shares no memory with it
     """
     values = numbers[:_SCALARS].tolist()

@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Literal
 
-from sb3_torcs.car import CarState, Controls, is_number
+from sb3_torcs.car import CAR_WIDTH, CarState, Controls, is_number
 from sb3_torcs.errors import InvalidOption, UnknownRewardTerm, near_miss
 
 __all__ = ["PRESETS", "TERMS", "Reward", "RewardChoice", "RewardName"]
@@ -65,10 +65,40 @@ def overspeed(before: CarState, after: CarState, controls: Controls) -> float:
     return max(after.speed_x - math.sqrt(BEND_SPEED**2 + 2.0 * BRAKING * sight), 0.0)
 
 
+def places(before: CarState, after: CarState, controls: Controls) -> float:
+    """Places gained per second [1/s], in a race; those lost count negative."""
+    return (before.race_position - after.race_position) / (after.time - before.time)
+
+
+def gap(before: CarState, after: CarState, controls: Controls) -> float:
+    """Metres gained per second on the car ahead, within 200 m [m/s]; 0 if places change."""
+    if before.race_position != after.race_position:
+        return 0.0
+    gained = min(before.gap_ahead, 200.0) - min(after.gap_ahead, 200.0)
+    return gained / (after.time - before.time)
+
+
+def contact(before: CarState, after: CarState, controls: Controls) -> float:
+    """Contacts with other cars per second [1/s], whosever fault."""
+    return (after.contacts - before.contacts) / (after.time - before.time)
+
+
+def fault(before: CarState, after: CarState, controls: Controls) -> float:
+    """Contacts per second in which this car hits another with its front [1/s]."""
+    return (after.faults - before.faults) / (after.time - before.time)
+
+
+def off_line(before: CarState, after: CarState, controls: Controls) -> float:
+    """Speed × how far the car's outer side is over the edge of the road [m²/s]."""
+    over = abs(after.distance_from_axis) + 0.5 * (CAR_WIDTH - after.track_width)
+    return max(over, 0.0) * abs(after.speed_x)
+
+
 TERMS: dict[str, Term] = {
     term.__name__: term
     for term in (
         speed_along, speed_across, speed_off_axis, progress, time, damage, pedals, overspeed,
+        places, gap, contact, fault, off_line,
     )
 }  # fmt: skip
 

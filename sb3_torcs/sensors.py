@@ -1,9 +1,9 @@
 """The sensor table, from which all that concerns observations is derived.
 
 Its rows stand in groups, which an environment's ``sensors`` names: ``"base"`` are sensors of the
-SCR manual (arXiv:1304.1672, table 1), and ``"preview"`` is the road ahead. The observation space,
-the encoder, the mirror image, the documentation and the policy's view of the observation are all
-derived from the table.
+SCR manual (arXiv:1304.1672, table 1), ``"preview"`` is the road ahead, and ``"opponents"``,
+``"rivals"`` and ``"race"`` are the other cars. The observation space, the encoder, the mirror
+image, the documentation and the policy's view of the observation are all derived from the table.
 
 To add a group, write its rows, put them into :data:`GROUPS`, and its function into ``_WRITERS``.
 """
@@ -22,12 +22,13 @@ import numpy.typing as npt
 from numba import literal_unroll, njit, types
 from numba.extending import overload
 
-from sb3_torcs.car import CarState, FloatArray
+from sb3_torcs.car import RIVALS, CarState, FloatArray
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.tracks.profile import INTERVALS, QUANTITIES, look_ahead
 
 __all__ = [
     "GROUPS",
+    "NEEDS_RACE",
     "OBSERVATION_HIGH",
     "OBSERVATION_LOW",
     "OBSERVATION_SIZE",
@@ -46,7 +47,7 @@ __all__ = [
     "sensors_of_size",
 ]
 
-SensorsName = Literal["base", "preview"]
+SensorsName = Literal["base", "preview", "opponents", "rivals", "race"]
 Mirror = Literal["same", "opposite", "reversed", "sides"]
 
 
@@ -95,7 +96,38 @@ learning.
 """
 USUAL_BEND = 1.0 / 50.0  # [1/m] seen as 0.5
 
-GROUPS: Mapping[SensorsName, tuple[Sensor, ...]] = {"base": SENSORS, "preview": PREVIEW}
+OPPONENTS = (Sensor("opponents", "opponents", 36, "m", 0.0, 200.0, 1.0 / 200.0, "reversed"),)
+"""Distances to the nearest car in sectors of 10°, clockwise; the first begins straight behind."""
+
+RIVAL_ROWS = (
+    Sensor("rivals_along", "", RIVALS, "m", -200.0, 200.0, 1.0 / 200.0),
+    Sensor("rivals_across", "", RIVALS, "m", -20.0, 20.0, 1.0 / 20.0, "opposite"),
+    Sensor("rivals_speed_along", "", RIVALS, "m/s", -60.0, 60.0, 1.0 / 30.0),
+    Sensor("rivals_speed_across", "", RIVALS, "m/s", -30.0, 30.0, 1.0 / 30.0, "opposite"),
+    Sensor("rivals_length", "", RIVALS, "m", 0.0, 10.0, 1.0 / 10.0),
+    Sensor("rivals_width", "", RIVALS, "m", 0.0, 5.0, 1.0 / 5.0),
+)
+"""The cars that are nearest along the road, the nearest first: where they are against this one, how
+much faster, and how large. Who is not there is 200 m ahead and has no size."""
+
+RACE = (
+    Sensor("race_position", "racePos", 1, "-", 1.0, 20.0, 1.0 / 20.0),
+    Sensor("gap_ahead", "", 1, "m", 0.0, 200.0, 1.0 / 200.0),
+    Sensor("gap_behind", "", 1, "m", 0.0, 200.0, 1.0 / 200.0),
+    Sensor("laps_left", "", 1, "-", 0.0, 10.0, 1.0 / 10.0),
+)
+"""How the race stands. Gaps are those to the car a place before and after."""
+
+NEEDS_RACE = frozenset({"rivals", "race"})
+"""Groups that only a world with a race can tell."""
+
+GROUPS: Mapping[SensorsName, tuple[Sensor, ...]] = {
+    "base": SENSORS,
+    "preview": PREVIEW,
+    "opponents": OPPONENTS,
+    "rivals": RIVAL_ROWS,
+    "race": RACE,
+}
 """The whole table. An observation has the groups that are named, in this order."""
 
 _TABLE = tuple(chain(*GROUPS.values()))
@@ -287,8 +319,34 @@ def _write_preview(world: Any, car: CarState, numbers: npt.NDArray[np.float32]) 
     _scale_preview(profile.sums, profile.step, car.distance_from_start, numbers)
 
 
+@njit(cache=True)
+def _scale_into(values: FloatArray, first: int, numbers: npt.NDArray[np.float32]) -> None:
+    """Scale and clip values of a group, whose place in the table is given."""
+    for i in range(len(values)):
+        numbers[i] = _scaled(values[i], first + i)
+
+
+def _write_opponents(world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> None:
+    del world
+    _scale_into(car.opponents, _PARTS["opponents"].start, numbers)
+
+
+def _write_rivals(world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> None:
+    del world
+    _scale_into(car.race[-len(numbers) :], _PARTS["rivals"].start, numbers)
+
+
+def _write_race(world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> None:
+    del world
+    values = np.array([car.race_position, car.gap_ahead, car.gap_behind, car.laps_left], np.float64)
+    _scale_into(values, _PARTS["race"].start, numbers)
+
+
 _WRITERS: dict[str, Callable[[Any, CarState, npt.NDArray[np.float32]], None]] = {
     "preview": _write_preview,
+    "opponents": _write_opponents,
+    "rivals": _write_rivals,
+    "race": _write_race,
 }
 """Of each group but ``"base"``: fills its numbers, from the world and the state of the car."""
 

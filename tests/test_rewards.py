@@ -30,6 +30,10 @@ AFTER = car_state(
         ("damage", 0.0),
         ("pedals", 0.0),
         ("overspeed", 0.0),
+        ("places", 0.0),
+        ("gap", 0.0),
+        ("contact", 0.0),
+        ("fault", 0.0),
     ],
 )
 def test_a_term_has_its_known_value(term, value):
@@ -46,6 +50,41 @@ def test_overspeed_is_what_cannot_be_lost_within_sight(sight, speed, value):
     beams[9] = sight
     car = AFTER._replace(speed_x=speed, range_finders=beams)
     assert TERMS["overspeed"](BEFORE, car, GAS) == value
+
+
+def in_a_race(car, place, ahead, contacts=0.0, faults=0.0):
+    return car._replace(race_position=place, race=np.array([ahead, 50.0, 3.0, contacts, faults]))
+
+
+def test_a_place_gained_counts_once_however_long_the_timestep():
+    before, after = in_a_race(BEFORE, 5, 10.0), in_a_race(AFTER, 3, 10.0)
+    assert Reward({"places": 1.0})(before, after, GAS, None)["places"] == 2.0
+    assert Reward({"places": 1.0})(after._replace(time=0.0), before._replace(time=0.5), GAS, None)[
+        "places"
+    ] == pytest.approx(-2.0)
+
+
+@pytest.mark.parametrize(
+    ("place", "was", "now", "value"),
+    [(4, 12.0, 7.0, 5.0), (4, 7.0, 12.0, -5.0), (4, 900.0, 190.0, 10.0), (3, 2.0, 80.0, 0.0)],
+)
+def test_a_gap_that_closes_is_a_gain(place, was, now, value):
+    """Beyond 200 m nothing counts, nor does the gap to another car after a place was gained."""
+    before, after = in_a_race(BEFORE, 4, was), in_a_race(AFTER, place, now)
+    assert Reward({"gap": 1.0})(before, after, GAS, None)["gap"] == value
+
+
+def test_a_contact_is_told_from_one_s_own_fault():
+    before, after = in_a_race(BEFORE, 4, 9.0, 1.0, 0.0), in_a_race(AFTER, 4, 9.0, 3.0, 1.0)
+    terms = Reward({"contact": -1.0, "fault": -1.0})(before, after, GAS, None)
+    assert (terms["contact"], terms["fault"]) == (-2.0, -1.0)
+
+
+@pytest.mark.parametrize(("offset", "over"), [(0.0, 0.0), (4.0, 0.0), (-4.53, 0.5), (5.03, 1.0)])
+def test_off_line_is_how_far_the_side_is_over_the_edge(offset, over):
+    """Of a car of 1.94 m on a road of 10 m."""
+    car = AFTER._replace(distance_from_axis=offset, speed_x=20.0, track_width=10.0)
+    assert TERMS["off_line"](BEFORE, car, GAS) == pytest.approx(20.0 * over)
 
 
 def test_a_weight_multiplies_duration_and_scale():

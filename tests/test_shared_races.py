@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 import pickle
 
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch as th
 from stable_baselines3 import DDPG, PPO
 
 from sb3_torcs.agents.scripted import ScriptedDriver
 from sb3_torcs.backends.native import Fleet, make_engine, make_grid
 from sb3_torcs.backends.seats import REJOIN_SPEED
-from sb3_torcs.car import CAR_RECORD, CONTROL_TICK
+from sb3_torcs.car import CAR_RECORD, CONTROL_TICK, RIVALS
 from sb3_torcs.envs.torcs_race import make_race
 from sb3_torcs.errors import CarLost, InvalidAction, InvalidOption
+from sb3_torcs.policies.mirror import mirror_observations
+from sb3_torcs.sensors import feature_slices
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.vec_env import TorcsVecEnv
 
@@ -439,3 +444,99 @@ class TestVectorEnvironment:
         model.learn(256)
         assert model.num_timesteps == 256
         assert all(np.isfinite(p.detach().numpy()).all() for p in model.policy.parameters())
+
+
+class TestSensorsOfARace:
+    """Held to what is read of each car alone."""
+
+    @pytest.fixture
+    def field(self, race):
+        engine = race([("bt", 2), ("inferno", 3), ("", 0), ("", 1), ("", 2), ("", 3)], laps=3)
+        for controls in random_controls(250, agents=4):
+            hold(engine, controls)
+            engine.drive(1)
+        return [engine.read(car) for car in range(6)], engine.track_summary()["length"]
+
+    def test_rivals_are_the_nearest_along_the_road(self, field):
+        cars, length = field
+        for car in cars:
+            ahead = {
+                math.remainder(other.distance_from_start - car.distance_from_start, length): other
+                for other in cars
+                if other is not car
+            }
+            nearest = sorted(ahead, key=abs)[:RIVALS]
+            along, across, speed_along, _, long, wide = car.race[5:].reshape(6, RIVALS)
+            assert along == pytest.approx(nearest, abs=1e-3)  # the game's floats
+            others = [ahead[place] for place in nearest]
+            assert across == pytest.approx(
+                [other.distance_from_axis - car.distance_from_axis for other in others]
+            )
+            assert speed_along == pytest.approx(
+                [speed_on(other) - speed_on(car) for other in others],
+                abs=0.01,  # it rolls, too
+            )
+            assert (long > 4.0).all()
+            assert (wide > 1.5).all()
+
+    def test_the_race_is_told_as_it_stands(self, field):
+        cars, _ = field
+        order = sorted(cars, key=lambda car: car.race_position)
+        assert [car.race_position for car in order] == [1, 2, 3, 4, 5, 6]
+        assert order[0].gap_ahead == order[-1].gap_behind == 200.0
+        for first, second in itertools.pairwise(order):
+            assert first.gap_behind == second.gap_ahead > 0.0
+        assert {car.laps_left for car in cars} == {3.0}
+
+    def test_who_is_alone_has_no_rival(self, race):
+        car = race([("", 0)]).read(0)
+        assert car.race[5:].reshape(6, RIVALS).tolist() == [[200.0] * RIVALS, *[[0.0] * RIVALS] * 5]
+
+    def test_who_hits_another_with_the_front_is_at_fault(self, race):
+        """The second agent drives into the first, which stands on its brake in front of it."""
+        engine = race([("", 0), ("", 1)])
+        engine.start_at(300.0, engine.read(1).track_position, 0.0, 0.0)
+        ahead, behind = engine.read(0), engine.read(1)
+        for _ in range(300):
+            if behind.contacts:
+                break
+            hold(engine, [(0.0, 0.0, 1.0, None), (0.5 * behind.heading_error, 0.5, 0.0, None)])
+            engine.drive(1)
+            ahead, behind = engine.read(0), engine.read(1)
+        assert (ahead.contacts, ahead.faults) == (1.0, 0.0)
+        assert (behind.contacts, behind.faults) == (1.0, 1.0)
+
+    def test_an_agent_sees_what_it_is_asked_to_show(self, make):
+        sensors = ("base", "opponents", "rivals", "race")
+        envs = make(1, 3, sensors=sensors, opponents=["bt"])
+        envs.seed(0)
+        seen = envs.reset()
+        where = feature_slices(sensors)
+        for _ in range(30):
+            for row, car in zip(seen, envs.get_attr("car"), strict=True):
+                assert row[where["opponents"]] == pytest.approx(car.opponents / 200.0)
+                assert row[where["rivals_along"]] == pytest.approx(
+                    np.clip(car.race[5:9], -200.0, 200.0) / 200.0, abs=1e-6
+                )
+                assert row[where["race_position"]] == pytest.approx(car.race_position / 20.0)
+            assert envs.observation_space.contains(seen[0])
+            seen = envs.step(np.array([GAS] * 3, np.float32))[0]
+
+    @pytest.mark.parametrize("sensors", [("base", "rivals"), ("base", "race")])
+    def test_a_world_without_races_cannot_tell_of_one(self, sensors):
+        with pytest.raises(InvalidOption, match="of which this world does not tell"):
+            gym.make("TorcsLite-v0", sensors=sensors)
+
+    def test_in_the_mirror_who_was_left_is_right(self):
+        """Places along the road stay, places across it change their sign."""
+        sensors = ("base", "opponents", "rivals")
+        where = feature_slices(sensors)
+        row = th.arange(29.0 + 36 + 6 * RIVALS)[None]
+        image = mirror_observations(row)[0]
+        assert image[where["opponents"]].tolist() == row[0][where["opponents"]].tolist()[::-1]
+        for name, sign in (("rivals_along", 1.0), ("rivals_across", -1.0)):
+            assert (image[where[name]] == sign * row[0][where[name]]).all()
+
+
+def speed_on(car):
+    return car.speed_x * math.cos(car.heading_error) + car.speed_y * math.sin(car.heading_error)

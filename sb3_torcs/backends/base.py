@@ -27,7 +27,8 @@ class Backend(Protocol):
     has an attribute ``gears``. One whose road has hills has an attribute ``profile``, a
     :class:`~sb3_torcs.tracks.profile.RoadProfile`. One that can drive under other conditions has a
     method ``set_conditions(grip, mass)``, factors that hold from the next reset on, and in
-    ``conditions`` the names of those that it can change.
+    ``conditions`` the names of those that it can change. One that fills ``CarState.race`` has an
+    attribute ``tells_race``, which is true.
     """
 
     track: Track
@@ -79,7 +80,7 @@ class Fleet(Protocol):
         :param controls: (n, 5) as of :class:`~sb3_torcs.car.Controls`, finite and within their
             ranges; a gear of nan leaves it to the gearbox
         :param ticks: (n,) control ticks of 0.02 s
-        :param cars: (n, 82) filled, each row a :data:`~sb3_torcs.car.CAR_RECORD`
+        :param cars: (n, 111) filled, each row a :data:`~sb3_torcs.car.CAR_RECORD`
         :return: the rows that are not filled, of races that failed
         """
 

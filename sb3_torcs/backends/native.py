@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sb3_torcs.actions import checked_gearbox
-from sb3_torcs.backends.seats import SeatWorld, profile_of
+from sb3_torcs.backends.seats import SeatWorld, align, profile_of
 from sb3_torcs.car import (
     DEFAULT_CAR,
     MANY_LAPS,
@@ -39,10 +39,14 @@ if TYPE_CHECKING:
     from sb3_torcs._engine import Engine, Rollouts
 
 __all__ = [
-    "Fleet", "NativeBackend", "check_layout", "make_engine", "make_grid", "make_rollouts",
-]  # fmt: skip
-
-MIN_SHIFT = 1.0  # [m] between the game's frame and the track's, from which positions are moved
+    "Fleet",
+    "NativeBackend",
+    "check_layout",
+    "load_race",
+    "make_engine",
+    "make_grid",
+    "make_rollouts",
+]
 
 
 def make_engine(
@@ -118,14 +122,6 @@ def _for_each(choice: str | Sequence[str], agents: int) -> list[str]:
     return [choice] * max(agents, 1) if isinstance(choice, str) else list(choice)
 
 
-def _align(engine: Engine, track: Track) -> None:
-    """Move positions into the track's frame: the game counts one track's origin otherwise."""
-    there = engine.track_summary()
-    x, y, _ = track.pose(0.0)
-    if abs(x - there["x"]) > MIN_SHIFT or abs(y - there["y"]) > MIN_SHIFT:
-        engine.set_origin(x - there["x"], y - there["y"])
-
-
 def make_grid(
     track: str | Path,
     car: str,
@@ -152,17 +148,47 @@ def make_grid(
     :param flagged: whether agents are flagged off after the last lap
     :return: the cars of the agents
     """
-    game = find_game()
-    entries = starting_list(game, opponents, grid_place, agents)
-    file = find_track(track, game)
+    entries = starting_list(find_game(), opponents, grid_place, agents)
     angles = range_finder_angles(range_finders)
+    engine, road = load_race(
+        track, entries, cars=[car] * agents, gearboxes=[gearbox] * agents,
+        angles=[angles] * agents, laps=checked_laps(laps) or 0, flagged=flagged,
+    )  # fmt: skip
+    return [SeatWorld(engine, seat, road, angles) for seat in engine.agents]
+
+
+def load_race(
+    track: str | Path,
+    entries: Sequence[tuple[str, int]],
+    *,
+    cars: Sequence[str],
+    gearboxes: Sequence[str],
+    angles: Sequence[FloatArray],
+    laps: int,
+    flagged: bool,
+) -> tuple[Engine, Track]:
+    """
+    Load a race of robots and agents, whose positions are those of the track's file.
+
+    :param track: as of :class:`NativeBackend`
+    :param entries: as of :func:`make_engine`
+    :param cars: of the agents
+    :param gearboxes: of the agents
+    :param angles: (19,) of the range finders of each agent [rad]
+    :param laps: of the race; 0 drives on
+    :param flagged: whether agents are flagged off after the last lap
+    :return: the engine, not yet started, and the road
+    """
+    game = find_game()
+    file = find_track(track, game)
     engine = make_engine(
-        game, file, entries, car=car, session=session_for(entries), laps=checked_laps(laps) or 0,
-        angles=angles, gearbox=gearbox, flagged=flagged,
+        game, file, entries, session=session_for(entries), laps=laps, flagged=flagged,
+        car=list(cars) or DEFAULT_CAR, gearbox=list(gearboxes) or "automatic",
+        angles=np.stack(angles) if angles else None,
     )  # fmt: skip
     road = load_track(file.path)
-    _align(engine, road)
-    return [SeatWorld(engine, seat, road, angles) for seat in engine.agents]
+    align(engine, road)
+    return engine, road
 
 
 def make_rollouts(engines: Sequence[Engine]) -> Rollouts:
@@ -192,6 +218,8 @@ class NativeBackend:
     """
 
     conditions = ("grip", "mass")
+
+    tells_race = True
 
     def __init__(
         self,
@@ -237,7 +265,7 @@ class NativeBackend:
         self.gears = self.engine.gears(self.seat)
         self._noise = sensor_noise
         self._conditions = 1.0, 1.0
-        _align(self.engine, self.track)
+        align(self.engine, self.track)
         self._drive: list[Any] = []  # steps since the reset, for copies
 
     @cached_property

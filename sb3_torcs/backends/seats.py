@@ -17,10 +17,26 @@ from sb3_torcs.tracks.track import Track
 if TYPE_CHECKING:
     from sb3_torcs._engine import Engine
 
-__all__ = ["REJOIN_SPEED", "Seat", "SeatWorld", "SharedRace", "profile_of"]
+__all__ = ["REJOIN_SPEED", "Seat", "SeatWorld", "SharedRace", "align", "profile_of"]
 
 REJOIN_SPEED = 20.0
 """[m/s] of a car that is put back on the road, where no start was drawn for it."""
+
+
+MIN_SHIFT = 1.0  # [m] between the game's frame and the track's, from which positions are moved
+
+
+def align(engine: Engine, track: Track) -> None:
+    """
+    Move positions into the track's frame: the game counts one track's origin otherwise.
+
+    :param engine: of a race
+    :param track: the same road as it was read from its file
+    """
+    there = engine.track_summary()
+    x, y, _ = track.pose(0.0)
+    if abs(x - there["x"]) > MIN_SHIFT or abs(y - there["y"]) > MIN_SHIFT:
+        engine.set_origin(x - there["x"], y - there["y"])
 
 
 _profiles: WeakKeyDictionary[Track, RoadProfile] = WeakKeyDictionary()
@@ -161,6 +177,8 @@ class Seat:
     :param race: that it is in
     :param number: of the agent, from 0
     """
+
+    tells_race = True
 
     def __init__(self, race: SharedRace, number: int) -> None:
         self.race, self.number = race, number

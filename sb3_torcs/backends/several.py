@@ -59,6 +59,7 @@ class SeveralWorlds:
         self._enter(0)
         self.gears: int = min(getattr(world, "gears", GEARS) for world in self.worlds)
         self.range_finder_angles = self._world.range_finder_angles
+        self.tells_race = all(getattr(world, "tells_race", False) for world in self.worlds)
         self.conditions: Sequence[str] = getattr(self._world, "conditions", ())
 
     @property

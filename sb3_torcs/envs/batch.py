@@ -40,8 +40,8 @@ NO_TERM = -1
 class Timestep(NamedTuple):
     """The outcome of a timestep of all races."""
 
-    before: FloatArray  # (n, 82) cars
-    after: FloatArray  # (n, 82) cars
+    before: FloatArray  # (n, 111) cars
+    after: FloatArray  # (n, 111) cars
     observations: npt.NDArray[np.float32]  # (n, size)
     rewards: list[float]
     terms: list[list[float]]  # of the rewards, in the order of `names`
@@ -311,7 +311,7 @@ class Batch:
         Drive all races.
 
         :param parts: of the timestep
-        :param after: (n, 82) filled
+        :param after: (n, 111) filled
         :return: the races that failed, whose rows are not
         """
         if len(parts) == 1:

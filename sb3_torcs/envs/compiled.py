@@ -43,7 +43,7 @@ def _derived(name: str) -> None:
         return value
 
 
-for _name in ("track_position", "off_track"):
+for _name in ("track_position", "off_track", "gap_ahead", "gap_behind", "contacts", "faults"):
     _derived(_name)
 for _function in (end_of, stands, *(actions.action_layout(name).read for name in actions.ACTIONS)):
     register_jitable(_function)

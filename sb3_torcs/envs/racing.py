@@ -30,7 +30,7 @@ from sb3_torcs.car import (
 from sb3_torcs.envs.conditions import Conditions, Delay, Part, read_start
 from sb3_torcs.errors import CarLost, EnvClosed, InvalidOption
 from sb3_torcs.rewards import Reward, RewardChoice
-from sb3_torcs.sensors import SensorsName, View
+from sb3_torcs.sensors import NEEDS_RACE, SensorsName, View
 from sb3_torcs.tracks.track import Track
 
 __all__ = ["RacingEnv", "RacingInfo", "RenderMode"]
@@ -125,6 +125,16 @@ def stands(car: CarState) -> bool:
     return car.speed_x * math.cos(car.heading_error) < STUCK_SPEED
 
 
+def _check_tells(world: Backend, view: View) -> None:
+    """Refuse sensors of a race in a world that has none to tell of."""
+    lacking = NEEDS_RACE.intersection(view.sensors)
+    if lacking and not getattr(world, "tells_race", False):
+        raise InvalidOption(
+            f"sensors {', '.join(map(repr, sorted(lacking)))} are of races, of which this world "
+            "does not tell; leave them out, or use backend 'native' of Torcs-v0"
+        )
+
+
 class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
     """
     A car on a track, driven by steering and pedals.
@@ -179,6 +189,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
             "render_fps": 1.0 / (action_repeat * CONTROL_TICK),
         }
         self.view = View(sensors)
+        _check_tells(backend, self.view)
         self.observation_space = spaces.Box(self.view.low, self.view.high, dtype=np.float32)
         self.action = action
         self.layout = action_layout(action, getattr(backend, "gears", GEARS))

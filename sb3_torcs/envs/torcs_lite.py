@@ -70,8 +70,9 @@ class TorcsLiteEnv(RacingEnv):
     :param reward: ``"progress"``, ``"blog"``, ``"apex"``, or a dict of weights
     :param action_repeat: control ticks of 0.02 s per timestep
     :param range_finders: ``"scr"``, ``"narrow"``, or 19 angles in degrees, left to right
-    :param sensors: groups of sensors in an observation: ``("base",)``, the 29 numbers, or
-        ``("base", "preview")``, with the road ahead of the car
+    :param sensors: groups of sensors in an observation: ``"base"``, the 29 numbers, and any of
+        ``"preview"``, the road ahead, or
+        ``"opponents"``
     :param action: ``"pedals"``: steering, throttle, brake; ``"pedal"``: steering and one signed
         pedal; or ``"manual"``: steering, throttle, brake, gear, clutch
     :param gearbox: ``"automatic"``, by motor speed; or ``"road_speed"``, which does not hunt while

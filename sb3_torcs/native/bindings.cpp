@@ -55,7 +55,7 @@ py::array_t<double> read_only(const std::array<double, n>& values) {
 py::object as_state(const Reading& reading) {
     static PyTypeObject* type = reinterpret_cast<PyTypeObject*>(
         py::object(py::module_::import("sb3_torcs.car").attr("CarState")).release().ptr());
-    const auto state = py::reinterpret_steal<py::object>(type->tp_alloc(type, SCALARS + 3));
+    const auto state = py::reinterpret_steal<py::object>(type->tp_alloc(type, SCALARS + 4));
     if (!state) throw py::error_already_set();
     for (int i = 0; i < SCALARS; i++) {
         const double value = reading.scalars[static_cast<std::size_t>(i)];
@@ -66,6 +66,7 @@ py::object as_state(const Reading& reading) {
     PyTuple_SET_ITEM(state.ptr(), SCALARS, read_only(reading.wheel_speeds).release().ptr());
     PyTuple_SET_ITEM(state.ptr(), SCALARS + 1, read_only(reading.range_finders).release().ptr());
     PyTuple_SET_ITEM(state.ptr(), SCALARS + 2, read_only(reading.opponents).release().ptr());
+    PyTuple_SET_ITEM(state.ptr(), SCALARS + 3, read_only(reading.race).release().ptr());
     return state;
 }
 

@@ -251,6 +251,11 @@ Reading Engine::read(Race& race, int index) {
     range_finders(car, angles_[static_cast<std::size_t>(index)].data(),
                   reading.range_finders.data());
     opponents(car, race.cars(), race.cars_number(), reading.opponents.data());
+    reading.race = {
+        race.gap(index, -1), race.gap(index, 1), static_cast<double>(race.laps_left(index)),
+        static_cast<double>(race.contacts(index)), static_cast<double>(race.faults(index))};
+    rivals(car, race.cars(), race.cars_number(), race.track().length,
+           reading.race.data() + (RACE_NUMBERS - RIVAL_NUMBERS));
     if (noise_) add_noise(*noise_, reading.range_finders.data(), reading.opponents.data());
     return reading;
 }

@@ -19,6 +19,7 @@ constexpr int SCALARS = 23;
 constexpr int GEAR_SCALAR = 15;
 constexpr int LAPS_SCALAR = 18;
 constexpr int POSITION_SCALAR = 22;
+constexpr int RACE_NUMBERS = 5 + RIVAL_NUMBERS;
 
 using Angles = std::array<double, RANGE_FINDERS>;  // [rad] left negative
 
@@ -27,6 +28,7 @@ struct Reading {
     std::array<double, 4> wheel_speeds;
     std::array<double, RANGE_FINDERS> range_finders;
     std::array<double, OPPONENT_SECTORS> opponents;
+    std::array<double, RACE_NUMBERS> race;  // see sb3_torcs.car.CarState
 };
 
 // A race at one moment, with its sensors' noise.

@@ -570,6 +570,7 @@ void Race::step() {
     simulation_.update(&situation, PHYSICS_STEP, -1);
     for (int i = 0; i < situation.cars_number; i++) manage(*world_->order[i]);
     sort();
+    if (situation.cars_number > 1) watch_contacts();
 }
 
 // The game's tyre model divides by zero if a wheel moves sideways and its forward speed is exactly
@@ -706,6 +707,17 @@ float Race::height(int index) const { return height_over_road(field(), car(index
 
 double Race::distance_raced(int index) const {
     return world_->cars[index].race.distance_raced - world_->records[index].start_distance;
+}
+
+double Race::gap(int index, int places) const {
+    const int other = car(index).race.position - 1 + places;
+    if (other < 0 || other >= cars_number()) return SENSOR_RANGE;
+    const float behind = world_->order[other]->race.distance_raced - car(index).race.distance_raced;
+    return std::fabs(static_cast<double>(behind));
+}
+
+int Race::laps_left(int index) const {
+    return world_->situation.laps - std::max(car(index).race.crossings - 1, 0);
 }
 
 std::vector<LapRecord> Race::laps(int index) const {

@@ -138,6 +138,11 @@ public:
     }
     float height(int index) const;           // [m] of the mass centre above the road
     double distance_raced(int index) const;  // [m] since the start
+    // To the car a place before (-1) or after (1), [m] of road; SENSOR_RANGE if there is none.
+    double gap(int index, int places) const;
+    int laps_left(int index) const;  // MANY_LAPS in a race without an end
+    int contacts(int index) const { return world_->records[index].contacts; }  // with other cars
+    int faults(int index) const { return world_->records[index].faults; }      // own ones of these
     std::vector<LapRecord> laps(int index) const;
     std::vector<Result> results() const;  // in the order of a race's standings
 
@@ -153,6 +158,8 @@ private:
         double start_distance;  // [m] by the race's count, where the episode began
         bool finished;          // drove all its laps
         bool flying;            // began on the way: the first crossing starts the clock
+        int contacts, faults;   // with other cars; of these by its own fault
+        double contact_time;    // [s] of the last moment of contact
         LapRecord* laps;
         int laps_number, laps_room;
     };
@@ -219,6 +226,8 @@ private:
     void check_pit_lane(CarElement& car, Record& record);
     void add_penalty(CarElement& car, int kind);
     void sort();
+    void watch_contacts();
+    void note_contact(const CarElement& car, const CarElement& other);
 
     std::uint64_t number_;
     Game& game_;

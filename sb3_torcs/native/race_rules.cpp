@@ -23,6 +23,28 @@ enum LaneState : int {
     WAS_IN_ILLEGALLY = 0x20000,
 };
 
+bool is_touching(const CarElement& car) {
+    return car.priv.collision & COLLISION_WITH_BODY && !(car.pub.status & NOT_SIMULATED);
+}
+
+double diagonal(const CarElement& car) {
+    return std::hypot(car.info.dimension.x, car.info.dimension.y);
+}
+
+bool near(const CarElement& a, const CarElement& b) {
+    constexpr double SLACK = 0.5;  // [m] that cars are moved apart in a step
+    const Pose &here = a.pub.local.pos, &there = b.pub.local.pos;
+    const double apart = std::hypot(there.x - here.x, there.y - here.y);
+    return apart < 0.5 * (diagonal(a) + diagonal(b)) + SLACK;
+}
+
+bool lies_before(const CarElement& car, const CarElement& other) {
+    constexpr double FRONT = 0.25 * M_PI;  // [rad] to either side
+    const Pose &here = car.pub.local.pos, &there = other.pub.local.pos;
+    const double direction = std::atan2(there.y - here.y, there.x - here.x);
+    return std::fabs(std::remainder(direction - here.az, 2.0 * M_PI)) < FRONT;
+}
+
 }  // namespace
 
 void Race::manage(CarElement& car) {
@@ -137,6 +159,30 @@ void Race::sort() {
         }
     }
     if (all_finished) situation.state = ENDED;
+}
+
+// ---- Contacts -----------------------------------------------------------------------------------
+
+// The simulation says which cars have hit something in this step; who is near has hit each other.
+void Race::watch_contacts() {
+    for (int i = 0; i < cars_number(); i++) {
+        if (!is_touching(car(i))) continue;
+        for (int j = 0; j < cars_number(); j++)
+            if (j != i && is_touching(car(j)) && near(car(i), car(j))) note_contact(car(i), car(j));
+    }
+}
+
+// Cars that rub against each other for a while have one contact. It is the fault of a car that hits
+// the other with its front.
+void Race::note_contact(const CarElement& car, const CarElement& other) {
+    constexpr double PAUSE = 0.5;  // [s] without a touch, after which it is another contact
+    Record& record = world_->records[car.index];
+    const double now = world_->situation.time;
+    if (record.contacts == 0 || now - record.contact_time > PAUSE) {
+        record.contacts++;
+        if (lies_before(car, other)) record.faults++;
+    }
+    record.contact_time = now;
 }
 
 // ---- Pits ---------------------------------------------------------------------------------------

@@ -215,6 +215,55 @@ void opponents(const CarElement& car, CarElement* const* cars, int number, doubl
     }
 }
 
+// ---- Rivals ------------------------------------------------------------------------------------
+
+namespace {
+
+// A car's velocity along the road and to its left, [m/s].
+Vector road_velocity(const CarElement& car) {
+    const double heading = road_heading(car.pub.track);
+    const Vector along = {std::cos(heading), std::sin(heading)};
+    const Vector velocity = {car.pub.global.vel.x, car.pub.global.vel.y};
+    return {dot(velocity, along), cross(along, velocity)};
+}
+
+}  // namespace
+
+void rivals(const CarElement& car, CarElement* const* cars, int number, double track_length,
+            double* numbers) {
+    std::fill_n(numbers, RIVALS, SENSOR_RANGE);
+    std::fill_n(numbers + RIVALS, RIVAL_NUMBERS - RIVALS, 0.0);
+    if (number < 2) return;
+    const CarElement* nearest[RIVALS];
+    int found = 0;
+    for (int i = 0; i < number; i++) {
+        const CarElement& other = *cars[i];
+        if (&other == &car || (other.pub.status & NOT_SIMULATED & ~IN_PIT) != 0) continue;
+        const double ahead =
+            std::remainder(distance_from_start(other) - distance_from_start(car), track_length);
+        int place = found;
+        while (place > 0 && std::abs(ahead) < std::abs(numbers[place - 1])) place--;
+        if (place == RIVALS || !(std::abs(ahead) < SENSOR_RANGE)) continue;
+        for (int j = std::min(found, RIVALS - 1); j > place; j--) {
+            numbers[j] = numbers[j - 1];
+            nearest[j] = nearest[j - 1];
+        }
+        numbers[place] = ahead;
+        nearest[place] = &other;
+        found = std::min(found + 1, RIVALS);
+    }
+    const Vector own = road_velocity(car);
+    for (int i = 0; i < found; i++) {
+        const CarElement& other = *nearest[i];
+        const Vector faster = road_velocity(other) - own;
+        numbers[RIVALS + i] = double(other.pub.track.to_middle) - car.pub.track.to_middle;
+        numbers[2 * RIVALS + i] = faster.x;
+        numbers[3 * RIVALS + i] = faster.y;
+        numbers[4 * RIVALS + i] = other.info.dimension.x;
+        numbers[5 * RIVALS + i] = other.info.dimension.y;
+    }
+}
+
 // ---- Noise -------------------------------------------------------------------------------------
 
 // SplitMix64 (Steele, Lea and Flood 2014, doi 10.1145/2660193.2660195).

@@ -44,6 +44,14 @@ void focused_range_finders(const CarElement& car, double direction, double* dist
 // in its pit is.
 void opponents(const CarElement& car, CarElement* const* cars, int number, double* distances);
 
+// The cars that are nearest along the road, within SENSOR_RANGE, the nearest first: in a block for
+// each, (1) how far ahead they are along the road [m], SENSOR_RANGE where there is none, (2) how
+// far to the left [m], (3) and (4) how much faster that way [m/s], (5) their length and (6) width
+// [m].
+constexpr int RIVALS = 4, RIVAL_NUMBERS = 6 * RIVALS;
+void rivals(const CarElement& car, CarElement* const* cars, int number, double track_length,
+            double* numbers);
+
 // A seeded stream of random numbers, the same on every machine (but for the last digit of the
 // mathematical library's log and cos). Its state is one number: a copy goes on alike.
 class Generator {

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from sb3_torcs.car import CONTROL_TICK, CarState, FloatArray
+from sb3_torcs.car import CONTROL_TICK, NO_RACE, CarState, FloatArray
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.scr.protocol import ScrState
 from sb3_torcs.tracks.track import WIDTH_END, WIDTH_START, Track
@@ -102,7 +102,7 @@ class CarReader:
             state.engine_speed, state.gear, state.fuel, state.damage,
             self._laps, state.lap_time, state.last_lap_time, self._best, state.race_position,
             _read_only(state.wheel_speeds), _read_only(state.range_finders),
-            _read_only(state.opponents),
+            _read_only(state.opponents), NO_RACE,
         )  # fmt: skip
         return CarState._make(values)
 

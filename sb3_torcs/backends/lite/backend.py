@@ -13,7 +13,7 @@ from sb3_torcs.backends.lite import physics
 from sb3_torcs.backends.lite.car import TOP_GEAR
 from sb3_torcs.backends.lite.rays import RANGE, Edges, road_edges
 from sb3_torcs.backends.lite.road import road_width
-from sb3_torcs.car import DEFAULT_CAR, CarState, Controls, FloatArray, Start
+from sb3_torcs.car import DEFAULT_CAR, NO_RACE, CarState, Controls, FloatArray, Start
 from sb3_torcs.errors import CarLost, InvalidOption
 from sb3_torcs.sensors import RangeFinderName, range_finder_angles
 from sb3_torcs.torcs.track_names import RANDOM_TRACK
@@ -145,7 +145,7 @@ class LiteBackend:
         values = scalars.tolist()
         values[physics.GEAR_FIELD] = int(values[physics.GEAR_FIELD])
         values[physics.LAPS_FIELD] = int(values[physics.LAPS_FIELD])
-        return CarState._make((*values, 1, wheels, beams, opponents))
+        return CarState._make((*values, 1, wheels, beams, opponents, NO_RACE))
 
 
 def _with_grip(table: FloatArray, grip: float) -> FloatArray:

@@ -14,7 +14,7 @@ from numba import njit
 from sb3_torcs.backends.lite import physics
 from sb3_torcs.backends.lite.backend import LiteBackend
 from sb3_torcs.backends.lite.rays import RANGE, Edges
-from sb3_torcs.car import CarState, Controls, FloatArray
+from sb3_torcs.car import NO_RACE, CarState, Controls, FloatArray
 from sb3_torcs.errors import EngineForked
 
 __all__ = ["LiteFleet"]
@@ -25,6 +25,7 @@ Road = tuple[FloatArray, Edges]
 WHEELS = physics.SCALARS + 1  # first column of the wheels, after the place in the race
 BEAMS = WHEELS + 4
 OPPONENTS = BEAMS + 19
+RACE = OPPONENTS + 36
 
 
 @njit(cache=True, nogil=True)
@@ -59,7 +60,7 @@ def _drive(
     :param flying: (worlds,) whether the episode began elsewhere than on the grid
     :param controls: (n, 5)
     :param ticks: (n,) control ticks
-    :param cars: (n, 82) filled
+    :param cars: (n, 111) filled
     :param lost: (n,) filled: whether the physics has given NaN
     """
     for row in rows:
@@ -82,7 +83,8 @@ def _drive(
             car[BEAMS:OPPONENTS],
         )
         car[physics.SCALARS] = 1.0  # there are no opponents in this world
-        car[OPPONENTS:] = RANGE
+        car[OPPONENTS:RACE] = RANGE
+        car[RACE:] = NO_RACE
 
 
 class LiteFleet:
