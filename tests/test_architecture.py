@@ -21,7 +21,7 @@ PACKAGE = Path(__file__).parent.parent / "sb3_torcs"
 FILES = sorted(PACKAGE.rglob("*.py"))
 
 MAX_MODULES = 14  # at the top of the package
-MAX_FOLDERS = 15  # of Python there; beside them stands native/, the C++
+MAX_FOLDERS = 16  # of Python there, races of many drivers the last; beside them native/, the C++
 MAX_CODE_LINES = 300
 LONGER_FILES = {
     "backends/lite/physics.py": 320,  # one physics step is one piece
@@ -38,7 +38,7 @@ FLOORS = (
     {"backends"},
     {"envs"},
     {"agents", "vec_env"},
-    {"callbacks", "evaluation"},
+    {"callbacks", "evaluation", "races"},
     {"training"},
     {"bench", "studies"},
     {"cli", "progress", "rl_zoo", "zoo"},
@@ -73,6 +73,7 @@ USES_A_NETWORK = {"rendering/game_camera.py", "scr/client.py", "scr/server.py", 
 LOADS_THE_ENGINE = {"backends/native.py", "torcs/trial_child.py"}
 ASKS_DRIVERS = {
     "agents/models.py",  # hands on what it is asked
+    "agents/pilots.py",  # several at once, in one race
     "agents/rollout.py",
     "bench/torcs.py",  # on threads, where nobody looks at what is driven
     "callbacks/metrics.py",  # hands on, for all cars of a vector

@@ -20,6 +20,7 @@ from sb3_torcs.cli import (
     evaluate,
     install_torcs,
     optimize_lap,
+    race,
     report,
     robots,
     serve,
@@ -40,7 +41,7 @@ INTERRUPTED = 130
 READER_LEFT = 141
 VERBS = (
     doctor, install_torcs, tracks, train, evaluate, compare, watch, optimize_lap, study, report,
-    robots, serve, compete, bench,
+    robots, race, serve, compete, bench,
 )  # fmt: skip
 
 

@@ -1,0 +1,123 @@
+"""Agents that drive cars of one race: their policies are asked at once, if they are the same."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from sb3_torcs.agents.ghosts import is_ghost
+from sb3_torcs.agents.models import driver_record, load_driver
+from sb3_torcs.agents.wrapping import wrapped
+from sb3_torcs.backends.seats import SharedRace
+from sb3_torcs.car import DEFAULT_CAR, FloatArray
+from sb3_torcs.envs.torcs_race import RaceCarEnv
+from sb3_torcs.errors import InvalidAction, InvalidOption, ModelMismatch
+from sb3_torcs.sensors import range_finder_angles
+
+__all__ = ["CarOfAnAgent", "Pilots"]
+
+SEEN = ("action_repeat", "sensors", "action")
+"""What an agent drives with as in its training, besides its car, gearbox and range finders."""
+
+
+class CarOfAnAgent:
+    """
+    What an agent's car needs before its race is loaded.
+
+    :param driver: as of :func:`~sb3_torcs.agents.models.load_driver`
+    :raises InvalidOption: if there is no such driver, or it is a ghost
+    """
+
+    def __init__(self, driver: str) -> None:
+        if is_ghost(driver):
+            raise InvalidOption(f"'{driver}' is a ghost, which looks at nobody and cannot race")
+        self.driver = driver
+        self.record = driver_record(driver)
+        kwargs = self.record.env_kwargs
+        car = kwargs.get("car", DEFAULT_CAR)
+        self.car: str = car if isinstance(car, str) else DEFAULT_CAR
+        self.gearbox: str = kwargs.get("gearbox", "automatic")
+        self.angles: FloatArray = range_finder_angles(kwargs.get("range_finders", "scr"))
+
+
+class Pilots:
+    """
+    The agents of a race that is loaded.
+
+    :param cars: of the agents
+    :param race: in which they have the seats, in the same order
+    :param trust: load models as SB3 does, which runs code that is pickled in them
+    :raises ModelMismatch: if an agent does not fit, or was trained behind wrappers that have to
+        see each timestep
+    """
+
+    def __init__(self, cars: Sequence[CarOfAnAgent], race: SharedRace, trust: bool = False) -> None:
+        self._race = race
+        self._envs = [
+            RaceCarEnv(seat, **car.record.kept(SEEN))
+            for car, seat in zip(cars, race.seats, strict=True)
+        ]
+        self._teams: dict[str, list[int]] = {}
+        self._drivers: dict[str, Any] = {}
+        self._states: dict[str, Any] = {}
+        for number, (car, env) in enumerate(zip(cars, self._envs, strict=True)):
+            self._teams.setdefault(car.driver, []).append(number)
+            if car.driver not in self._drivers:
+                if wrapped(env, car.record.hyperparameters, trust=trust) is not env:
+                    raise ModelMismatch(
+                        f"'{car.driver}' was trained behind a wrapper of its environment, which "
+                        "cannot be put around one car of several; race an agent without one"
+                    )
+                self._drivers[car.driver] = load_driver(car.driver, env, trust=trust)
+        self.failed: dict[int, str] = {}
+        """Agents that were taken out of the race, and why."""
+
+    def begin(self, seed: int) -> None:
+        """
+        Begin the race on the grid.
+
+        :param seed: of the environments
+        """
+        for env in self._envs:
+            env.reset(seed=seed)
+        self._states = {}
+
+    def act(self, tick: int) -> int:
+        """
+        Ask the agents whose timestep begins, and let their cars hold the answers. A car whose agent
+        answers no number is taken out of the race.
+
+        :param tick: control ticks that have been driven
+        :return: control ticks until the next agent has to be asked
+        """
+        for driver, team in self._teams.items():
+            if tick % self._envs[team[0]].action_repeat == 0:
+                self._ask(driver, team, np.full(len(team), tick == 0))
+        return min(env.action_repeat - tick % env.action_repeat for env in self._envs)
+
+    def _ask(self, driver: str, team: list[int], begins: Any) -> None:
+        worlds = [self._race.world(number) for number in team]
+        seen = [
+            self._envs[number].view.encode(world.engine.read(world.seat), self._race.seats[number])
+            for number, world in zip(team, worlds, strict=True)
+        ]
+        actions, self._states[driver] = self._drivers[driver].predict(
+            np.stack(seen), self._states.get(driver), begins, deterministic=True
+        )
+        for number, world, action in zip(team, worlds, actions, strict=True):
+            if number in self.failed:
+                continue
+            try:
+                ((controls, _),) = self._envs[number].begin_step(action)
+            except InvalidAction as error:
+                self.failed[number] = str(error)
+                world.engine.retire(world.seat)
+                continue
+            world.engine.hold(world.seat, *controls)
+
+    def close(self) -> None:
+        """Close the race."""
+        for env in self._envs:
+            env.close()

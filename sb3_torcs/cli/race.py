@@ -1,0 +1,145 @@
+"""``sb3-torcs race``: agents and robots against each other, and who is better."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sb3_torcs.cli.common import (
+    MODEL_HELP,
+    TRUST_HELP,
+    positive,
+    print_json,
+    quiet_output,
+    seed,
+    table,
+)
+from sb3_torcs.files import writable_file
+
+if TYPE_CHECKING:
+    from sb3_torcs.races.protocol import Race
+
+__all__ = ["add_parser", "run"]
+
+PICTURES = (".png", ".svg", ".pdf")
+GRIDS = ("last", "reverse", "random")
+HEADERS = ("driver", "races", "wins", "win rate", "mean place", "finished", "damage/km", "rating")
+LAST_RACE = ("place", "driver", "from", "laps", "time s", "best lap s", "damage", "contacts")
+
+DESCRIPTION = """\
+Let drivers race against each other: robots of the game, shipped agents, files of trained ones. Each
+agent sees and drives as in its training; the rules and the flag are the game's.
+
+Drivers and worlds are deterministic, so races differ by the grid, which is drawn from the seed of
+each race: --grid last puts the first driver behind all others, whose order is drawn; random draws
+all; reverse begins each race in the reverse order of the standings before. With --field N each race
+holds the first driver and N - 1 of the others, who are drawn.
+
+A win rate comes with its 95 % interval. Ratings are those of openskill (Plackett-Luce).
+"""
+
+
+def add_parser(subparsers: Any) -> None:
+    """
+    :param subparsers: of the command
+    """
+    parser = subparsers.add_parser(
+        "race",
+        help="race agents and robots against each other",
+        description=DESCRIPTION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add("drivers", nargs="+", metavar="DRIVER",
+        help=f"{MODEL_HELP}; or a robot, e.g. inferno or bt:3")  # fmt: skip
+    add("--track", default="aalborg", metavar="T", help="the track; default: aalborg")
+    add("--laps", type=positive, default=5, metavar="N", help="laps of a race; default: 5")
+    add("--races", type=positive, default=20, metavar="N", help="races to hold; default: 20")
+    add("--grid", choices=GRIDS, default="last", help="who starts where; default: last")
+    add("--field", type=positive, metavar="N", help="cars in a race; default: all drivers")
+    add("--seed", type=seed, default=0, metavar="S", help="of the first race; default: 0")
+    add("--picture", metavar="FILE",
+        help="draw place and gap over distance of the last race (.png, .svg, .pdf)")  # fmt: skip
+    add("--trust", action="store_true", help=TRUST_HELP)
+    add("--json", action="store_true", help="print one JSON object and nothing else")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """
+    :param args: from the command line
+    :return: the exit status
+    """
+    picture = None if args.picture is None else writable_file(args.picture, PICTURES)
+    with quiet_output(args.json):
+        races = _held(args)
+        if picture is not None:
+            from sb3_torcs.races.picture import draw_race
+
+            draw_race(races[-1], picture)
+    for race in races:
+        for driver, why in race.failures.items():
+            print(f"sb3-torcs: race {race.seed}: {driver} is out: {why}", file=sys.stderr)
+    if args.json:
+        print_json(_as_json(args, races))
+    else:
+        _show(races, picture)
+    return 0
+
+
+def _held(args: argparse.Namespace) -> list[Race]:
+    """Hold the races, behind a progress bar."""
+    from tqdm import tqdm
+
+    from sb3_torcs.races.entrants import find_entrants
+    from sb3_torcs.races.protocol import run_races
+    from sb3_torcs.torcs.installation import find_game
+
+    entrants = find_entrants(args.drivers, find_game())
+    races = run_races(
+        entrants, args.track, laps=args.laps, races=args.races, grid=args.grid,
+        field_size=args.field, seed=args.seed, trust=args.trust,
+    )  # fmt: skip
+    return list(tqdm(races, total=args.races, file=sys.stderr, leave=False, disable=None))
+
+
+def _as_json(args: argparse.Namespace, races: list[Race]) -> dict[str, Any]:
+    from sb3_torcs.races.standings import driver_figures
+
+    return {
+        "track": args.track,
+        "laps": args.laps,
+        "grid": args.grid,
+        "races": [
+            {"seed": race.seed, "standings": [standing.as_dict() for standing in race.standings]}
+            for race in races
+        ],
+        "drivers": driver_figures(races),
+    }
+
+
+def _show(races: list[Race], picture: Path | None) -> None:
+    """Print the figures of the drivers, and the standings of the last race."""
+    from sb3_torcs.races.standings import driver_figures
+
+    print(table(HEADERS, [
+        (
+            f["driver"], str(f["races"]), str(f["wins"]),
+            "{1:.0%} ({0:.0%} to {2:.0%})".format(*f["win_rate"]), f"{f['mean_place']:.2f}",
+            str(f["finished"]), f"{f['damage_per_km']:.0f}", "{:.1f} ± {:.1f}".format(*f["rating"]),
+        )
+        for f in driver_figures(races)
+    ]))  # fmt: skip
+    print(f"\nrace {races[-1].seed}")
+    print(table(LAST_RACE, [
+        (
+            "out" if s.out else str(s.place), s.driver, str(s.grid_slot), str(s.laps),
+            f"{s.time:.3f}", "-" if s.best_lap is None else f"{s.best_lap:.3f}",
+            f"{s.damage:.0f}", str(s.contacts),
+        )
+        for s in races[-1].standings
+    ]))  # fmt: skip
+    if picture is not None:
+        print(f"picture: {picture}")

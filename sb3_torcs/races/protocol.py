@@ -1,0 +1,213 @@
+"""Races as the game holds them: a grid, laps, the flag, and the standings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Any, Literal, get_args
+
+import numpy as np
+
+from sb3_torcs.agents.pilots import Pilots
+from sb3_torcs.backends.native import load_race
+from sb3_torcs.backends.seats import SeatWorld, SharedRace
+from sb3_torcs.car import CONTROL_TICK
+from sb3_torcs.errors import InvalidOption
+from sb3_torcs.races.entrants import Entrant
+from sb3_torcs.torcs.starting_list import GRID_SLOTS
+
+if TYPE_CHECKING:
+    from sb3_torcs._engine import Engine
+
+__all__ = ["GRIDS", "GridName", "Race", "Standing", "run_race", "run_races"]
+
+GridName = Literal["last", "reverse", "random"]
+GRIDS = get_args(GridName)
+
+LOOK = 50  # [control ticks] a second, after which the race is looked at
+SLOWEST = 10.0  # [m/s] below which the game takes a car out, for a lap and ...
+PIT_STOP = 84.5  # [s] ... for a stop in it
+
+
+@dataclass(frozen=True)
+class Standing:
+    """Where a driver came in a race."""
+
+    driver: str
+    place: int
+    grid_slot: int
+    laps: int
+    time: float  # [s] with penalties, of whole laps
+    best_lap: float | None  # [s] of those that count
+    damage: float  # [points]
+    contacts: int  # with other cars
+    out: bool  # did not finish
+    distance: float = field(repr=False, default=0.0)  # [m]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the fields as the command prints them."""
+        fields = asdict(self)
+        del fields["distance"]
+        return fields
+
+
+@dataclass(frozen=True)
+class Race:
+    """One race. A row of the trace is a moment, a column a grid slot."""
+
+    seed: int
+    standings: list[Standing]  # the winner first
+    failures: dict[str, str]  # drivers that were taken out for what they answered
+    drivers: list[str]  # by grid slot
+    distances: Any  # (moments, cars) [m] raced
+    places: Any  # (moments, cars)
+
+
+def run_races(
+    entrants: Sequence[Entrant],
+    track: str,
+    *,
+    laps: int,
+    races: int,
+    grid: GridName = "last",
+    field_size: int | None = None,
+    seed: int = 0,
+    trust: bool = False,
+) -> Iterator[Race]:
+    """
+    Hold races one after the other.
+
+    Worlds and drivers are deterministic, so what differs between races is the grid, and with
+    ``field_size`` who stands on it; both are drawn from the seed of the race.
+
+    :param entrants: the drivers; the first one takes part in every race
+    :param track: as of ``Torcs-v0``
+    :param laps: of each race
+    :param races: their number
+    :param grid: ``"last"``: the first driver behind all others, who are drawn; ``"random"``: all
+        are drawn; ``"reverse"``: in the reverse order of the race before, the first one drawn
+    :param field_size: cars in each race, the others are drawn; ``None`` is all
+    :param seed: of the first race; the others have the next ones
+    :param trust: as of :class:`~sb3_torcs.agents.pilots.Pilots`
+    :raises InvalidOption: if no such races can be held
+    """
+    if grid not in GRIDS:
+        raise InvalidOption(f"grid is {grid!r}; expected one of {', '.join(map(repr, GRIDS))}")
+    size = len(entrants) if field_size is None else field_size
+    if not 1 <= size <= min(len(entrants), GRID_SLOTS):
+        raise InvalidOption(
+            f"{len(entrants)} drivers, {size} in a race; expected no more than there are, and 1 to "
+            f"{GRID_SLOTS}, which is what a grid has room for"
+        )
+    before: list[str] = []
+    for number in range(races):
+        rng = np.random.default_rng(seed + number)
+        order = _grid(entrants, size, grid, before, rng)
+        race = run_race(order, track, laps=laps, seed=seed + number, trust=trust)
+        before = [standing.driver for standing in race.standings]
+        yield race
+
+
+def _grid(
+    entrants: Sequence[Entrant],
+    size: int,
+    grid: GridName,
+    before: list[str],
+    rng: np.random.Generator,
+) -> list[Entrant]:
+    """Draw who stands on the grid, and where; the one in front comes first."""
+    others = [entrants[1 + i] for i in rng.permutation(len(entrants) - 1)[: size - 1]]
+    if grid == "last":
+        return [*others, entrants[0]]
+    order = [[entrants[0], *others][i] for i in rng.permutation(size)]
+    if grid == "reverse" and before:
+        order.sort(key=lambda e: -before.index(e.name) if e.name in before else 0)
+    return order
+
+
+def run_race(
+    order: Sequence[Entrant],
+    track: str,
+    *,
+    laps: int,
+    seed: int = 0,
+    trust: bool = False,
+    watch: Callable[[Engine, list[str]], None] | None = None,
+) -> Race:
+    """
+    Hold a race by the game's rules: who crosses the line after the winner has finished.
+
+    :param order: the drivers, the one in front first
+    :param track: as of ``Torcs-v0``
+    :param laps: to drive
+    :param seed: which is kept with the race
+    :param trust: as of :class:`~sb3_torcs.agents.pilots.Pilots`
+    :param watch: called after each stretch that is driven, with the engine and the drivers' names
+    :raises ModelMismatch: if an agent does not fit this race
+    """
+    agents = [entrant.agent for entrant in order if entrant.agent is not None]
+    numbers = iter(range(len(agents)))
+    entries = [entrant.robot or ("", next(numbers)) for entrant in order]
+    engine, road = load_race(
+        track,
+        entries,
+        cars=[agent.car for agent in agents],
+        gearboxes=[agent.gearbox for agent in agents],
+        angles=[agent.angles for agent in agents],
+        laps=laps,
+        flagged=True,
+    )
+    names = [entrant.name for entrant in order]
+    pilots: Pilots | None = None
+    moments: list[list[tuple[float, int]]] = []
+    try:
+        if agents:
+            grid = [
+                SeatWorld(engine, seat, road, agent.angles)
+                for seat, agent in zip(engine.agents, agents, strict=True)
+            ]
+            pilots = Pilots(agents, SharedRace([grid]), trust)
+            pilots.begin(seed)
+        else:
+            engine.start()
+        limit = (laps + 1) * (PIT_STOP + road.length / SLOWEST)
+        for _ in _stretches(engine, pilots, limit):
+            cars = [engine.read(number) for number in range(len(order))]
+            moments.append([(car.distance_raced, car.race_position) for car in cars])
+            if watch is not None:
+                watch(engine, names)
+        standings = _standings(engine, names)
+        failed = {} if pilots is None else pilots.failed
+        seats = engine.agents
+        failures = {names[seats[number]]: why for number, why in failed.items()}
+    finally:
+        engine.close()
+    trace = np.array(moments)
+    return Race(seed, standings, failures, names, trace[..., 0], trace[..., 1].astype(int))
+
+
+def _stretches(engine: Engine, pilots: Pilots | None, limit: float) -> Iterator[None]:
+    """Drive to the end of the race, a second at a time."""
+    tick = 0
+    while tick * CONTROL_TICK < limit and not engine.ended:
+        look = tick + LOOK
+        while tick < look and not engine.ended:
+            ticks = look - tick if pilots is None else min(pilots.act(tick), look - tick)
+            engine.drive(ticks)
+            tick += ticks
+        yield
+        if all(out or engine.finished(car) for car, *_, out in engine.results()):
+            return
+
+
+def _standings(engine: Engine, names: Sequence[str]) -> list[Standing]:
+    standings = []
+    for place, (slot, laps, time, best, damage, _) in enumerate(engine.results(), start=1):
+        car = engine.read(slot)
+        standings.append(
+            Standing(
+                names[slot], place, slot + 1, laps, time, best or None, float(damage),
+                int(car.contacts), not engine.finished(slot), car.distance_raced,
+            )
+        )  # fmt: skip
+    return standings

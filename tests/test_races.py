@@ -1,0 +1,207 @@
+"""Races of agents and robots: the game's rules, seeded grids, honest figures."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from sb3_torcs.agents.robots import race as robots_race
+from sb3_torcs.agents.scripted import ScriptedDriver
+from sb3_torcs.cli import main
+from sb3_torcs.errors import InvalidOption
+from sb3_torcs.races.entrants import find_entrants
+from sb3_torcs.races.protocol import Race, Standing, run_race, run_races
+from sb3_torcs.races.ratings import ratings
+from sb3_torcs.races.standings import driver_figures, wilson
+
+SHORT = "g-track-1"
+
+
+def standing(driver, place, **changes):
+    values = {"laps": 1, "time": 80.0, "best_lap": None, "damage": 0.0, "contacts": 0, "out": False}
+    return Standing(driver, place, place, **{**values, **changes}, distance=2000.0)
+
+
+def held(*orders):
+    """Races that came out as said."""
+    return [
+        Race(seed, [standing(name, place) for place, name in enumerate(order, 1)], {}, [], 0, 0)
+        for seed, order in enumerate(orders)
+    ]
+
+
+def test_a_win_rate_is_wilson_s():
+    """3 of 20, by hand: the centre is (3 + 1.92) / (20 + 3.84)."""
+    low, rate, high = wilson(3, 20)
+    assert rate == 0.15
+    assert (low + high) / 2 == pytest.approx((3 + 1.920729) / (20 + 3.841459), rel=1e-5)
+    assert wilson(0, 5)[0] == 0.0
+    assert wilson(5, 5)[2] == 1.0
+
+
+def test_who_wins_more_has_the_higher_rating():
+    rated = ratings([["a", "b", "c"], ["a", "c", "b"], ["b", "a", "c"]])
+    assert rated["a"][0] > rated["b"][0] > rated["c"][0]
+    assert all(deviation < 25.0 / 3.0 for _, deviation in rated.values())
+
+
+def test_figures_are_sums_over_the_races_of_a_driver():
+    races = held(["a", "b"], ["b", "a"], ["a", "c"])
+    races[1].standings[1] = standing("a", 2, damage=600.0, out=True)
+    figures = {figure["driver"]: figure for figure in driver_figures(races)}
+    a = figures["a"]
+    assert (a["races"], a["wins"], a["finished"], a["mean_place"]) == (3, 2, 2, 4 / 3)
+    assert a["damage_per_km"] == 600.0 / 6.0
+    assert figures["c"]["races"] == 1
+
+
+def test_who_is_out_has_not_won():
+    (race,) = held(["a", "b"])
+    race.standings[0] = standing("a", 1, out=True)
+    assert {f["driver"]: f["wins"] for f in driver_figures([race])} == {"a": 0, "b": 0}
+
+
+class TestGrid:
+    @pytest.fixture
+    def grids(self, monkeypatch, game):
+        """Hold races in which all come in as they start; return who started where."""
+
+        def hold(order, track, **options):
+            (race,) = held([entrant.name for entrant in order])
+            return race
+
+        monkeypatch.setattr("sb3_torcs.races.protocol.run_race", hold)
+
+        def grids(drivers, **options):
+            entrants = find_entrants(drivers, game)
+            options = {"laps": 1, "races": 8, **options}
+            races = run_races(entrants, SHORT, **options)
+            return [[s.driver for s in race.standings] for race in races]
+
+        return grids
+
+    DRIVERS = ("inferno", "bt", "tita", "lliaw")
+
+    def test_the_first_driver_starts_last_and_the_others_are_drawn(self, grids):
+        found = grids(self.DRIVERS, grid="last")
+        assert {order[-1] for order in found} == {"inferno"}
+        assert len({tuple(order) for order in found}) > 2
+
+    def test_a_seed_is_a_grid(self, grids):
+        for grid in ("last", "random"):
+            found = grids(self.DRIVERS, grid=grid, seed=3)
+            assert found == grids(self.DRIVERS, grid=grid, seed=3)
+            assert found[1:] == grids(self.DRIVERS, grid=grid, seed=4, races=7)
+
+    def test_random_puts_the_first_driver_anywhere(self, grids):
+        found = grids(self.DRIVERS, grid="random")
+        assert len({order.index("inferno") for order in found}) > 1
+
+    def test_reverse_turns_the_standings_round(self, grids):
+        found = grids(self.DRIVERS, grid="reverse", races=3)
+        assert found[1] == found[0][::-1]
+        assert found[2] == found[0]
+
+    def test_a_field_is_drawn_of_the_others(self, grids):
+        found = grids(self.DRIVERS, field_size=2)
+        assert {len(order) for order in found} == {2}
+        assert {order[-1] for order in found} == {"inferno"}
+        assert len({order[0] for order in found}) > 1
+
+    @pytest.mark.parametrize(
+        ("options", "message"),
+        [
+            ({"field_size": 5}, "4 drivers, 5 in a race"),
+            ({"grid": "front"}, "grid is 'front'; expected one of 'last'"),
+        ],
+    )
+    def test_what_cannot_be_held(self, grids, options, message):
+        with pytest.raises(InvalidOption, match=message):
+            grids(self.DRIVERS, **options)
+
+
+@pytest.mark.parametrize(
+    ("drivers", "message"),
+    [
+        (["bt", "bt:2"], "driver 'bt' is named twice"),
+        (["ddpg-roads", "ddpg-roads"], "driver 'ddpg-roads' is named twice"),
+        (["infermo"], "infermo.*nor is it a robot of the game; did you mean 'inferno'"),
+        (["lap.npz"], "is a ghost, which looks at nobody"),
+    ],
+)
+def test_a_driver_that_cannot_take_part(drivers, message, game):
+    with pytest.raises(InvalidOption, match=message):
+        find_entrants(drivers, game)
+
+
+def test_robots_race_as_by_the_game_s_rules(game):
+    """The same order, times and damage as ``sb3-torcs robots``, which equals the game."""
+    robots = [("bt", 2), ("inferno", 3)]
+    race = run_race(find_entrants(["bt", "inferno"], game), SHORT, laps=2)
+    for one, other in zip(
+        race.standings, robots_race(robots, SHORT, 2, session="race"), strict=True
+    ):
+        assert (one.driver, one.laps) == (other.robot, other.laps_completed)
+        assert (one.time, one.best_lap, one.damage) == (
+            other.total_time, other.best_lap, other.damage,
+        )  # fmt: skip
+        assert not one.out
+
+
+def test_a_race_is_the_same_race_twice(game):
+    entrants = find_entrants(["scripted", "bt"], game)
+    one, other = (run_race(entrants, SHORT, laps=1) for _ in range(2))
+    assert one.standings == other.standings
+    assert np.array_equal(one.distances, other.distances)
+    assert [standing.driver for standing in one.standings] == ["bt", "scripted"]
+    assert one.places[-1].tolist() == [2, 1]
+
+
+def test_an_agent_that_answers_no_number_is_out_and_the_others_race_on(monkeypatch, game):
+    asked = []
+    predict = ScriptedDriver.predict
+
+    def failing(self, observation, *words, **options):
+        action, state = predict(self, observation, *words, **options)
+        asked.append(1)
+        return (action * np.nan if len(asked) > 50 else action), state
+
+    monkeypatch.setattr(ScriptedDriver, "predict", failing)
+    race = run_race(find_entrants(["scripted", "bt"], game), SHORT, laps=1)
+    first, second = race.standings
+    assert (first.driver, first.out, second.driver, second.out) == ("bt", False, "scripted", True)
+    assert "steering is nan" in race.failures["scripted"]
+
+
+def test_policies_of_one_driver_are_asked_at_once(monkeypatch, game):
+    """A row for each of its cars."""
+    shapes = []
+    predict = ScriptedDriver.predict
+    monkeypatch.setattr(
+        ScriptedDriver,
+        "predict",
+        lambda self, seen, *words, **options: (
+            shapes.append(seen.shape) or predict(self, seen, *words, **options)
+        ),
+    )
+    (entrant,) = find_entrants(["scripted"], game)
+    run_race([entrant, entrant, entrant], SHORT, laps=1)
+    assert set(shapes) == {(3, 29)}
+
+
+def test_the_command_prints_one_object(capsys, game, tmp_path):
+    picture = tmp_path / "race.svg"
+    words = ["race", "scripted", "bt", "--track", SHORT, "--laps", "1", "--races", "2", "--json"]
+    assert main([*words, "--picture", str(picture)]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert list(printed) == ["track", "laps", "grid", "races", "drivers"]
+    assert [race["seed"] for race in printed["races"]] == [0, 1]
+    assert list(printed["races"][0]["standings"][0]) == [
+        "driver", "place", "grid_slot", "laps", "time", "best_lap", "damage", "contacts", "out",
+    ]  # fmt: skip
+    assert printed["races"][0]["standings"][1]["grid_slot"] == 2
+    best = printed["drivers"][0]
+    assert (best["driver"], best["races"], best["wins"], best["win_rate"][1]) == ("bt", 2, 2, 1.0)
+    assert picture.stat().st_size > 1000
