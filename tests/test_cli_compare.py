@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import gymnasium as gym
@@ -17,6 +18,7 @@ from sb3_torcs.cli import main
 from sb3_torcs.evaluation import comparing
 from sb3_torcs.evaluation.comparing import compare
 from sb3_torcs.telemetry import DriveLog
+from sb3_torcs.torcs.track_names import BUNDLED_FOLDER
 from sb3_torcs.tracks.catalogue import load_track
 
 TRACK = "g-track-1"
@@ -124,6 +126,16 @@ def test_an_evaluation_makes_the_same_page(tmp_path, capsys):
     text = page.read_text()
     assert "There is one lap only" in text
     assert "From the grid, not flying: the lap of scripted." in text
+
+
+def test_a_track_may_be_somebodys_own_file(tmp_path, capsys):
+    own = tmp_path / "mine.csv"
+    shutil.copy(BUNDLED_FOLDER / "road" / "g-track-1.csv", own)
+    drives, page = tmp_path / "drives.parquet", tmp_path / "lap.html"
+    words = f"evaluate scripted --env TorcsLite-v0 --track {own} --laps 1 --telemetry {drives}"
+    assert main([*words.split(), "--report", str(page)]) == 0
+    assert page.read_text().startswith("<!DOCTYPE html>")
+    assert run(capsys, drives, "--track", own, "--html", page)[0] == 0
 
 
 def test_in_a_notebook_the_report_shows_itself(saved):

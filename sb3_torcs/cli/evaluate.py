@@ -107,7 +107,8 @@ def run(args: argparse.Namespace) -> int:
     if "report" in files:  # last: it is an error if there is no whole lap
         from sb3_torcs.evaluation.comparing import report_of
 
-        report_of(log.frame()).save(files["report"])
+        track = recorder.get_wrapper_attr("backend").track  # which may be of somebody's own file
+        report_of(log.frame(), track).save(files["report"])
     for what, path in files.items():
         if not args.json:
             print(f"{what}: {path}")

@@ -27,6 +27,7 @@ from sb3_torcs.telemetry.page import lap_report
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.track_names import RANDOM_TRACK
 from sb3_torcs.tracks.catalogue import load_track
+from sb3_torcs.tracks.track import Track
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -102,16 +103,18 @@ def compare(
     return LapReport(compare_drives(_told_apart(drives), load_track(where)))
 
 
-def report_of(frame: pd.DataFrame) -> LapReport:
+def report_of(frame: pd.DataFrame, track: Track | None = None) -> LapReport:
     """
     Make the lap report of drives that are there already, such as those of a race.
 
     :param frame: of a :class:`~sb3_torcs.telemetry.DriveLog`, on one track
+    :param track: which it is; ``None`` finds it by its name
     :return: the report; its first driver is the first of the table
     :raises DriveFileError: if nobody drove a whole lap
     """
     drives = drives_of(frame)
-    return LapReport(compare_drives(drives, load_track(_track(None, (), {"": drives}))))
+    name = _track(None, (), {"": drives})
+    return LapReport(compare_drives(drives, load_track(name) if track is None else track))
 
 
 def is_saved(driver: str | Path) -> bool:
@@ -153,9 +156,9 @@ def _track(
     return track
 
 
-def _same_track(one: str, other: str) -> bool:
-    """Whether two names are of one track."""
-    return one == other or load_track(one).name == load_track(other).name
+def _same_track(stored: str, track: str) -> bool:
+    """Whether the name in a drive is that of a track: with its category or without, or a path."""
+    return Path(stored).stem in (Path(track).stem, load_track(track).name)
 
 
 def _trained_on(drivers: Sequence[str | Path]) -> str:

@@ -177,11 +177,13 @@ def _corners(comparison: Comparison) -> str:
     groups = []
     for number, corner in enumerate(comparison.corners):
         side = "left" if corner.left else "right"
-        told = f"{number + 1}, {side}, {corner.begin:.0f} m, radius {corner.radius:.0f} m"
+        told = f"{number + 1}, {side}, {corner.begin:.0f} m"
+        radius = f'<span class="wide">, radius {corner.radius:.0f} m</span>'
+        place = Cell(told, html=told + radius)
         groups.append(
             [
-                [told if place == 0 else "", *_pass_cells(place, one, one.corners[number])]
-                for place, one in enumerate(comparison.drivers)
+                [place if row == 0 else "", *_pass_cells(row, one, one.corners[number])]
+                for row, one in enumerate(comparison.drivers)
             ]
         )
     return table(headers, groups, words=2)
