@@ -11,13 +11,16 @@ import pytest
 from stable_baselines3.common.buffers import ReplayBuffer
 
 import sb3_torcs  # noqa: F401  registers the environments
-from sb3_torcs.agents.ghosts import GhostDriver, demonstration, read_ghost
+from sb3_torcs.agents.ghosts import GhostDriver, demonstration, read_ghost, shipped_ghosts
 from sb3_torcs.agents.models import driver_name, driver_record, load_driver
+from sb3_torcs.agents.remote import Agent
 from sb3_torcs.backends.native import make_engine, make_rollouts
 from sb3_torcs.cli import main
 from sb3_torcs.errors import InvalidOption, ModelMismatch
 from sb3_torcs.evaluation import evaluate
+from sb3_torcs.scr.server import open_ports, start_server
 from sb3_torcs.torcs.installation import find_game
+from sb3_torcs.torcs.race_setup import RaceSetup
 from sb3_torcs.torcs.starting_list import AGENT
 from sb3_torcs.training import lap_search
 from sb3_torcs.training.lap_line import Line, lap_of, repeated
@@ -188,9 +191,8 @@ def test_a_lap_is_put_behind_itself():
 def test_a_ghost_is_read_as_it_was_written(ghost, file):
     read = read_ghost(file)
     np.testing.assert_array_equal(read.actions, ghost.actions)
-    assert (read.env_kwargs, read.lap_times, read.agent, read.rollouts) == (
-        ghost.env_kwargs, ghost.lap_times, "scripted", ghost.rollouts,
-    )  # fmt: skip
+    assert (read.env_kwargs, read.lap_times) == (ghost.env_kwargs, ghost.lap_times)
+    assert (read.agent, read.start, read.rollouts) == ("scripted", "inferno:3", ghost.rollouts)
     assert [path.name for path in file.parent.iterdir()] == ["ghost.npz"]
 
 
@@ -257,6 +259,26 @@ def test_a_demonstration_fits_a_replay_buffer(ghost):
     assert not rows.terminated.any()
     assert rows.truncated.tolist() == [False] * (len(rows.truncated) - 1) + [True]
     np.testing.assert_array_equal(rows.observations[1:], rows.next_observations[:-1])
+
+
+def test_over_the_scr_protocol_a_ghost_drives_the_same_laps(ghost, file):
+    sockets = open_ports(1)
+    port = sockets[0].getsockname()[1]
+    race = RaceSetup(TRACK, [("scr_server", 0)], 3)
+    with start_server(find_game(), race, sockets):
+        sockets[0].close()
+        agent = Agent(str(file), {"track": TRACK, "host": "127.0.0.1", "port": port})
+        agent.drive()
+    assert tuple(agent.lap_times) == ghost.lap_times
+
+
+@pytest.mark.parametrize("name", shipped_ghosts())
+def test_a_shipped_ghost_is_small_and_drives_the_laps_that_it_says(name):
+    shipped = read_ghost(name)
+    assert len(shipped.actions) < 5_000
+    with shipped.make_env() as env:
+        (race,) = evaluate(env, load_driver(name, env))
+    assert (race.end, race.damage, tuple(race.lap_times)) == ("laps", 0.0, shipped.lap_times)
 
 
 # ---- The command ----------------------------------------------------------------------------

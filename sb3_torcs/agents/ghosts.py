@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sb3_torcs.agents.rollout import Timestep, drive
-from sb3_torcs.errors import InvalidOption, ModelMismatch
+from sb3_torcs.errors import InvalidOption, ModelMismatch, near_miss
 from sb3_torcs.files import writable_file
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.track_names import find_track
@@ -29,9 +29,11 @@ __all__ = [
     "demonstration",
     "is_ghost",
     "read_ghost",
+    "shipped_ghosts",
 ]
 
 SUFFIX = ".npz"
+SHIPPED = Path(__file__).parents[1] / "data" / "ghosts"
 VERSION = 1
 MAX_SIZE = 2**24  # [bytes] of a ghost's file, and of what is in it
 AFTERWARDS = -0.3  # [-] the pedal of a ghost that has no actions left: it brakes
@@ -47,7 +49,8 @@ class Ghost:
     :param env_kwargs: of the ``Torcs-v0`` that it was driven in, track, car and laps among them
     :param actions: (timesteps, numbers of the action)
     :param lap_times: of its whole laps [s], the first one from the grid
-    :param agent: around whose drive it was searched
+    :param agent: in whose environment it was searched
+    :param start: whose drive the search began with: the agent's, or a robot's
     :param rollouts: candidates that were driven to find it
     """
 
@@ -55,6 +58,7 @@ class Ghost:
     actions: FloatArray
     lap_times: tuple[float, ...]
     agent: str
+    start: str
     rollouts: int
 
     def make_env(self) -> gym.Env[Any, Any]:
@@ -89,6 +93,7 @@ class Ghost:
             "env_kwargs": dict(self.env_kwargs),
             "lap_times": list(self.lap_times),
             "agent": self.agent,
+            "start": self.start,
             "rollouts": self.rollouts,
         }
         half = file.with_name(f".{file.name}.{os.getpid()}{SUFFIX}")
@@ -106,20 +111,27 @@ def is_ghost(driver: str | Path) -> bool:
 
     :param driver: a path, or the name of any driver
     """
-    return str(driver).lower().endswith(SUFFIX)
+    return str(driver).lower().endswith(SUFFIX) or str(driver) in shipped_ghosts()
+
+
+def shipped_ghosts() -> list[str]:
+    """List the ghosts that come with the package."""
+    return sorted(path.stem for path in SHIPPED.glob(f"*{SUFFIX}"))
 
 
 def read_ghost(path: str | Path) -> Ghost:
     """
     Read a ghost. Nothing is unpickled.
 
-    :param path: of the file
+    :param path: of the file, or the name of a shipped ghost, e.g. ``"ghost-aalborg"``
     :raises InvalidOption: if there is no such file
     :raises ModelMismatch: if it is not a ghost
     """
-    file = Path(os.path.expanduser(path))
+    shipped = SHIPPED / f"{path}{SUFFIX}"
+    file = shipped if str(path) in shipped_ghosts() else Path(os.path.expanduser(path))
     if not file.is_file():
-        raise InvalidOption(f"there is no ghost '{file}'; `sb3-torcs optimize-lap` makes one")
+        hint = near_miss(file.name, shipped_ghosts(), "`sb3-torcs optimize-lap` makes one")
+        raise InvalidOption(f"there is no ghost '{file}'{hint}")
     try:
         _check_size(file)
         with np.load(file, allow_pickle=False) as content:
@@ -150,7 +162,8 @@ def _ghost(actions: npt.NDArray[Any], record: Any) -> Ghost:
     if not np.isfinite(actions).all():
         raise ValueError("an action is not finite")
     times = tuple(float(time) for time in record["lap_times"])
-    return Ghost(kwargs, actions, times, str(record["agent"]), int(record["rollouts"]))
+    agent, start = str(record["agent"]), str(record["start"])
+    return Ghost(kwargs, actions, times, agent, start, int(record["rollouts"]))
 
 
 class GhostDriver:

@@ -26,7 +26,7 @@ __all__ = [
     "told_record",
 ]
 
-MODEL_HELP = "a saved .zip, a run's folder, a shipped agent, or 'scripted'"
+MODEL_HELP = "a saved .zip, a run's folder, a shipped agent, a ghost, or 'scripted'"
 
 TRUST_HELP = "run the code that is pickled in the model: only if you trust its author"
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
+import time
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
@@ -34,10 +36,10 @@ ghost. A ghost drives as any driver does: `sb3-torcs watch GHOST`, `sb3-torcs ev
 
 The search begins with the fastest of these drives: the agent's, and those of the robots that have
 the same car. It drives the race again and again. On the way it restores the engine's snapshots to
-try some dozen ways on, a few seconds far, and takes the best.
+try some ten ways on, a few seconds far, and takes the best.
 
-It uses all cores. With --rollouts the same seed finds the same ghost on any machine; what can be
-found in --seconds depends on the machine. Ctrl-C ends the search and keeps what was found.
+It uses all cores. With --rollouts the same seed finds the same ghost; what is found in --seconds
+depends on the machine, and is another ghost each time. Ctrl-C keeps what was found.
 """
 
 
@@ -52,7 +54,7 @@ def add_parser(subparsers: Any) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
-    add("agent", metavar="AGENT", help=MODEL_HELP)
+    add("agent", metavar="AGENT", help=f"in whose environment the ghost drives: {MODEL_HELP}")
     add("--track", metavar="T", help="default: that of the training, or aalborg")
     add("--car", metavar="C", help="default: that of the training, or car1-trb1")
     add("--seconds", type=positive, metavar="S",
@@ -82,11 +84,13 @@ def run(args: argparse.Namespace) -> int:
         kwargs["action_repeat"] = args.action_repeat
     name, track = driver_name(args.agent), str(kwargs["track"]).rpartition("/")[2]
     out = writable_file(args.out or f"ghost-{name}-{track.removesuffix('.xml')}.npz", (".npz",))
+    begun = time.monotonic()
     with quiet_output(args.json):
         ghost, state, stopped = _search(args, kwargs)
+    seconds = time.monotonic() - begun
     if ghost is None:
         raise InvalidOption(
-            f"no whole race was found in {state.rollouts} rollouts, {state.seconds:.0f} s; "
+            f"no whole race was found in {state.rollouts} rollouts, {seconds:.0f} s; "
             "give more --seconds"
         )
     ghost.write(out)
@@ -98,13 +102,13 @@ def run(args: argparse.Namespace) -> int:
         "standing_lap": standing,
         "flying_lap": min(flying),
         "rollouts": state.rollouts,
-        "seconds": round(state.seconds, 1),
+        "seconds": round(seconds, 1),
         "ghost": str(out),
     }
     if args.json:
         print_json(figures)
     else:
-        print(f"{track}, {kwargs['car']}: {state.rollouts} rollouts, {state.seconds:.0f} s")
+        print(f"{track}, {kwargs['car']}: {state.rollouts} rollouts, {seconds:.0f} s")
         rows = [(f"{number}", f"{time:.3f}") for number, time in enumerate(ghost.lap_times, 1)]
         print(table(HEADERS, rows))
         print(f"ghost: {out}")
@@ -116,6 +120,7 @@ def _search(args: argparse.Namespace, kwargs: dict[str, Any]) -> tuple[Ghost | N
     from sb3_torcs.training.lap_search import Budget, LapSearch
     from sb3_torcs.training.lap_starts import find_starts
 
+    begun = time.monotonic()
     starts = find_starts(args.agent, kwargs, alone=args.alone, trust=args.trust)
     first = starts[0]
     print(
@@ -123,8 +128,8 @@ def _search(args: argparse.Namespace, kwargs: dict[str, Any]) -> tuple[Ghost | N
         file=sys.stderr,
     )
     seconds = args.seconds or (None if args.rollouts else SECONDS)
-    limits = {"seconds": seconds, "rollouts": args.rollouts}
-    budget = Budget(**{name: limit for name, limit in limits.items() if limit})
+    left = math.inf if seconds is None else seconds - (time.monotonic() - begun)
+    budget = Budget(left, args.rollouts or math.inf)
     search = LapSearch(args.agent, kwargs, starts, seed=args.seed)
     stopped = False
     try:
