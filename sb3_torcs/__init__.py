@@ -9,7 +9,7 @@ from typing import Any
 
 from gymnasium.envs.registration import register, registry
 
-__all__ = ["__version__", "compare", "register_envs"]
+__all__ = ["__version__", "compare", "parallel_env", "register_envs"]
 
 __version__ = "0.1.0"
 
@@ -39,9 +39,13 @@ register_envs()
 
 
 def __getattr__(name: str) -> Any:
-    """Load ``sb3_torcs.compare`` when somebody asks for it."""
+    """Load ``compare`` and ``parallel_env`` when somebody asks for them."""
     if name == "compare":
         from sb3_torcs.evaluation.comparing import compare
 
         return compare
+    if name == "parallel_env":
+        from sb3_torcs.envs.parallel_env import parallel_env
+
+        return parallel_env
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

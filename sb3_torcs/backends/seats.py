@@ -162,6 +162,14 @@ class SharedRace:
         else:
             engine.start_at(*start)
 
+    def drive(self, ticks: int) -> None:
+        """
+        Drive the whole race on; each agent does what it holds.
+
+        :param ticks: control ticks of 0.02 s
+        """
+        self.world(0).engine.drive(ticks)
+
     def leave(self) -> None:
         """Close the race when the last seat is left."""
         self._open -= 1
@@ -223,6 +231,31 @@ class Seat:
             f"the {self.race.agents} agents of this race drive at once; step the whole vector "
             "environment"
         )
+
+    def hold(self, controls: Controls) -> None:
+        """
+        Say what the agent does from its next call on.
+
+        :param controls: finite and within their ranges
+        """
+        world = self.race.world(self.number)
+        world.engine.hold(world.seat, *controls)
+
+    def read(self) -> CarState:
+        """Return the car as it is."""
+        world = self.race.world(self.number)
+        return world.engine.read(world.seat)
+
+    def retire(self) -> None:
+        """Take the car off the road, until another race begins."""
+        world = self.race.world(self.number)
+        world.engine.retire(world.seat)
+
+    @property
+    def finished(self) -> bool:
+        """Whether the car was flagged off."""
+        world = self.race.world(self.number)
+        return world.engine.finished(world.seat)
 
     def close(self) -> None:
         """Leave the race, which is closed by the last one."""

@@ -11,7 +11,7 @@ from sb3_torcs.actions import ActionName, GearboxName, used_gearbox
 from sb3_torcs.backends.native import make_grid
 from sb3_torcs.backends.seats import Seat, SharedRace
 from sb3_torcs.backends.several import is_several
-from sb3_torcs.car import DEFAULT_CAR
+from sb3_torcs.car import DEFAULT_CAR, CarState
 from sb3_torcs.envs.racing import RacingEnv
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.sensors import RangeFinderName
@@ -31,6 +31,10 @@ class RaceCarEnv(RacingEnv):
         world: Any = seat  # whose track and car may not be set
         super().__init__(world, **options)
         self.seat = seat
+
+    def _end(self, car: CarState) -> str | None:
+        """Return why the episode ends; a car that is laps behind is flagged off with the others."""
+        return super()._end(car) or ("laps" if self.seat.finished else None)
 
 
 def make_race(

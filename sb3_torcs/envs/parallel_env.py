@@ -1,0 +1,195 @@
+"""Several agents in one race of the real TORCS, as PettingZoo's Parallel API has them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+from pettingzoo import ParallelEnv
+
+from sb3_torcs.car import CarState, is_count
+from sb3_torcs.envs.conditions import RESET_OPTIONS
+from sb3_torcs.envs.torcs_race import RaceCarEnv, make_race
+from sb3_torcs.errors import EnvClosed, InvalidAction, InvalidOption
+
+__all__ = ["TorcsParallelEnv", "parallel_env"]
+
+Observation = npt.NDArray[np.float32]
+Action = npt.NDArray[np.float32]
+
+MAX_STEPS = 3000  # timesteps, as of ``Torcs-v0``
+
+
+class TorcsParallelEnv(ParallelEnv[str, Observation, Action]):
+    """
+    A race of several agents, each with its own car, beside robots.
+
+    Observations, actions, rewards and ends are those of ``Torcs-v0``, for each agent. With
+    ``laps`` the race is flagged: who crosses the line after the winner has finished, too, and ends
+    with ``"laps"``. An agent whose episode ends leaves ``agents``, its car is taken off the road,
+    and the others race on. ``info`` holds besides what ``Torcs-v0`` tells the ``place``,
+    ``gap_ahead`` and ``gap_behind`` [m], ``contacts`` with other cars, and those by own ``faults``.
+
+    :param agents: their number
+    :param max_episode_steps: timesteps after which all are truncated; ``None`` is never
+    :param options: of :func:`~sb3_torcs.envs.torcs_race.make_race`
+    :raises InvalidOption: if an option has a value that is not allowed
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012
+        "name": "torcs_v0",
+        "render_modes": [],
+        "is_parallelizable": True,
+    }
+    render_mode = None
+
+    def __init__(
+        self, agents: int = 2, *, max_episode_steps: int | None = MAX_STEPS, **options: Any
+    ) -> None:
+        if max_episode_steps is not None and not is_count(max_episode_steps):
+            raise InvalidOption(
+                f"max_episode_steps is {max_episode_steps!r}; expected a whole number >= 1, or None"
+            )
+        options.setdefault("flagged", options.get("laps") is not None)
+        envs = make_race(agents, **options)
+        self.possible_agents = [f"agent_{number}" for number in range(agents)]
+        self.agents: list[str] = []
+        self._envs = dict(zip(self.possible_agents, envs, strict=True))
+        self._race = envs[0].seat.race
+        self._limit = max_episode_steps
+        self._steps = 0
+        self._closed = False
+        self.observation_spaces: dict[str, spaces.Space[Any]] = {
+            name: env.observation_space for name, env in self._envs.items()
+        }
+        self.action_spaces: dict[str, spaces.Space[Any]] = {
+            name: env.action_space for name, env in self._envs.items()
+        }
+
+    def observation_space(self, agent: str) -> spaces.Space[Any]:
+        """
+        Return what an agent may see.
+
+        :param agent: its name
+        """
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> spaces.Space[Any]:
+        """
+        Return what an agent may do.
+
+        :param agent: its name
+        """
+        return self.action_spaces[agent]
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Observation], dict[str, dict[str, Any]]]:
+        """
+        Begin a race.
+
+        :param seed: of the random numbers of this and the following races
+        :param options: where the field starts, as of ``Torcs-v0``; the place is the first agent's.
+            Other names are ignored: PettingZoo's tests hand over one
+        :return: observations and infos
+        """
+        self._race.end()
+        self.agents = list(self.possible_agents)
+        self._steps = 0
+        options = {name: (options or {})[name] for name in RESET_OPTIONS if name in (options or {})}
+        answers = {
+            name: env.reset(seed=None if seed is None else seed + number, options=options)
+            for number, (name, env) in enumerate(self._envs.items())
+        }
+        observations = {name: seen for name, (seen, _) in answers.items()}
+        return observations, {name: _with_race(info) for name, (_, info) in answers.items()}
+
+    def step(self, actions: Mapping[str, Action]) -> Any:
+        """
+        Hold an action in each car that still races.
+
+        :param actions: by agent
+        :return: observations, rewards, terminations, truncations and infos, by agent
+        :raises InvalidAction: if one is missing or invalid; then no car has been driven
+        """
+        if self._closed or not self.agents:
+            raise EnvClosed("step before reset, after the race or after close; call reset first")
+        racing = {name: self._envs[name] for name in self.agents}
+        self._hold(racing, actions)
+        failure = self._drive(next(iter(racing.values())))
+        self._steps += 1
+        late = self._limit is not None and self._steps >= self._limit
+        answers: tuple[dict[str, Any], ...] = ({}, {}, {}, {}, {})
+        for name, env in racing.items():
+            seen, reward, terminated, truncated, info = env.finish_step(partial(_car, env, failure))
+            truncated = truncated or (late and not terminated)
+            values = seen, reward, terminated, truncated, _with_race(info)
+            for part, value in zip(answers, values, strict=True):
+                part[name] = value
+            if terminated or truncated:
+                self.agents.remove(name)
+                env.seat.retire()
+        return answers
+
+    def _hold(self, racing: Mapping[str, RaceCarEnv], actions: Mapping[str, Action]) -> None:
+        missing = [name for name in racing if name not in actions]
+        if missing:
+            raise InvalidAction(f"no action of {', '.join(missing)}; give one of each in `agents`")
+        controls = {}
+        for name, env in racing.items():
+            try:
+                ((controls[name], _),) = env.begin_step(actions[name])
+            except InvalidAction as error:
+                raise InvalidAction(f"{name}: {error}") from error
+        for name, env in racing.items():
+            env.seat.hold(controls[name])
+
+    def _drive(self, env: RaceCarEnv) -> Exception | None:
+        """Drive the whole race on; return what stopped it."""
+        try:
+            self._race.drive(env.action_repeat)
+        except Exception as error:
+            return error
+        return None
+
+    def render(self) -> None:
+        """Draw nothing: there are no modes."""
+
+    def close(self) -> None:
+        """Close the race. A second call does nothing."""
+        self._closed = True
+        self.agents = []
+        for env in self._envs.values():
+            env.close()
+
+
+def _car(env: RaceCarEnv, failure: Exception | None) -> CarState:
+    if failure is not None:
+        raise failure
+    return env.seat.read()
+
+
+def _with_race(info: dict[str, Any]) -> dict[str, Any]:
+    car: CarState = info["car"]
+    return {
+        **info,
+        "place": car.race_position,
+        "gap_ahead": car.gap_ahead,
+        "gap_behind": car.gap_behind,
+        "contacts": int(car.contacts),
+        "faults": int(car.faults),
+    }
+
+
+def parallel_env(agents: int = 2, **options: Any) -> TorcsParallelEnv:
+    """
+    Make a race of several agents.
+
+    :param agents: their number
+    :param options: of :class:`TorcsParallelEnv`
+    """
+    return TorcsParallelEnv(agents, **options)
