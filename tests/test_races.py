@@ -11,6 +11,7 @@ from sb3_torcs.agents.robots import race as robots_race
 from sb3_torcs.agents.scripted import ScriptedDriver
 from sb3_torcs.cli import main
 from sb3_torcs.errors import InvalidOption
+from sb3_torcs.evaluation.comparing import saved_drives
 from sb3_torcs.races.entrants import find_entrants
 from sb3_torcs.races.protocol import Race, Standing, run_race, run_races
 from sb3_torcs.races.ratings import ratings
@@ -205,3 +206,17 @@ def test_the_command_prints_one_object(capsys, game, tmp_path):
     best = printed["drivers"][0]
     assert (best["driver"], best["races"], best["wins"], best["win_rate"][1]) == ("bt", 2, 2, 1.0)
     assert picture.stat().st_size > 1000
+
+
+def test_the_last_race_is_written_and_reported(capsys, game, tmp_path):
+    """Tick by tick, which changes nothing: the standings are those of a race that nobody notes."""
+    words = ["race", "scripted", "bt", "--track", SHORT, "--laps", "2", "--races", "1", "--json"]
+    drives, page = tmp_path / "race.parquet", tmp_path / "race.html"
+    assert main([*words, "--telemetry", str(drives), "--report", str(page)]) == 0
+    noted = capsys.readouterr().out
+    assert main(words) == 0
+    assert capsys.readouterr().out == noted
+    best = {one["driver"]: one["best_lap"] for one in json.loads(noted)["races"][0]["standings"]}
+    saved = {drive.driver: min(lap.time for lap in drive.laps) for drive in saved_drives(drives)}
+    assert saved == pytest.approx(best, abs=1e-6)
+    assert "<title>g-track-1: scripted " in page.read_text()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,11 +20,17 @@ from sb3_torcs.cli.common import (
 from sb3_torcs.files import writable_file
 
 if TYPE_CHECKING:
+    from sb3_torcs.races.entrants import Entrant
     from sb3_torcs.races.protocol import Race
+    from sb3_torcs.telemetry import DriveLog
 
 __all__ = ["add_parser", "run"]
 
-PICTURES = (".png", ".svg", ".pdf")
+FILES = {
+    "picture": (".png", ".svg", ".pdf"), "telemetry": (".parquet",), "report": (".html",),
+}  # fmt: skip
+"""Endings of what can be written of the last race."""
+
 GRIDS = ("last", "reverse", "random")
 HEADERS = ("driver", "races", "wins", "win rate", "mean place", "finished", "damage/km", "rating")
 LAST_RACE = ("place", "driver", "from", "laps", "time s", "best lap s", "damage", "contacts")
@@ -62,6 +69,9 @@ def add_parser(subparsers: Any) -> None:
     add("--seed", type=seed, default=0, metavar="S", help="of the first race; default: 0")
     add("--picture", metavar="FILE",
         help="draw place and gap over distance of the last race (.png, .svg, .pdf)")  # fmt: skip
+    add("--telemetry", metavar="FILE.parquet", help="write the drives of the last race")
+    add("--report", metavar="FILE.html",
+        help="make the lap report of the last race, as `sb3-torcs compare` does")  # fmt: skip
     add("--trust", action="store_true", help=TRUST_HELP)
     add("--json", action="store_true", help="print one JSON object and nothing else")
     parser.set_defaults(run=run)
@@ -72,35 +82,62 @@ def run(args: argparse.Namespace) -> int:
     :param args: from the command line
     :return: the exit status
     """
-    picture = None if args.picture is None else writable_file(args.picture, PICTURES)
-    with quiet_output(args.json):
-        races = _held(args)
-        if picture is not None:
-            from sb3_torcs.races.picture import draw_race
+    files = {
+        what: writable_file(getattr(args, what), suffixes)
+        for what, suffixes in FILES.items()
+        if getattr(args, what)
+    }
+    from sb3_torcs.races.entrants import find_entrants
+    from sb3_torcs.telemetry import DriveLog
+    from sb3_torcs.torcs.installation import find_game
 
-            draw_race(races[-1], picture)
+    with quiet_output(args.json):
+        entrants = find_entrants(args.drivers, find_game())
+        log = DriveLog() if "telemetry" in files or "report" in files else None
+        races = _held(args, entrants, log)
+        _write(files, races[-1], log, entrants[0].name)
     for race in races:
         for driver, why in race.failures.items():
             print(f"sb3-torcs: race {race.seed}: {driver} is out: {why}", file=sys.stderr)
     if args.json:
         print_json(_as_json(args, races))
     else:
-        _show(races, picture)
+        _show(races, files)
     return 0
 
 
-def _held(args: argparse.Namespace) -> list[Race]:
-    """Hold the races, behind a progress bar."""
+def _write(files: Mapping[str, Path], race: Race, log: DriveLog | None, first: str) -> None:
+    """
+    Write the files that show the last race.
+
+    :param files: by what they hold
+    :param race: the last one
+    :param log: of its drives
+    :param first: driver that the others are measured against
+    """
+    if "picture" in files:
+        from sb3_torcs.races.picture import draw_race
+
+        draw_race(race, files["picture"])
+    if log is not None and "telemetry" in files:
+        log.write(files["telemetry"])
+    if log is not None and "report" in files:
+        from sb3_torcs.evaluation.comparing import report_of
+
+        report_of(log.frame(), first=first).save(files["report"])
+
+
+def _held(
+    args: argparse.Namespace, entrants: Sequence[Entrant], log: DriveLog | None
+) -> list[Race]:
+    """Hold the races, behind a progress bar; the last one is noted in the log."""
     from tqdm import tqdm
 
-    from sb3_torcs.races.entrants import find_entrants
     from sb3_torcs.races.protocol import run_races
-    from sb3_torcs.torcs.installation import find_game
 
-    entrants = find_entrants(args.drivers, find_game())
     races = run_races(
         entrants, args.track, laps=args.laps, races=args.races, grid=args.grid,
-        field_size=args.field, seed=args.seed, trust=args.trust,
+        field_size=args.field, seed=args.seed, trust=args.trust, log=log,
     )  # fmt: skip
     return list(tqdm(races, total=args.races, file=sys.stderr, leave=False, disable=None))
 
@@ -120,7 +157,7 @@ def _as_json(args: argparse.Namespace, races: list[Race]) -> dict[str, Any]:
     }
 
 
-def _show(races: list[Race], picture: Path | None) -> None:
+def _show(races: list[Race], files: Mapping[str, Path]) -> None:
     """Print the figures of the drivers, and the standings of the last race."""
     from sb3_torcs.races.standings import driver_figures
 
@@ -141,5 +178,5 @@ def _show(races: list[Race], picture: Path | None) -> None:
         )
         for s in races[-1].standings
     ]))  # fmt: skip
-    if picture is not None:
-        print(f"picture: {picture}")
+    for what, path in files.items():
+        print(f"{what}: {path}")

@@ -103,16 +103,19 @@ def compare(
     return LapReport(compare_drives(_told_apart(drives), load_track(where)))
 
 
-def report_of(frame: pd.DataFrame, track: Track | None = None) -> LapReport:
+def report_of(
+    frame: pd.DataFrame, track: Track | None = None, first: str | None = None
+) -> LapReport:
     """
     Make the lap report of drives that are there already, such as those of a race.
 
     :param frame: of a :class:`~sb3_torcs.telemetry.DriveLog`, on one track
     :param track: which it is; ``None`` finds it by its name
-    :return: the report; its first driver is the first of the table
+    :param first: driver that the others are measured against; ``None`` is the first of the table
+    :return: the report
     :raises DriveFileError: if nobody drove a whole lap
     """
-    drives = drives_of(frame)
+    drives = sorted(drives_of(frame), key=lambda drive: drive.driver != first)
     name = _track(None, (), {"": drives})
     return LapReport(compare_drives(drives, load_track(name) if track is None else track))
 

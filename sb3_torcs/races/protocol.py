@@ -11,9 +11,10 @@ import numpy as np
 from sb3_torcs.agents.pilots import Pilots
 from sb3_torcs.backends.native import load_race
 from sb3_torcs.backends.seats import SeatWorld, SharedRace
-from sb3_torcs.car import CONTROL_TICK
+from sb3_torcs.car import CONTROL_TICK, Controls
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.races.entrants import Entrant
+from sb3_torcs.telemetry import DriveLabel, DriveLog
 from sb3_torcs.torcs.starting_list import GRID_SLOTS
 
 if TYPE_CHECKING:
@@ -73,6 +74,7 @@ def run_races(
     field_size: int | None = None,
     seed: int = 0,
     trust: bool = False,
+    log: DriveLog | None = None,
 ) -> Iterator[Race]:
     """
     Hold races one after the other.
@@ -89,6 +91,7 @@ def run_races(
     :param field_size: cars in each race, the others are drawn; ``None`` is all
     :param seed: of the first race; the others have the next ones
     :param trust: as of :class:`~sb3_torcs.agents.pilots.Pilots`
+    :param log: that notes the drives of the last race
     :raises InvalidOption: if no such races can be held
     """
     if grid not in GRIDS:
@@ -103,7 +106,8 @@ def run_races(
     for number in range(races):
         rng = np.random.default_rng(seed + number)
         order = _grid(entrants, size, grid, before, rng)
-        race = run_race(order, track, laps=laps, seed=seed + number, trust=trust)
+        noted = log if number == races - 1 else None
+        race = run_race(order, track, laps=laps, seed=seed + number, trust=trust, log=noted)
         before = [standing.driver for standing in race.standings]
         yield race
 
@@ -133,6 +137,7 @@ def run_race(
     seed: int = 0,
     trust: bool = False,
     watch: Callable[[Engine, list[str]], None] | None = None,
+    log: DriveLog | None = None,
 ) -> Race:
     """
     Hold a race by the game's rules: who crosses the line after the winner has finished.
@@ -143,6 +148,7 @@ def run_race(
     :param seed: which is kept with the race
     :param trust: as of :class:`~sb3_torcs.agents.pilots.Pilots`
     :param watch: called after each stretch that is driven, with the engine and the drivers' names
+    :param log: that notes every car after every control tick
     :raises ModelMismatch: if an agent does not fit this race
     """
     agents = [entrant.agent for entrant in order if entrant.agent is not None]
@@ -171,7 +177,8 @@ def run_race(
         else:
             engine.start()
         limit = (laps + 1) * (PIT_STOP + road.length / SLOWEST)
-        for _ in _stretches(engine, pilots, limit):
+        note = None if log is None else _noting(engine, names, track, log)
+        for _ in _stretches(engine, pilots, limit, note):
             cars = [engine.read(number) for number in range(len(order))]
             moments.append([(car.distance_raced, car.race_position) for car in cars])
             if watch is not None:
@@ -186,14 +193,42 @@ def run_race(
     return Race(seed, standings, failures, names, trace[..., 0], trace[..., 1].astype(int))
 
 
-def _stretches(engine: Engine, pilots: Pilots | None, limit: float) -> Iterator[None]:
-    """Drive to the end of the race, a second at a time."""
+def _noting(engine: Engine, names: Sequence[str], track: str, log: DriveLog) -> Callable[[], None]:
+    """Return what notes all cars."""
+    labels = [
+        DriveLabel(name, track, engine.car_name(slot), "Torcs-v0")
+        for slot, name in enumerate(names)
+    ]
+
+    def note() -> None:
+        for slot, label in enumerate(labels):
+            log.add(label, engine.read(slot), Controls(*engine.controls(slot)))
+
+    return note
+
+
+def _stretches(
+    engine: Engine, pilots: Pilots | None, limit: float, note: Callable[[], None] | None
+) -> Iterator[None]:
+    """
+    Drive to the end of the race, a second at a time.
+
+    :param engine: with the race
+    :param pilots: of the agents
+    :param limit: of the race [s]
+    :param note: called after every control tick
+    """
     tick = 0
     while tick * CONTROL_TICK < limit and not engine.ended:
         look = tick + LOOK
         while tick < look and not engine.ended:
             ticks = look - tick if pilots is None else min(pilots.act(tick), look - tick)
-            engine.drive(ticks)
+            if note is None:
+                engine.drive(ticks)
+            else:
+                for _ in range(ticks):
+                    engine.drive(1)
+                    note()
             tick += ticks
         yield
         if all(out or engine.finished(car) for car, *_, out in engine.results()):
