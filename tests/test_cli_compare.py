@@ -72,7 +72,7 @@ def test_a_ghost_drives_as_it_did(tmp_path):
     kwargs = {"track": "a-speedway", "car": "car1-trb1", "action_repeat": 5, "laps": 1}
     with gym.make("sb3_torcs:Torcs-v0", **kwargs) as env:
         actions = np.array([step.action for step in rollout(env, ScriptedDriver(), seed=0)])
-    ghost = Ghost(kwargs, actions, (), "scripted", 0).write(tmp_path / "lap.npz")
+    ghost = Ghost(kwargs, actions, (), "scripted", "scripted", 0).write(tmp_path / "lap.npz")
     first, second = compare("scripted", ghost, track="a-speedway", laps=1).comparison.drivers
     assert second.lap.time == first.lap.time
     assert not second.delta.any()
