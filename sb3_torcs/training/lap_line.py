@@ -19,6 +19,7 @@ TIME, DISTANCE, OFFSET, HEADING, SPEED, STEERING, PEDAL = range(7)
 THROTTLE = 0.9  # [-] from which a line counts as accelerating
 FADING = 4.0  # [s] in which a car on full throttle loses most of a difference of speed
 LEAST_FADING = 0.2  # [s] elsewhere
+WALKING = 2.0  # [m/s] as in native/rollouts.cpp
 SLOWEST = 10.0  # [m/s] for the worth of speed
 DRIFT_COST = 0.01  # [s/m²] of being beside the line
 TURN_COST = 0.5  # [s/rad²] of heading elsewhere than the line
@@ -57,9 +58,11 @@ class Line:
         :param car: (7,) waypoint from which to go on
         :param driven: timesteps since the line's begin, for a car that sets off
         """
-        if car[SPEED] < 2.0:
+        last = len(self.rows) - 2
+        if car[SPEED] < WALKING and driven < last and self.rows[driven, SPEED] < WALKING:
             return self.rows[driven:]
-        return self.rows[max(int(np.searchsorted(self._distance, car[DISTANCE], "right")) - 1, 0) :]
+        first = int(np.searchsorted(self._distance, car[DISTANCE], "right")) - 1
+        return self.rows[min(max(first, 0), last) :]
 
     def gain(self, begin: FloatArray, ends: FloatArray) -> FloatArray:
         """
