@@ -20,9 +20,10 @@ CORNER_HEADERS = ("corner", "m", "driver", "brakes m", "entry km/h", "slowest km
                   "lost s")  # fmt: skip
 
 DESCRIPTION = """\
-Compare the best laps of drivers on one track: agents, robots, and files of saved drives (.parquet,
-see --telemetry of evaluate and robots). Agents and robots drive --laps laps from the grid, each
-alone; the best flying lap of each counts. The first driver is what the others are measured against.
+Compare the best laps of drivers on one track: agents, robots, ghosts, and files of saved drives
+(.parquet, see --telemetry of evaluate and robots). All but saved drives drive --laps laps from the
+grid, each alone; the best flying lap of each counts. The first driver is what the others are
+measured against.
 
 The page is one HTML file that works offline: map, speed, pedals, steering, gear, place across the
 road, wheel slip, time gained and lost, corners, sectors and laps.
