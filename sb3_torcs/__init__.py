@@ -9,6 +9,8 @@ from typing import Any
 
 from gymnasium.envs.registration import register, registry
 
+from sb3_torcs.torcs.drivers import register_crew
+
 __all__ = ["__version__", "compare", "parallel_env", "register_envs"]
 
 __version__ = "0.1.0"
@@ -36,6 +38,7 @@ def register_envs() -> None:
 
 
 register_envs()
+register_crew("sb3_torcs.agents.pilots:Crew")
 
 
 def __getattr__(name: str) -> Any:

@@ -20,6 +20,8 @@ from sb3_torcs.envs.batch import Batch, Timestep
 from sb3_torcs.envs.racing import RacingEnv, RacingInfo
 from sb3_torcs.envs.torcs_race import RaceCarEnv, make_race
 from sb3_torcs.errors import EnvClosed, InvalidOption
+from sb3_torcs.torcs.installation import find_game
+from sb3_torcs.torcs.starting_list import guests_of
 
 __all__ = ["RaceInfo", "TorcsVecEnv", "glance"]
 
@@ -150,7 +152,7 @@ class TorcsVecEnv(DummyVecEnv):
                     "number of races"
                 )
             makers = list(races)
-        elif is_count(races) and agents > 1:
+        elif is_count(races) and (agents > 1 or _has_guests(env_id, env_kwargs)):
             makers = _made(races, agents, env_id, env_kwargs)  # type: ignore[arg-type]
         elif is_count(races):
             makers = [partial(_monitored, env_id, env_kwargs)] * int(races)  # type: ignore[arg-type]
@@ -204,7 +206,7 @@ class TorcsVecEnv(DummyVecEnv):
             raise EnvClosed("step after close; make a new environment")
         if not self._driving:
             self._enter()
-        timestep = self._batch.step(self.actions)
+        timestep = self._drive(self._batch)
         rewards = np.array(timestep.rewards, np.float32)
         dones = np.zeros(self.num_envs, np.bool_)
         infos: list[Any] = [RaceInfo(timestep, i) for i in range(self.num_envs)]
@@ -229,6 +231,15 @@ class TorcsVecEnv(DummyVecEnv):
         if failures:
             raise failures[0]
         return timestep.observations, rewards, dones, infos
+
+    def _drive(self, batch: Batch) -> Timestep:
+        """Take a timestep in all races, in which opponents that are agents drive, too."""
+        for race in self._shared:
+            race.ask()
+        timestep = batch.step(self.actions)
+        for race, members in self._shared.items():
+            race.advance(self._races[members[0]].racing.action_repeat)
+        return timestep
 
     def _end_races(self, over: npt.NDArray[np.bool_]) -> None:
         """End the races all of whose first episodes are over; with them end all their others."""
@@ -360,6 +371,13 @@ class _Race:
         if self._limit is not None:
             self._limit._elapsed_steps = elapsed
         self._noted = elapsed
+
+
+def _has_guests(env_id: str, env_kwargs: dict[str, Any]) -> bool:
+    """Whether agents are among the opponents, whom only a shared race can ask."""
+    opponents = env_kwargs.get("opponents", ())
+    several = any(not isinstance(name, str) for name in opponents)
+    return env_id == "Torcs-v0" and (several or bool(guests_of(opponents, find_game())))
 
 
 def _made(races: int, agents: int, env_id: str, env_kwargs: dict[str, Any]) -> list[EnvMaker]:

@@ -13,10 +13,10 @@ import torch as th
 from stable_baselines3 import DDPG, PPO
 
 from sb3_torcs.agents.scripted import ScriptedDriver
-from sb3_torcs.backends.native import Fleet, make_engine, make_grid
+from sb3_torcs.backends.native import Fleet, make_engine
 from sb3_torcs.backends.seats import REJOIN_SPEED
 from sb3_torcs.car import CAR_RECORD, CONTROL_TICK, RIVALS
-from sb3_torcs.envs.torcs_race import make_race
+from sb3_torcs.envs.torcs_race import make_grid, make_race
 from sb3_torcs.errors import CarLost, InvalidAction, InvalidOption
 from sb3_torcs.policies.mirror import mirror_observations
 from sb3_torcs.sensors import feature_slices
@@ -540,3 +540,38 @@ class TestSensorsOfARace:
 
 def speed_on(car):
     return car.speed_x * math.cos(car.heading_error) + car.speed_y * math.sin(car.heading_error)
+
+
+class TestAgentsAsOpponents:
+    def test_they_drive_as_they_were_trained(self, make):
+        """Off the grid in the first seconds, while the other agent stands on its brake."""
+        envs = make(1, 1, opponents=["ddpg-roads"], grid_place=2, track="aalborg")
+        (backend,) = envs.get_attr("seat")
+        engine = backend.worlds[0].engine
+        envs.seed(0)
+        envs.reset()
+        for _ in range(28):
+            envs.step(np.array([[0.0, 0.0, 1.0]], np.float32))
+        opponent = engine.read(0)
+        assert (opponent.off_track, opponent.damage) == (False, 0.0)
+        assert opponent.distance_raced > 10.0
+        assert engine.read(1).race_position == 2
+
+    def test_they_race_beside_robots_and_several_agents_and_again_after_a_reset(self, make):
+        envs = make(1, 2, opponents=["bt", "scripted"])
+        seen = []
+        for _ in range(2):
+            envs.seed(0)
+            digest = [envs.reset().tobytes()]
+            digest += [envs.step(action)[0].tobytes() for action in random_actions(40, 2)]
+            engine = envs.envs[0].unwrapped.backend.worlds[0].engine
+            seen.append((digest, [np.hstack(engine.read(car)).tobytes() for car in range(4)]))
+        assert seen[0] == seen[1]
+
+    def test_who_does_not_exist_is_told(self):
+        with pytest.raises(InvalidOption, match="infermo"):
+            make_race(2, opponents=["infermo"])
+
+    def test_they_need_the_same_timestep(self):
+        with pytest.raises(InvalidOption, match=r"action_repeat is 3, .* were trained with 5"):
+            make_race(2, opponents=["ddpg-roads"], action_repeat=3)

@@ -10,13 +10,13 @@ import numpy as np
 from sb3_torcs.agents.ghosts import is_ghost
 from sb3_torcs.agents.models import driver_record, load_driver
 from sb3_torcs.agents.wrapping import wrapped
-from sb3_torcs.backends.seats import SharedRace
+from sb3_torcs.backends.seats import SeatWorld, SharedRace
 from sb3_torcs.car import DEFAULT_CAR, FloatArray
 from sb3_torcs.envs.torcs_race import RaceCarEnv
 from sb3_torcs.errors import InvalidAction, InvalidOption, ModelMismatch
 from sb3_torcs.sensors import range_finder_angles
 
-__all__ = ["CarOfAnAgent", "Pilots"]
+__all__ = ["CarOfAnAgent", "Crew", "Pilots"]
 
 SEEN = ("action_repeat", "sensors", "action")
 """What an agent drives with as in its training, besides its car, gearbox and range finders."""
@@ -83,6 +83,7 @@ class Pilots:
         for env in self._envs:
             env.reset(seed=seed)
         self._states = {}
+        self.failed.clear()
 
     def act(self, tick: int) -> int:
         """
@@ -121,3 +122,41 @@ class Pilots:
         """Close the race."""
         for env in self._envs:
             env.close()
+
+
+class Crew:
+    """
+    Agents as opponents, in a race that others have begun.
+
+    :param drivers: as of :class:`CarOfAnAgent`
+    """
+
+    def __init__(self, drivers: Sequence[str]) -> None:
+        self._members = [CarOfAnAgent(driver) for driver in drivers]
+        self.cars = [member.car for member in self._members]
+        self.gearboxes = [member.gearbox for member in self._members]
+        self.angles = [member.angles for member in self._members]
+        repeats = {member.record.env_kwargs.get("action_repeat", 5) for member in self._members}
+        self.action_repeats: set[int] = repeats
+
+    def board(self, worlds: Sequence[SeatWorld]) -> None:
+        """
+        Load the agents.
+
+        :param worlds: their cars, in the order of the drivers
+        """
+        self._race = SharedRace([worlds])
+        self._pilots = Pilots(self._members, self._race)
+
+    def begin(self) -> None:
+        """Take part in the race that begins."""
+        self._race.join()
+        self._pilots.begin(0)
+
+    def act(self, tick: int) -> None:
+        """
+        Let the cars hold what the agents answer.
+
+        :param tick: control ticks that have been driven
+        """
+        self._pilots.act(tick)

@@ -44,7 +44,6 @@ __all__ = [
     "check_layout",
     "load_race",
     "make_engine",
-    "make_grid",
     "make_rollouts",
 ]
 
@@ -120,41 +119,6 @@ def make_engine(
 def _for_each(choice: str | Sequence[str], agents: int) -> list[str]:
     """Repeat what is for all agents; a race of robots has it once."""
     return [choice] * max(agents, 1) if isinstance(choice, str) else list(choice)
-
-
-def make_grid(
-    track: str | Path,
-    car: str,
-    *,
-    agents: int,
-    range_finders: RangeFinderName | Sequence[float] = "scr",
-    opponents: Sequence[str] = (),
-    laps: int | None = None,
-    grid_place: int | None = None,
-    gearbox: str = "automatic",
-    flagged: bool = False,
-) -> list[SeatWorld]:
-    """
-    Load a race of several agents, for a :class:`~sb3_torcs.backends.seats.SharedRace`.
-
-    :param track: as of :class:`NativeBackend`
-    :param car: of all agents
-    :param agents: their number
-    :param range_finders: as of :class:`NativeBackend`
-    :param opponents: robots
-    :param laps: of the race, for which robots take fuel; ``None`` drives on
-    :param grid_place: of the first agent, whom the others follow; ``None`` is behind all robots
-    :param gearbox: as of :class:`NativeBackend`
-    :param flagged: whether agents are flagged off after the last lap
-    :return: the cars of the agents
-    """
-    entries = starting_list(find_game(), opponents, grid_place, agents)
-    angles = range_finder_angles(range_finders)
-    engine, road = load_race(
-        track, entries, cars=[car] * agents, gearboxes=[gearbox] * agents,
-        angles=[angles] * agents, laps=checked_laps(laps) or 0, flagged=flagged,
-    )  # fmt: skip
-    return [SeatWorld(engine, seat, road, angles) for seat in engine.agents]
 
 
 def load_race(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -17,7 +17,7 @@ from sb3_torcs.tracks.track import Track
 if TYPE_CHECKING:
     from sb3_torcs._engine import Engine
 
-__all__ = ["REJOIN_SPEED", "Seat", "SeatWorld", "SharedRace", "align", "profile_of"]
+__all__ = ["REJOIN_SPEED", "Grid", "Seat", "SeatWorld", "SharedRace", "align", "profile_of"]
 
 REJOIN_SPEED = 20.0
 """[m/s] of a car that is put back on the road, where no start was drawn for it."""
@@ -80,6 +80,13 @@ class SeatWorld:
         """Take the result of a step, of which nothing has to be remembered."""
 
 
+class Grid(NamedTuple):
+    """A race that is loaded."""
+
+    worlds: Sequence[SeatWorld]  # the cars of its agents
+    crew: Any = None  # drives the opponents that are agents; see ``agents.pilots.Crew``
+
+
 class SharedRace:
     """
     A race whose agents begin and end their episodes one by one.
@@ -92,10 +99,19 @@ class SharedRace:
 
     :param grids: the cars of the agents, of each race that can be drawn
     :param noise: whether sensors err as those of the SCR server's ``-noisy``
+    :param crews: of each such race who drives the opponents that are agents, or ``None``
     """
 
-    def __init__(self, grids: Sequence[Sequence[SeatWorld]], noise: bool = False) -> None:
+    def __init__(
+        self,
+        grids: Sequence[Sequence[SeatWorld]],
+        noise: bool = False,
+        crews: Sequence[Any] = (),
+    ) -> None:
         self.grids = [tuple(grid) for grid in grids]
+        self._crews = list(crews) or [None] * len(self.grids)
+        self._tick = 0  # control ticks since the race began
+        self._asked = -1  # when the crew was asked
         self.index = 0  # of the present grid
         self.agents = len(self.grids[0])
         self._noise = noise
@@ -161,6 +177,29 @@ class SharedRace:
             engine.start()
         else:
             engine.start_at(*start)
+        self._tick, self._asked = 0, -1
+        if self._crews[self.index] is not None:
+            self._crews[self.index].begin()
+
+    def join(self) -> None:
+        """Let all agents begin in a race that is begun elsewhere."""
+        self._waiting = set(range(self.agents))
+        self._lasting = set(self._waiting)
+
+    def ask(self) -> None:
+        """Ask the opponents that are agents what they do next, once before each timestep."""
+        crew = self._crews[self.index]
+        if crew is not None and self._asked != self._tick:
+            crew.act(self._tick)
+            self._asked = self._tick
+
+    def advance(self, ticks: int) -> None:
+        """
+        Take note that the race was driven.
+
+        :param ticks: control ticks
+        """
+        self._tick += ticks
 
     def drive(self, ticks: int) -> None:
         """
@@ -168,7 +207,9 @@ class SharedRace:
 
         :param ticks: control ticks of 0.02 s
         """
+        self.ask()
         self.world(0).engine.drive(ticks)
+        self.advance(ticks)
 
     def leave(self) -> None:
         """Close the race when the last seat is left."""

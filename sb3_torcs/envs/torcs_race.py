@@ -8,15 +8,18 @@ from pathlib import Path
 from typing import Any
 
 from sb3_torcs.actions import ActionName, GearboxName, used_gearbox
-from sb3_torcs.backends.native import make_grid
-from sb3_torcs.backends.seats import Seat, SharedRace
+from sb3_torcs.backends.native import load_race
+from sb3_torcs.backends.seats import Grid, Seat, SeatWorld, SharedRace
 from sb3_torcs.backends.several import is_several
-from sb3_torcs.car import DEFAULT_CAR, CarState
+from sb3_torcs.car import DEFAULT_CAR, CarState, checked_laps
 from sb3_torcs.envs.racing import RacingEnv
 from sb3_torcs.errors import InvalidOption
-from sb3_torcs.sensors import RangeFinderName
+from sb3_torcs.sensors import RangeFinderName, range_finder_angles
+from sb3_torcs.torcs.drivers import crew_of
+from sb3_torcs.torcs.installation import find_game
+from sb3_torcs.torcs.starting_list import guests_of, starting_list
 
-__all__ = ["RaceCarEnv", "make_race"]
+__all__ = ["RaceCarEnv", "make_grid", "make_race"]
 
 
 class RaceCarEnv(RacingEnv):
@@ -35,6 +38,52 @@ class RaceCarEnv(RacingEnv):
     def _end(self, car: CarState) -> str | None:
         """Return why the episode ends; a car that is laps behind is flagged off with the others."""
         return super()._end(car) or ("laps" if self.seat.finished else None)
+
+
+def make_grid(
+    track: str | Path,
+    car: str,
+    *,
+    agents: int,
+    range_finders: RangeFinderName | Sequence[float] = "scr",
+    opponents: Sequence[str] = (),
+    laps: int | None = None,
+    grid_place: int | None = None,
+    gearbox: str = "automatic",
+    flagged: bool = False,
+) -> Grid:
+    """
+    Load a race of several agents, for a :class:`~sb3_torcs.backends.seats.SharedRace`.
+
+    :param track: as of :func:`make_race`
+    :param car: of all agents
+    :param agents: their number
+    :param range_finders: as of :func:`make_race`
+    :param opponents: robots, and names or paths of agents
+    :param laps: of the race, for which robots take fuel; ``None`` drives on
+    :param grid_place: of the first agent, whom the others follow; ``None`` is behind all robots
+    :param gearbox: as of :func:`make_race`
+    :param flagged: whether agents are flagged off after the last lap
+    :return: the cars of the agents, and who drives the opponents that are agents
+    """
+    game = find_game()
+    guests = guests_of(opponents, game)
+    entries = starting_list(game, opponents, grid_place, agents, guests)
+    crew = crew_of(guests) if guests else None
+    every: list[list[Any]] = [[car], [gearbox], [range_finder_angles(range_finders)]]
+    more = ([], [], []) if crew is None else (crew.cars, crew.gearboxes, crew.angles)
+    cars, gearboxes, angles = (a * agents + b for a, b in zip(every, more, strict=True))
+    engine, road = load_race(
+        track, entries, cars=cars, gearboxes=gearboxes, angles=angles,
+        laps=checked_laps(laps) or 0, flagged=flagged,
+    )  # fmt: skip
+    worlds = [
+        SeatWorld(engine, seat, road, beams)
+        for seat, beams in zip(engine.agents, angles, strict=True)
+    ]
+    if crew is not None:
+        crew.board(worlds[agents:])
+    return Grid(worlds[:agents], crew)
 
 
 def make_race(
@@ -58,7 +107,8 @@ def make_race(
     :param agents: their number
     :param track: as of :class:`~sb3_torcs.envs.torcs.TorcsEnv`; each race is on one of a list
     :param car: of all agents; each race has one of a list
-    :param opponents: robots; each race has one of a list of lists
+    :param opponents: robots, e.g. ``"inferno"``, and shipped agents or paths of trained ones; each
+        race has one of a list of lists
     :param grid_place: of the first agent, whom the others follow, 1 in front; ``None`` is behind
         all opponents; each race has one of a list
     :param range_finders: as of ``TorcsEnv``
@@ -93,5 +143,12 @@ def make_race(
         make_grid(one, model, opponents=field, grid_place=place, **shared)
         for one, model, field, place in choices
     ]
-    race = SharedRace(grids, sensor_noise)
+    repeat = options.get("action_repeat", 5)
+    for grid in grids:
+        if grid.crew is not None and grid.crew.action_repeats != {repeat}:
+            raise InvalidOption(
+                f"action_repeat is {repeat!r}, and agents among the opponents were trained with "
+                f"{', '.join(map(str, sorted(grid.crew.action_repeats)))}; give all the same"
+            )
+    race = SharedRace([grid.worlds for grid in grids], sensor_noise, [grid.crew for grid in grids])
     return [RaceCarEnv(seat, action=action, laps=laps, **options) for seat in race.seats]

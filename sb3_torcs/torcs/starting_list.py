@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 from sb3_torcs.car import is_count
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.torcs.installation import Game
 
-__all__ = ["AGENT", "GRID_SLOTS", "starting_list"]
+__all__ = ["AGENT", "GRID_SLOTS", "guests_of", "starting_list"]
 
 AGENT = ("", 0)
 """The entry of the first agent in a starting list; robots have a name and an index."""
@@ -18,7 +19,11 @@ GRID_SLOTS = 20
 
 
 def starting_list(
-    game: Game, opponents: Sequence[str], grid_place: int | None, agents: int = 1
+    game: Game,
+    opponents: Sequence[str],
+    grid_place: int | None,
+    agents: int = 1,
+    guests: Sequence[str] = (),
 ) -> list[tuple[str, int]]:
     """
     Make the starting list.
@@ -27,6 +32,7 @@ def starting_list(
     :param opponents: robots, e.g. ``("inferno", "berniw:3")``
     :param grid_place: of the first agent among them, 1 in front; ``None`` is behind them all
     :param agents: that follow each other
+    :param guests: the opponents that are agents; they are numbered after the others
     :return: names and indices, and those of the agents: no name, and 0, 1 and so on
     :raises InvalidOption: if there is no such slot, or not enough of them, or the opponents are no
         list
@@ -36,7 +42,11 @@ def starting_list(
         raise InvalidOption(
             f"opponents is {opponents!r}; expected a list of names, e.g. ['inferno', 'berniw:3']"
         )
-    entries = [game.parse_robot(name) for name in opponents]
+    numbers = itertools.count(agents if is_count(agents) else 1)
+    entries = [
+        (AGENT[0], next(numbers)) if name in guests else game.parse_robot(name)
+        for name in opponents
+    ]
     slot = len(entries) + 1 if grid_place is None else grid_place
     if not is_count(slot) or slot > len(entries) + 1:
         raise InvalidOption(
@@ -50,3 +60,18 @@ def starting_list(
     name, first = AGENT
     entries[slot - 1 : slot - 1] = [(name, first + number) for number in range(agents)]
     return entries
+
+
+def guests_of(opponents: Sequence[str], game: Game) -> list[str]:
+    """
+    Tell the agents among opponents.
+
+    :param opponents: names
+    :param game: the installation, whose robots are none
+    """
+    if not isinstance(opponents, (list, tuple)):
+        return []
+    robots = game.robots()
+    return [
+        name for name in opponents if isinstance(name, str) and name.partition(":")[0] not in robots
+    ]
