@@ -178,10 +178,10 @@ def test_a_gain_is_time_against_the_line():
 
 def test_a_car_that_stands_on_the_way_finds_its_line():
     rows = np.zeros((9, 7))
-    rows[:, 1], rows[:, 4] = np.arange(9) * 2.0, 20.0
-    standing = np.array([5.0, 7.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-    assert Line(rows).rows_from(standing, driven=50)[0, 1] == 6.0
-    beyond = standing + np.array([0.0, 99.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    rows[:, 1], rows[:, 4] = np.arange(9) * 20.0, 20.0
+    standing = np.array([5.0, 70.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    assert Line(rows).rows_from(standing, driven=50)[0, 1] == 60.0
+    beyond = standing + np.array([0.0, 999.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     assert len(Line(rows).rows_from(beyond, driven=5)) == 2
 
 

@@ -20,6 +20,7 @@ THROTTLE = 0.9  # [-] from which a line counts as accelerating
 FADING = 4.0  # [s] in which a car on full throttle loses most of a difference of speed
 LEAST_FADING = 0.2  # [s] elsewhere
 WALKING = 2.0  # [m/s] as in native/rollouts.cpp
+LAUNCH = 20.0  # [m] within which a slow car sets off; elsewhere it has spun
 SLOWEST = 10.0  # [m/s] for the worth of speed
 DRIFT_COST = 0.01  # [s/m²] of being beside the line
 TURN_COST = 0.5  # [s/rad²] of heading elsewhere than the line
@@ -59,7 +60,7 @@ class Line:
         :param driven: timesteps since the line's begin, for a car that sets off
         """
         last = len(self.rows) - 2
-        if car[SPEED] < WALKING and driven < last and self.rows[driven, SPEED] < WALKING:
+        if car[SPEED] < WALKING and car[DISTANCE] < LAUNCH and driven < last:
             return self.rows[driven:]
         first = int(np.searchsorted(self._distance, car[DISTANCE], "right")) - 1
         return self.rows[min(max(first, 0), last) :]
