@@ -136,7 +136,6 @@ def run_race(
     laps: int,
     seed: int = 0,
     trust: bool = False,
-    watch: Callable[[Engine, list[str]], None] | None = None,
     log: DriveLog | None = None,
 ) -> Race:
     """
@@ -147,7 +146,6 @@ def run_race(
     :param laps: to drive
     :param seed: which is kept with the race
     :param trust: as of :class:`~sb3_torcs.agents.pilots.Pilots`
-    :param watch: called after each stretch that is driven, with the engine and the drivers' names
     :param log: that notes every car after every control tick
     :raises ModelMismatch: if an agent does not fit this race
     """
@@ -181,8 +179,6 @@ def run_race(
         for _ in _stretches(engine, pilots, limit, note):
             cars = [engine.read(number) for number in range(len(order))]
             moments.append([(car.distance_raced, car.race_position) for car in cars])
-            if watch is not None:
-                watch(engine, names)
         standings = _standings(engine, names)
         failed = {} if pilots is None else pilots.failed
         seats = engine.agents
