@@ -26,6 +26,14 @@ def run(monkeypatch, name, *words):
     return runpy.run_path(str(EXAMPLES / name), run_name="__main__")
 
 
+def test_the_growth_is_drawn_from_what_was_measured(monkeypatch, capsys, tmp_path):
+    found = {"races": {"1": [9e3] * 7}, "opponents": [1e3] * 10, "batches": [2e4] * 8}
+    (tmp_path / "growth.json").write_text(json.dumps(found))
+    run(monkeypatch, "growth.py", "--from-json", "--output", str(tmp_path / "growth"))
+    assert capsys.readouterr().out == f"{tmp_path}/growth.png\n"
+    assert (tmp_path / "growth.png").read_bytes()[:4] == b"\x89PNG"
+
+
 @pytest.fixture
 def demo():
     """A fresh copy of the demo's module."""

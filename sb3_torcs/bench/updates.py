@@ -18,7 +18,7 @@ from sb3_torcs.policies.replay import sample_mirrored
 from sb3_torcs.policies.updates import LeanUpdates
 from sb3_torcs.training.zoo import config_file, read_entry
 
-__all__ = ["default_updates", "products_of_an_update"]
+__all__ = ["default_model", "default_updates", "products_of_an_update"]
 
 PRODUCT = (64, 256, 256)
 """Sizes of the matrix product whose rate is the core's: that of the default critics."""
@@ -49,7 +49,7 @@ def default_updates(seconds: float) -> Figures:
 
 def _measure(seconds: float) -> Figures:
     entry = read_entry(config_file("ddpg"), "Torcs-v0")
-    model = _default_model(entry)
+    model = default_model(entry)
     updates, batch_size = LeanUpdates(model), model.batch_size
     rows, inner, columns = PRODUCT
     a, b, out = th.rand(rows, inner), th.rand(inner, columns), th.empty(rows, columns)
@@ -78,8 +78,13 @@ def _measure(seconds: float) -> Figures:
     }
 
 
-def _default_model(entry: dict[str, Any]) -> DDPG:
-    """Make the entry's model with random transitions and mirrored batches."""
+def default_model(entry: dict[str, Any]) -> DDPG:
+    """
+    Make the model of an entry for DDPG, with random transitions and mirrored batches.
+
+    :param entry: of a hyperparameter file
+    :return: a model that can be updated at once
+    """
     model = DDPG(
         SplitHeadPolicy,
         SpacesOnly(),
