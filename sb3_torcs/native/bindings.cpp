@@ -112,7 +112,7 @@ std::vector<Entry> entries_of(const std::vector<std::pair<std::string, int>>& na
     return entries;
 }
 
-const std::vector<Engine*>& checked(const std::vector<Engine*>& engines) {
+std::vector<Engine*> checked(std::vector<Engine*> engines) {
     for (const Engine* engine : engines)
         if (!engine) throw py::type_error("engine is None; expected an Engine");
     return engines;
