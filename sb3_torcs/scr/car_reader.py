@@ -102,12 +102,12 @@ class CarReader:
             state.engine_speed, state.gear, state.fuel, state.damage,
             self._laps, state.lap_time, state.last_lap_time, self._best, state.race_position,
             _read_only(state.wheel_speeds), _read_only(state.range_finders),
-            _read_only(state.opponents), NO_RACE,
+            _read_only(state.opponents), _read_only(NO_RACE),
         )  # fmt: skip
         return CarState._make(values)
 
 
-def _read_only(numbers: tuple[float, ...]) -> FloatArray:
+def _read_only(numbers: tuple[float, ...] | FloatArray) -> FloatArray:
     """Make an array read-only."""
     array = np.array(numbers)
     array.flags.writeable = False

@@ -136,16 +136,16 @@ class LiteBackend:
 
     def _read(self) -> CarState:
         scalars, wheels, beams = np.empty(physics.SCALARS), np.empty(4), np.empty(19)
-        opponents = np.full(36, RANGE)  # there are no other cars
+        opponents, race = np.full(36, RANGE), NO_RACE.copy()  # there are no other cars
         physics.read(
             self._state, self._table, *self._edges, self.range_finder_angles, scalars, wheels, beams
         )
-        for array in (wheels, beams, opponents):
+        for array in (wheels, beams, opponents, race):
             array.flags.writeable = False
         values = scalars.tolist()
         values[physics.GEAR_FIELD] = int(values[physics.GEAR_FIELD])
         values[physics.LAPS_FIELD] = int(values[physics.LAPS_FIELD])
-        return CarState._make((*values, 1, wheels, beams, opponents, NO_RACE))
+        return CarState._make((*values, 1, wheels, beams, opponents, race))
 
 
 def _with_grip(table: FloatArray, grip: float) -> FloatArray:
