@@ -1,4 +1,4 @@
-"""Watch a car learn to lap aalborg, in five minutes: `make demo` runs this.
+"""Watch a car learn to lap aalborg, in three minutes: `make demo` runs this.
 
 It learns in the game if TORCS is installed, and on TorcsLite-v0 otherwise. Ctrl-C at any time keeps
 what was learned; a second run continues, or starts over as asked.
