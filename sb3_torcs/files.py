@@ -1,10 +1,12 @@
-"""Checks of files and folders for results, before any work begins; and YAML that people write."""
+"""Files of results, which are checked before any work begins; and YAML that people write."""
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,7 @@ import yaml
 
 from sb3_torcs.errors import OutputNotWritable
 
-__all__ = ["read_yaml", "writable_file", "writable_folder"]
+__all__ = ["read_yaml", "whole_file", "writable_file", "writable_folder"]
 
 MAX_LENGTH = 2**16  # [characters] PyYAML takes about a second for as many
 MAX_BRACKETS = 100  # open at once: PyYAML's time grows with their square
@@ -55,6 +57,26 @@ def writable_file(file: str | Path, suffixes: tuple[str, ...]) -> Path:
         raise OutputNotWritable(f"'{path}' is a folder; give a file in it")
     writable_folder(path.parent)
     return path
+
+
+@contextlib.contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """
+    Write a file completely or not at all.
+
+    :param path: of the file, which appears when the block ends
+    :return: a path beside it with the same ending, which the block writes
+    :raises OutputNotWritable: if the file cannot be written; the previous one is kept
+    """
+    aside = path.with_name(f".{path.name}")
+    try:
+        try:
+            yield aside
+            aside.replace(path)
+        finally:
+            aside.unlink(missing_ok=True)
+    except OSError as error:
+        raise OutputNotWritable(f"{path}: {error}; choose another file") from error
 
 
 def read_yaml(text: str, loader_class: type[yaml.SafeLoader] = yaml.SafeLoader) -> Any:

@@ -16,7 +16,7 @@ from sb3_torcs.agents.models import driver_name, driver_record, load_driver
 from sb3_torcs.agents.remote import Agent
 from sb3_torcs.backends.native import make_engine, make_rollouts
 from sb3_torcs.cli import main
-from sb3_torcs.errors import InvalidOption, ModelMismatch
+from sb3_torcs.errors import InvalidOption, ModelMismatch, OutputNotWritable
 from sb3_torcs.evaluation import evaluate
 from sb3_torcs.scr.server import open_ports, start_server
 from sb3_torcs.torcs.installation import find_game
@@ -225,6 +225,20 @@ def test_what_is_no_ghost_is_refused(tmp_path, kind):
     broken(kind, path)
     with pytest.raises(ModelMismatch, match=r"is not a ghost \(.+\); give one that"):
         read_ghost(path)
+
+
+def test_a_full_disk_is_said_and_leaves_the_previous_ghost(ghost, file, monkeypatch):
+    before = file.read_bytes()
+
+    def fill(output, **_):
+        output.write(b"half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "savez_compressed", fill)
+    with pytest.raises(OutputNotWritable, match=r"No space left on device.*choose another file"):
+        ghost.write(file)
+    assert file.read_bytes() == before
+    assert list(file.parent.iterdir()) == [file]
 
 
 def test_a_ghost_that_is_not_there_is_said(tmp_path):

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from sb3_torcs.agents.rollout import Timestep, drive
 from sb3_torcs.errors import InvalidOption, ModelMismatch, near_miss
-from sb3_torcs.files import writable_file
+from sb3_torcs.files import whole_file, writable_file
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.track_names import find_track
 from sb3_torcs.tracks.catalogue import load_track
@@ -96,12 +96,8 @@ class Ghost:
             "start": self.start,
             "rollouts": self.rollouts,
         }
-        half = file.with_name(f".{file.name}.{os.getpid()}{SUFFIX}")
-        try:
-            np.savez_compressed(half, actions=self.actions, record=np.array(json.dumps(record)))
-            half.replace(file)
-        finally:
-            half.unlink(missing_ok=True)
+        with whole_file(file) as aside, aside.open("wb") as output:
+            np.savez_compressed(output, actions=self.actions, record=np.array(json.dumps(record)))
         return file
 
 

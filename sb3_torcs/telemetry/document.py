@@ -11,7 +11,8 @@ from html import escape
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sb3_torcs.errors import OutputNotWritable, PackageMissing
+from sb3_torcs.errors import PackageMissing
+from sb3_torcs.files import whole_file
 
 __all__ = ["OKABE_ITO", "Cell", "chip", "document", "paragraph", "table", "write_document"]
 
@@ -99,15 +100,8 @@ def write_document(path: Path, text: str) -> None:
     :param text: of the page
     :raises OutputNotWritable: if the file cannot be written
     """
-    aside = path.with_name(f".{path.name}")
-    try:
-        try:
-            aside.write_text(text, encoding="utf-8")
-            aside.replace(path)
-        finally:
-            aside.unlink(missing_ok=True)
-    except OSError as error:
-        raise OutputNotWritable(f"{path}: {error}; choose another file") from error
+    with whole_file(path) as aside:
+        aside.write_text(text, encoding="utf-8")
 
 
 def chip(colour: str) -> str:

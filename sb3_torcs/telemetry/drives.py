@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from sb3_torcs.car import CarState, Controls
-from sb3_torcs.errors import DriveFileError, OutputNotWritable
+from sb3_torcs.errors import DriveFileError
+from sb3_torcs.files import whole_file
 from sb3_torcs.sensors import SENSORS
 from sb3_torcs.telemetry.table import CONTROL_FIELDS, STATE_FIELDS
 
@@ -143,19 +144,12 @@ class DriveLog:
         table = self.table()
         floats = [field.name for field in table.schema if str(field.type) == "double"]
         others = [field.name for field in table.schema if field.name not in floats]
-        aside = path.with_name(f".{path.name}")
-        try:
-            try:
-                # Bytes of one weight stand together, which compresses better.
-                parquet.write_table(
-                    table, aside, compression="zstd", use_dictionary=others,
-                    use_byte_stream_split=floats, write_page_checksum=True,
-                )  # fmt: skip
-                aside.replace(path)
-            finally:
-                aside.unlink(missing_ok=True)
-        except OSError as error:
-            raise OutputNotWritable(f"{path}: {error}; choose another file") from error
+        with whole_file(path) as aside:
+            # Bytes of one weight stand together, which compresses better.
+            parquet.write_table(
+                table, aside, compression="zstd", use_dictionary=others,
+                use_byte_stream_split=floats, write_page_checksum=True,
+            )  # fmt: skip
 
 
 def read_drives(path: str | Path) -> pd.DataFrame:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_torcs.car import CarState
-from sb3_torcs.errors import OutputNotWritable
+from sb3_torcs.files import whole_file
 
 __all__ = ["CONTROL_FIELDS", "STATE_FIELDS", "TELEMETRY_FIELDS", "write_telemetry"]
 
@@ -26,15 +26,10 @@ def write_telemetry(path: Path, rows: Iterable[tuple[Any, ...]]) -> None:
     :param rows: values of :data:`TELEMETRY_FIELDS`; they are consumed one by one during the drive
     :raises OutputNotWritable: if the file cannot be written
     """
-    aside = path.with_name(f".{path.name}")
-    try:
-        try:
-            with aside.open("w", newline="", encoding="utf-8", errors="surrogateescape") as file:
-                writer = csv.writer(file)
-                writer.writerow(TELEMETRY_FIELDS)
-                writer.writerows(rows)
-            aside.replace(path)
-        finally:
-            aside.unlink(missing_ok=True)
-    except OSError as error:
-        raise OutputNotWritable(f"{path}: {error}; choose another file") from error
+    with (
+        whole_file(path) as aside,
+        aside.open("w", newline="", encoding="utf-8", errors="surrogateescape") as file,
+    ):
+        writer = csv.writer(file)
+        writer.writerow(TELEMETRY_FIELDS)
+        writer.writerows(rows)
