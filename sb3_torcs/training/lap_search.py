@@ -271,9 +271,9 @@ class LapSearch:
     def _driven_again(self, rows: FloatArray) -> Ghost:
         """Drive a race in the environment itself, which says when it ends and how long it took."""
         steering, pedal = rows[:, STEERING], rows[:, PEDAL]
-        pedals = [pedal] if self.env_kwargs["action"] == "pedal" else [pedal, -pedal]
-        columns = [steering, pedal] if len(pedals) == 1 else [steering, *np.maximum(pedals, 0.0)]
-        actions = np.stack(columns, axis=1).astype(np.float32)
+        throttle, brake = np.maximum(pedal, 0.0), np.maximum(-pedal, 0.0)
+        pedals = (pedal,) if self.env_kwargs["action"] == "pedal" else (throttle, brake)
+        actions = np.stack([steering, *pedals], axis=1).astype(np.float32)
         told = self.agent, self._start.driver, self.rollouts
         ghost = Ghost(self.env_kwargs, actions, (), *told)
         steps = list(ghost.drive())
