@@ -91,7 +91,7 @@ def run(args: argparse.Namespace) -> int:
     if ghost is None:
         raise InvalidOption(
             f"no whole race was found in {state.rollouts} rollouts, {seconds:.0f} s; "
-            "give more --seconds"
+            "give more --seconds or more --rollouts"
         )
     ghost.write(out)
     standing, *flying = ghost.lap_times
