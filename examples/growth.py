@@ -1,6 +1,7 @@
 """Measure how the speed grows with races, threads, opponents and batch sizes, and draw it."""
 
 import argparse
+import functools
 import json
 import os
 import time
@@ -41,11 +42,18 @@ def rate(step, seconds):
     return max(rates)
 
 
-def driving(races, threads, seconds, **env_kwargs):
-    """Return the timesteps per second of all races, driven by the scripted driver."""
+@functools.cache
+def drive_of_the_scripted_driver():
+    """Return the actions of a drive from the grid."""
     single = gym.make("Torcs-v0")
     asked = scripted_actions(single, 100)
     single.close()
+    return asked
+
+
+def driving(races, threads, seconds, **env_kwargs):
+    """Return the timesteps per second of all races, driven by the scripted driver."""
+    asked = drive_of_the_scripted_driver()
     envs = TorcsVecEnv(races, threads=threads, **env_kwargs)
     envs.reset()
     drive = iter(())
