@@ -10,17 +10,18 @@ from torch import nn
 from toy import ToyRace
 
 from sb3_torcs.callbacks import LeanUpdatesCallback
+from sb3_torcs.policies import BoundedPolicy
 from sb3_torcs.policies.ppo import LeanPPO, is_for
 
 RELU = {"activation_fn": nn.ReLU}
 SMALL = {"net_arch": {"pi": [8], "vf": [12, 6]}, **RELU}
 
 
-def make(policy_kwargs=SMALL, **kwargs):
+def make(policy_kwargs=SMALL, policy="MlpPolicy", **kwargs):
     """Rollouts of 40 timesteps in three unequal batches."""
     arguments = {"n_steps": 40, "batch_size": 16, "n_epochs": 3, "learning_rate": 0.01, **kwargs}
     with pytest.warns(UserWarning, match="truncated mini-batch"):
-        return PPO("MlpPolicy", ToyRace(), policy_kwargs=policy_kwargs, seed=0, **arguments)
+        return PPO(policy, ToyRace(), policy_kwargs=policy_kwargs, seed=0, **arguments)
 
 
 def learned(model, callback=None):
@@ -41,7 +42,7 @@ def learned(model, callback=None):
     {}, {"ent_coef": 0.1, "vf_coef": 0.2}, {"normalize_advantage": False},
     {"clip_range": 0.01, "max_grad_norm": 10.0},
     {"policy_kwargs": {"net_arch": [8, 8], "log_std_init": -1.0, **RELU}},
-    {"policy_kwargs": {**SMALL, "share_features_extractor": False}},
+    {"policy_kwargs": {**SMALL, "share_features_extractor": False}}, {"policy": BoundedPolicy},
 ])  # fmt: skip
 def test_lean_updates_learn_as_ppo_does(kwargs):
     """The same random numbers, log and state of Adam; tolerance: float32 in another order."""

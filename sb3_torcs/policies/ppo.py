@@ -24,6 +24,7 @@ from stable_baselines3.common.utils import explained_variance
 from torch import nn
 
 from sb3_torcs.policies import kernels
+from sb3_torcs.policies.bounded import BoundedHead, BoundedPolicy
 from sb3_torcs.policies.flat import Slot
 from sb3_torcs.policies.fused import array
 from sb3_torcs.policies.layers import compiled
@@ -94,7 +95,11 @@ class LeanPPO:
         self.model, self.policy = model, model.policy
         policy, first = self.policy, self.policy.log_std.numel()
         hidden = policy.mlp_extractor
-        self.actor = _Stack(hidden.policy_net, policy.action_net, first)  # type: ignore[arg-type]
+        head: Any = policy.action_net
+        last, self.bounds = head, (np.empty(0, np.float32),) * 2
+        if isinstance(head, BoundedHead):
+            last, self.bounds = head.linear, (array(head.middle), array(head.reach))
+        self.actor = _Stack(hidden.policy_net, last, first)
         self.critic = _Stack(hidden.value_net, policy.value_net, self.actor.part.stop)
         self.parameters = [policy.log_std, *self.actor.parameters, *self.critic.parameters]
         self.slots = [Slot((first,), False), *self.actor.slots, *self.critic.slots]
@@ -128,7 +133,7 @@ class LeanPPO:
         actions, values, chances = np.empty_like(noise), *np.empty((2, batch), np.float32)
         decide(
             (self.weights[actor.part], self.log_std, self.weights[critic.part]), actor.sizes,
-            critic.sizes, (features, noise), (actor.room(batch), critic.room(batch)),
+            critic.sizes, self.bounds, (features, noise), (actor.room(batch), critic.room(batch)),
             actions, values.reshape(-1, 1), chances,
         )  # fmt: skip
         return th.from_numpy(actions), th.from_numpy(values)[:, None], th.from_numpy(chances)
@@ -175,7 +180,7 @@ class LeanPPO:
         find_value = partial(self._find_value_gradient, observations, returns)
         running = other.submit(find_value) if other else None
         policy_loss, clipped, kl = find_policy_gradient(
-            self.weights[actor.part], self.log_std, actor.sizes, np.float32(clip),
+            self.weights[actor.part], self.log_std, actor.sizes, self.bounds, np.float32(clip),
             (observations, actions), (chances, advantages), actor.room(len(actions)),
             gradient[actor.part], gradient[: len(self.log_std)],
         )  # fmt: skip
@@ -263,9 +268,24 @@ class LeanPPO:
 
 
 @compiled
+def bound(means: Any, bounds: Any) -> None:
+    """
+    Do what :class:`~sb3_torcs.policies.bounded.BoundedHead` does after its layer.
+
+    :param means: (batch, actuators), overwritten
+    :param bounds: middle and half of the range of each; both empty for means without bounds
+    """
+    middle, half = bounds
+    if half.size:
+        for j in range(len(means)):
+            for o in range(half.size):
+                means[j, o] = middle[o] + half[o] * np.tanh(means[j, o])
+
+
+@compiled
 def decide(
-    parameters: Any, actor_sizes: Any, critic_sizes: Any, given: Any, rooms: Any, actions: Any,
-    values: Any, chances: Any,
+    parameters: Any, actor_sizes: Any, critic_sizes: Any, bounds: Any, given: Any, rooms: Any,
+    actions: Any, values: Any, chances: Any,
 ) -> None:  # fmt: skip
     """
     Draw actions and value observations.
@@ -274,6 +294,7 @@ def decide(
         the value function
     :param actor_sizes: of the policy's layers
     :param critic_sizes: of the value function's layers
+    :param bounds: of the means, as of ``bound``
     :param given: observations, (batch, features_dim), and noise, (batch, actuators)
     :param rooms: as ``work`` of ``stack_forward``, of each network
     :param actions: (batch, actuators), written
@@ -284,6 +305,7 @@ def decide(
     observations, noise = given
     kernels.stack_forward(actor, actor_sizes, False, observations, rooms[0], actions)
     kernels.stack_forward(critic, critic_sizes, False, observations, rooms[1], values)
+    bound(actions, bounds)
     deviations, two = np.exp(log_std), actions.dtype.type(2)
     chances[:] = 0
     for j in range(len(actions)):
@@ -295,8 +317,8 @@ def decide(
 
 @compiled
 def find_policy_gradient(
-    weights: Any, log_std: Any, sizes: Any, clip: Any, seen: Any, kept: Any, work: Any,
-    gradient: Any, d_log_std: Any,
+    weights: Any, log_std: Any, sizes: Any, bounds: Any, clip: Any, seen: Any, kept: Any,
+    work: Any, gradient: Any, d_log_std: Any,
 ) -> Any:  # fmt: skip
     """
     Find the gradient of PPO's clipped objective (Schulman et al., 2017, equation 7).
@@ -304,6 +326,7 @@ def find_policy_gradient(
     :param weights: of the policy's means
     :param log_std: (actuators,) logarithms of the standard deviations
     :param sizes: of the policy's layers
+    :param bounds: of the means, as of ``bound``
     :param clip: range of the ratio of probabilities about 1
     :param seen: observations and actions, (batch, ...)
     :param kept: (batch,) logarithms of the actions' probabilities in the rollout; advantages
@@ -318,7 +341,8 @@ def find_policy_gradient(
     one = real(1)
     slope = np.empty(actions.shape, weights.dtype)
     kernels.stack_forward(weights, sizes, False, observations, work, slope)
-    inverse = np.exp(-log_std)
+    bound(slope, bounds)
+    (middle, half), inverse = bounds, np.exp(-log_std)
     d_log_std[:] = 0
     loss, clipped, divergence = 0.0, 0, 0.0
     for j in range(batch):
@@ -339,6 +363,9 @@ def find_policy_gradient(
             z = slope[j, o]
             slope[j, o] = share * z * inverse[o]
             d_log_std[o] += share * (z * z - one)
+            if half.size:
+                tanh = (actions[j, o] - z / inverse[o] - middle[o]) / half[o]
+                slope[j, o] *= half[o] * (one - tanh * tanh)
     kernels.stack_backward(weights, sizes, False, observations, work, slope, gradient, NO_FEATURES)
     return loss / batch, clipped / batch, divergence / batch
 
@@ -382,7 +409,7 @@ def is_for(model: PPO) -> bool:
     policy = model.policy
     return (
         type(model).train is PPO.train
-        and type(policy) is ActorCriticPolicy
+        and type(policy) in (ActorCriticPolicy, BoundedPolicy)
         and isinstance(model.observation_space, spaces.Box)
         and len(model.observation_space.shape) == 1
         and type(policy.action_dist) is DiagGaussianDistribution

@@ -1,0 +1,103 @@
+"""A policy for PPO and A2C whose mean action always lies within the action space.
+
+SB3's own mean has no bounds, and an action beyond them is clipped. So a mean can drift to where
+every draw is full throttle: then no draw brakes, and PPO never learns that it should.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.preprocessing import get_action_dim
+from stable_baselines3.common.type_aliases import Schedule
+from torch import nn
+
+from sb3_torcs.errors import InvalidOption
+
+__all__ = ["BoundedHead", "BoundedPolicy"]
+
+
+class BoundedHead(nn.Module):
+    """
+    A layer whose outputs lie within bounds: middle + half of the range × tanh.
+
+    :param linear: the layer before tanh
+    :param space: of actions, with finite bounds
+    """
+
+    middle: th.Tensor
+    reach: th.Tensor
+
+    def __init__(self, linear: nn.Linear, space: spaces.Box) -> None:
+        super().__init__()
+        self.linear = linear
+        for name, value in (
+            ("middle", 0.5 * (space.high + space.low)),
+            ("reach", 0.5 * (space.high - space.low)),
+        ):
+            flat = th.from_numpy(value.reshape(-1).astype(np.float32))
+            self.register_buffer(name, flat, persistent=False)
+
+    def forward(self, latent: th.Tensor) -> th.Tensor:
+        """
+        Compute mean actions.
+
+        :param latent: (batch, inputs of the layer)
+        :return: (batch, actuators), within the bounds
+        """
+        return self.middle + self.reach * th.tanh(self.linear(latent))
+
+
+class BoundedPolicy(ActorCriticPolicy):
+    """
+    SB3's ``ActorCriticPolicy`` for a Gaussian whose mean has the bounds of the action space.
+
+    :param observation_space: as in ``ActorCriticPolicy``
+    :param action_space: a ``Box`` with finite bounds
+    :param lr_schedule: as in ``ActorCriticPolicy``
+    :param log_std_init: as in ``ActorCriticPolicy``, or one number per actuator
+    :param kwargs: the other arguments of ``ActorCriticPolicy``, but for ``use_sde``
+    :raises InvalidOption: if the action space has no bounds, or with ``use_sde``
+    """
+
+    action_net: BoundedHead
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
+        lr_schedule: Schedule,
+        log_std_init: float | Sequence[float] = 0.0,
+        **kwargs: Any,
+    ) -> None:
+        if not isinstance(action_space, spaces.Box) or not action_space.is_bounded():
+            raise InvalidOption(
+                f"BoundedPolicy needs a Box of actions with finite bounds, not {action_space}; "
+                "use MlpPolicy"
+            )
+        if kwargs.get("use_sde"):
+            raise InvalidOption("BoundedPolicy has no use_sde; leave it out, or use MlpPolicy")
+        number = np.size(log_std_init)
+        if number not in (1, get_action_dim(action_space)):
+            raise InvalidOption(
+                f"log_std_init has {number} numbers; expected one, or "
+                f"{get_action_dim(action_space)}, one per actuator"
+            )
+        self.first_log_std = log_std_init
+        super().__init__(observation_space, action_space, lr_schedule, **kwargs)
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        """Make the networks as SB3 does, and bound the mean."""
+        super()._build(lr_schedule)
+        with th.no_grad():
+            self.log_std.copy_(th.as_tensor(self.first_log_std))
+        assert isinstance(self.action_space, spaces.Box)
+        self.action_net = BoundedHead(self.action_net, self.action_space)  # type: ignore[arg-type]
+
+
+BoundedPolicy.__module__ = "sb3_torcs.policies"  # which hyperparameter files name
