@@ -34,6 +34,7 @@ __all__ = [
     "Start",
     "StartName",
     "car_from_record",
+    "checked_hard_starts",
     "checked_laps",
     "checked_start",
     "checked_start_speed",
@@ -147,6 +148,19 @@ def checked_start_speed(speed: float) -> float:
             f"speed of random starts is {speed!r}; expected 0 to {MAX_START_SPEED:g} m/s"
         )
     return float(speed)
+
+
+def checked_hard_starts(share: float) -> float:
+    """
+    Check how many random starts are hard ones.
+
+    :param share: of them, 0 to 1
+    :return: the same
+    :raises InvalidOption: for anything else
+    """
+    if not is_number(share) or not 0.0 <= share <= 1.0:
+        raise InvalidOption(f"the share of hard starts is {share!r}; expected 0 to 1")
+    return float(share)
 
 
 RIVALS = 4

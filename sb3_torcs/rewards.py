@@ -14,7 +14,7 @@ from typing import Literal
 from sb3_torcs.car import CAR_WIDTH, CarState, Controls, is_number
 from sb3_torcs.errors import InvalidOption, UnknownRewardTerm, near_miss
 
-__all__ = ["PRESETS", "TERMS", "Reward", "RewardChoice", "RewardName"]
+__all__ = ["CRASHES", "PRESETS", "TERMS", "Reward", "RewardChoice", "RewardName", "safe_speed"]
 
 BRAKING = 10.0  # [m/s²] a car on asphalt can do twice that, but not while it turns in
 BEND_SPEED = 12.0  # [m/s] in a bend behind which nothing is seen; the tightest hairpins need it
@@ -57,12 +57,20 @@ def pedals(before: CarState, after: CarState, controls: Controls) -> float:
     return controls.throttle * controls.brake
 
 
+def safe_speed(sight: float) -> float:
+    """√(12² + 2 · 10 · sight) [m/s], from which 10 m/s² slow down to 12 m/s within so many metres.
+
+    :param sight: [m]
+    """
+    return math.sqrt(BEND_SPEED**2 + 2.0 * BRAKING * sight)
+
+
 def overspeed(before: CarState, after: CarState, controls: Controls) -> float:
     """Speed beyond √(12² + 2 · 10 · d) [m/s], from which 10 m/s² slow down to 12 m/s within the
     longest range finder's d metres.
     """
     sight = max(float(after.range_finders.max()), 0.0)
-    return max(after.speed_x - math.sqrt(BEND_SPEED**2 + 2.0 * BRAKING * sight), 0.0)
+    return max(after.speed_x - safe_speed(sight), 0.0)
 
 
 def places(before: CarState, after: CarState, controls: Controls) -> float:

@@ -10,8 +10,9 @@ from conftest import ScriptedBackend
 
 from sb3_torcs.car import Controls, Start
 from sb3_torcs.envs.racing import RacingEnv
+from sb3_torcs.envs.starts import Starts
 from sb3_torcs.errors import CarLost, EnvClosed, InvalidAction, InvalidOption
-from sb3_torcs.rewards import TERMS
+from sb3_torcs.rewards import TERMS, safe_speed
 
 GAS = np.array([0.0, 1.0, 0.0], np.float32)
 
@@ -158,6 +159,40 @@ def test_random_starts_are_as_fast_as_asked(oval):
     assert 80.0 < max(speeds) <= 90.0
     with pytest.raises(InvalidOption, match="expected 0 to 150 m/s"):
         env.set_random_speed(-1.0)
+
+
+def test_hard_starts_lie_before_places_where_episodes_ended_badly(oval):
+    """At most at a speed that can be lost on the way there."""
+    left = {"distance_from_axis": 6.0, "distance_from_start": 120.0}
+    env = RacingEnv(ScriptedBackend(oval, left), start="random")
+    env.set_random_speed(90.0)
+    assert env.set_hard_starts(1.0) == 0.0
+    env.reset(seed=0)
+    assert env.step(GAS)[2]
+    before = len(env.backend.calls)
+    for _ in range(50):
+        env.reset()
+    moving = [call[1] for call in env.backend.calls[before:] if call[1] is not None]
+    assert 30 < len(moving) < 51  # some are on the grid
+    for start in moving:
+        ahead = (120.0 - start.distance) % oval.length
+        assert 20.0 <= ahead <= 300.0
+        assert start.speed <= safe_speed(ahead)
+    for share in (-0.1, 1.1, float("nan"), "half"):
+        with pytest.raises(InvalidOption, match="expected 0 to 1"):
+            env.set_hard_starts(share)
+
+
+def test_without_hard_starts_mishaps_change_no_start(oval):
+    """To the bit: no random number is drawn for them."""
+    drawn = []
+    for mishaps in (0, 3):
+        starts = Starts("random")
+        for _ in range(mishaps):
+            starts.remember(oval, 120.0)
+        rng = np.random.default_rng(0)
+        drawn.append([starts.draw(rng, oval) for _ in range(20)])
+    assert drawn[0] == drawn[1]
 
 
 @pytest.mark.parametrize(

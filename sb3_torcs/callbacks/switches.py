@@ -9,7 +9,13 @@ from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_torcs.callbacks.metrics import callbacks_in
-from sb3_torcs.car import StartName, checked_start, checked_start_speed, is_count
+from sb3_torcs.car import (
+    StartName,
+    checked_hard_starts,
+    checked_start,
+    checked_start_speed,
+    is_count,
+)
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.rewards import Reward, RewardChoice
 
@@ -81,13 +87,22 @@ class RandomStartCallback(_SwitchUser):
 
     :param start: ``"random"`` or ``"grid"``
     :param speed: highest speed of random starts [m/s]; by default the environment's own
+    :param hard: share of random starts that lie before places where episodes ended badly, at a
+        speed that can be lost on the way there, 0 to 1; see
+        :meth:`~sb3_torcs.envs.racing.RacingEnv.set_hard_starts`
     :param verbose: as in ``BaseCallback``
     """
 
     def __init__(
-        self, *, start: StartName = "random", speed: float | None = None, verbose: int = 0
+        self,
+        *,
+        start: StartName = "random",
+        speed: float | None = None,
+        hard: float = 0.0,
+        verbose: int = 0,
     ) -> None:
         super().__init__(verbose)
+        self.hard = checked_hard_starts(hard)
         self.start = checked_start(start)
         self.speed = None if speed is None else checked_start_speed(speed)
 
@@ -95,6 +110,8 @@ class RandomStartCallback(_SwitchUser):
         settings: list[tuple[str, Any]] = [("set_start", self.start)]
         if self.speed is not None:
             settings.append(("set_random_speed", self.speed))
+        if self.hard:
+            settings.append(("set_hard_starts", self.hard))
         self._switches = [_Switch(self.training_env, *setting) for setting in settings]
 
 

@@ -45,7 +45,8 @@ def _derived(name: str) -> None:
 
 for _name in ("track_position", "off_track", "gap_ahead", "gap_behind", "contacts", "faults"):
     _derived(_name)
-for _function in (end_of, stands, *(actions.action_layout(name).read for name in actions.ACTIONS)):
+_readers = (actions.action_layout(name).read for name in actions.ACTIONS)
+for _function in (end_of, stands, rewards.safe_speed, *_readers):
     register_jitable(_function)
 _read_pedals, _read_pedal, _read_manual = (
     actions.action_layout(name).read for name in ("pedals", "pedal", "manual")

@@ -1,19 +1,17 @@
-"""How an episode begins and drives: where it starts, how late controls arrive, grip and mass."""
+"""The conditions of an episode: how late controls arrive, grip and mass."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_torcs.car import MAX_START_SPEED, Controls, Start, is_count, is_number
+from sb3_torcs.car import Controls, is_count, is_number
 from sb3_torcs.errors import InvalidOption
 
-__all__ = ["MAX_DELAY", "Conditions", "Delay", "read_start"]
+__all__ = ["MAX_DELAY", "Conditions", "Delay"]
 
-RESET_OPTIONS = ("distance", "track_position", "heading_error", "speed")
 MAX_DELAY = 50  # control ticks: 1 s
 LEAST_FACTOR = 0.5  # of grip or mass; ice is another game
 RESTING = Controls(0.0, 0.0, 0.0)  # held until the first action arrives
@@ -142,39 +140,3 @@ class Conditions:
             )
             world.set_conditions(self.grip, self.mass)
         return Delay(ticks, repeat)
-
-
-def read_start(options: Any, length: float) -> Start:
-    """
-    Read the options of ``reset``.
-
-    :param options: where the episode begins; what is left out is 0
-    :param length: of the track [m]
-    :raises InvalidOption: if no car can start so
-    """
-    if not isinstance(options, Mapping):
-        raise InvalidOption(
-            f"options of reset is {options!r}; expected a dict, e.g. {{'distance': 100.0}}"
-        )
-    for name, value in options.items():
-        if name not in RESET_OPTIONS:
-            raise InvalidOption(
-                f"unknown reset option {name!r}; allowed: {', '.join(RESET_OPTIONS)}"
-            )
-        if not is_number(value):
-            raise InvalidOption(f"reset option {name} is {value!r}; expected a number")
-    values = {name: float(options.get(name, 0.0)) for name in RESET_OPTIONS}
-    if abs(values["track_position"]) > 1.0:
-        raise InvalidOption(
-            f"track_position is {values['track_position']:g}; expected -1 (right edge) to 1"
-        )
-    if not 0.0 <= values["speed"] <= MAX_START_SPEED:
-        raise InvalidOption(f"speed is {values['speed']:g} m/s; expected 0 to {MAX_START_SPEED:g}")
-    if abs(values["heading_error"]) > math.pi:
-        raise InvalidOption(f"heading_error is {values['heading_error']:g} rad; expected -pi to pi")
-    return Start(
-        values["distance"] % length,
-        values["track_position"],
-        values["heading_error"],
-        values["speed"],
-    )

@@ -12,7 +12,7 @@ from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
 from sb3_torcs.car import CarState, is_count
-from sb3_torcs.envs.conditions import RESET_OPTIONS
+from sb3_torcs.envs.starts import RESET_OPTIONS
 from sb3_torcs.envs.torcs_race import RaceCarEnv, make_race
 from sb3_torcs.errors import EnvClosed, InvalidAction, InvalidOption
 

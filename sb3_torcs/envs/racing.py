@@ -22,14 +22,16 @@ from sb3_torcs.car import (
     FloatArray,
     Start,
     StartName,
+    checked_hard_starts,
     checked_laps,
     checked_start,
     checked_start_speed,
     is_count,
 )
-from sb3_torcs.envs.conditions import Conditions, Delay, Part, read_start
+from sb3_torcs.envs.conditions import Conditions, Delay, Part
+from sb3_torcs.envs.starts import Starts, read_start
 from sb3_torcs.errors import CarLost, EnvClosed, InvalidOption
-from sb3_torcs.rewards import Reward, RewardChoice
+from sb3_torcs.rewards import CRASHES, Reward, RewardChoice
 from sb3_torcs.sensors import NEEDS_RACE, SensorsName, View
 from sb3_torcs.tracks.track import Track
 
@@ -44,13 +46,6 @@ STUCK_SPEED = 5.0 / 3.6  # [m/s] along the road; slower than walking counts as s
 STUCK_TICKS = 75  # control ticks of standing that end an episode: 1.5 s
 GRACE_TICKS = 150  # 3 s to get going after a standing start
 BACKWARDS_ANGLE = 0.5 * math.pi  # [rad] to the road from which the car faces backwards
-
-# A random start: anywhere on the track, near the axis, roughly along it, at any moderate speed; but
-# one in ten on the grid, since an agent that never stood still does not know how to set off.
-RANDOM_GRID_SHARE = 0.1
-RANDOM_TRACK_POSITION = 0.6  # [-]
-RANDOM_HEADING_ERROR = 0.25  # [rad]
-RANDOM_SPEED = 40.0  # [m/s] default
 
 
 class RacingInfo(TypedDict):
@@ -197,8 +192,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
             np.array(self.layout.low, np.float32), np.array(self.layout.high, np.float32)
         )
         self.set_reward(reward)
-        self.set_start(start)
-        self.set_random_speed(RANDOM_SPEED)
+        self._starts = Starts(checked_start(start))
         self.conditions = Conditions(delay, grip, mass)
         self.conditions.check(backend)
         self.delay = Delay(0, self.action_repeat)
@@ -240,26 +234,35 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         self._reward_choice = reward
         return previous
 
-    def set_start(self, start: StartName) -> StartName | None:
+    def set_start(self, start: StartName) -> StartName:
         """
         Change the start of episodes from the next reset on.
 
         :param start: ``"grid"`` or ``"random"``
         :return: the previous start
         """
-        previous = getattr(self, "_start", None)
-        self._start = checked_start(start)
+        previous, self._starts.start = self._starts.start, checked_start(start)
         return previous
 
-    def set_random_speed(self, speed: float) -> float | None:
+    def set_random_speed(self, speed: float) -> float:
         """
         Change the highest speed of random starts from the next reset on.
 
         :param speed: highest speed [m/s]
         :return: the previous one
         """
-        previous = getattr(self, "_random_speed", None)
-        self._random_speed = checked_start_speed(speed)
+        previous, self._starts.speed = self._starts.speed, checked_start_speed(speed)
+        return previous
+
+    def set_hard_starts(self, share: float) -> float:
+        """
+        Let random starts of the next resets begin where this environment's episodes end badly.
+
+        :param share: of random starts that lie 20 to 300 m before a place where one of the last 32
+            such episodes of the track ended, at a speed that can be lost on the way there [0 to 1]
+        :return: the previous one
+        """
+        previous, self._starts.hard = self._starts.hard, checked_hard_starts(share)
         return previous
 
     def reset(
@@ -278,7 +281,10 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         super().reset(seed=seed)
         if self._draw_track is not None:
             self._draw_track(self.np_random)
-        start = read_start(options, self.track.length) if options else self._draw_start()
+        if options:
+            start: Start | None = read_start(options, self.track.length)
+        else:
+            start = self._starts.draw(self.np_random, self.track)
         self.delay = self.conditions.draw(self.np_random, self.backend, self.action_repeat)
         self.car = None  # if the reset fails, no step is possible
         self.car = self.backend.reset(self.np_random, start)
@@ -358,6 +364,8 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
             # End the episode, and not a training of millions of timesteps.
             after, end = before, "lost"
         self.car = after
+        if end in CRASHES:
+            self._starts.remember(self.track, after.distance_from_start)
         terms = self.reward(before, after, self._controls, end)
         lap_time = after.last_lap_time if after.laps > before.laps else 0.0
         info = racing_info(after, lap_time, terms, end)
@@ -431,16 +439,3 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
 
     def _end_of_race(self) -> str | None:
         return "race" if self._race_is_over else None
-
-    def _draw_start(self) -> Start | None:
-        if self._start == "grid":
-            return None
-        draw = self.np_random.uniform
-        if draw() < RANDOM_GRID_SHARE:
-            return None
-        return Start(
-            draw(0.0, self.backend.track.length),
-            draw(-RANDOM_TRACK_POSITION, RANDOM_TRACK_POSITION),
-            draw(-RANDOM_HEADING_ERROR, RANDOM_HEADING_ERROR),
-            draw(0.0, self._random_speed),
-        )
