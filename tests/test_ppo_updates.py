@@ -5,11 +5,13 @@ import os
 import numpy as np
 import pytest
 import torch as th
-from stable_baselines3 import PPO
+from stable_baselines3 import A2C, PPO
+from stable_baselines3.common.callbacks import BaseCallback
 from torch import nn
 from toy import ToyRace
 
-from sb3_torcs.callbacks import LeanUpdatesCallback
+from sb3_torcs.callbacks import AdaptiveLearningRateCallback, LeanUpdatesCallback
+from sb3_torcs.errors import InvalidOption
 from sb3_torcs.policies import BoundedPolicy
 from sb3_torcs.policies.ppo import LeanPPO, is_for
 
@@ -122,3 +124,52 @@ def test_a_deterministic_action_is_the_mean():
         expected = model.policy.forward(observations, deterministic=True)
     found = lean.forward(observations, deterministic=True)
     th.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
+
+
+# ------------------------------------------------------------------------- learning rate
+
+
+class Rates(BaseCallback):
+    """Notes the divergence and the rate of each update, and what a model saved in it would say."""
+
+    def __init__(self):
+        super().__init__()
+        self.seen, self.saved = [], set()
+
+    def _on_step(self):
+        self.saved.add(self.model.lr_schedule(1.0))
+        return True
+
+    def _on_rollout_start(self):
+        logged = self.logger.name_to_value
+        if "train/approx_kl" in logged:
+            self.seen.append((logged["train/approx_kl"], logged["train/learning_rate"]))
+
+
+@pytest.mark.parametrize(("kl", "last"), [(1e-9, 0.01 / 1.5**3), (1e3, 0.01 * 1.5**3)])
+def test_the_learning_rate_follows_the_divergence(kl, last):
+    """It falls where updates change the policy too much, and rises where they change it little."""
+    model, rates = make(), Rates()
+    model.learn(200, callback=[AdaptiveLearningRateCallback(kl=kl), rates])
+    assert len(rates.seen) == 4
+    assert rates.seen[0][1] == 0.01
+    assert rates.seen[-1][1] == pytest.approx(last)
+    assert rates.saved == {0.01}
+
+
+def test_within_the_target_the_learning_rate_is_the_models_own():
+    first = make()
+    first.learn(80, callback=(rates := Rates()))
+    model = make()
+    target = rates.seen[0][0]
+    model.learn(120, callback=[AdaptiveLearningRateCallback(kl=target), rates := Rates()])
+    assert [rate for _, rate in rates.seen] == [0.01, 0.01]
+    assert model.lr_schedule(1.0) == 0.01
+
+
+def test_only_ppo_tells_a_divergence():
+    with pytest.raises(InvalidOption, match="the model is a A2C; take it out"):
+        A2C("MlpPolicy", ToyRace()).learn(5, callback=AdaptiveLearningRateCallback())
+    for kl in (0.0, -1.0, "small"):
+        with pytest.raises(InvalidOption, match="pass a divergence above 0"):
+            AdaptiveLearningRateCallback(kl=kl)

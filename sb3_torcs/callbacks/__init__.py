@@ -9,6 +9,7 @@ from sb3_torcs.callbacks.exploration import (
     StochasticBrakeCallback,
 )
 from sb3_torcs.callbacks.learning import (
+    AdaptiveLearningRateCallback,
     GradientStepsCallback,
     LeanUpdatesCallback,
     MirrorCallback,
@@ -20,6 +21,7 @@ from sb3_torcs.callbacks.switches import RandomStartCallback, RewardCallback
 
 __all__ = [
     "MONITOR_KWARGS",
+    "AdaptiveLearningRateCallback",
     "DrivingMetricsCallback",
     "GradientStepsCallback",
     "LeanUpdatesCallback",

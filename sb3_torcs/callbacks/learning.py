@@ -15,7 +15,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_torcs.callbacks.switches import require_method
-from sb3_torcs.car import is_count
+from sb3_torcs.car import is_count, is_number
 from sb3_torcs.errors import InvalidOption, renamed
 from sb3_torcs.policies import ppo, updates
 from sb3_torcs.policies.ppo import LeanPPO
@@ -24,7 +24,15 @@ from sb3_torcs.policies.split_head import SplitHeadPolicy
 from sb3_torcs.policies.updates import LeanUpdates
 from sb3_torcs.sensors import look_both_ways
 
-__all__ = ["GradientStepsCallback", "LeanUpdatesCallback", "MirrorCallback"]
+__all__ = [
+    "AdaptiveLearningRateCallback",
+    "GradientStepsCallback",
+    "LeanUpdatesCallback",
+    "MirrorCallback",
+]
+
+RATE_STEP = 1.5  # [-] by which the learning rate changes after an update
+LEAST_RATE, MOST_RATE = 0.01, 4.0  # [-] of the model's own
 
 
 class _WhileLearning(BaseCallback):
@@ -137,6 +145,54 @@ class LeanUpdatesCallback(_WhileLearning):
     def _undo(self) -> None:
         vars(self.model).pop("train", None)
         vars(self.model.policy).pop("forward", None)
+
+
+class AdaptiveLearningRateCallback(_WhileLearning):
+    """
+    Scale PPO's learning rate so that each update changes the policy about equally much.
+
+    As exploration fades, the same step changes what a Gaussian policy does more and more. So the
+    rate falls by a factor of 1.5 after an update whose divergence from the policy before is more
+    than twice the target, and rises by it after one with less than half of the target (Schulman et
+    al., 2017, section 4, adapt a penalty in the same way). The model's own schedule goes on below;
+    models that callbacks save keep it. A resumed training begins with it again.
+
+    :param kl: target of the divergence per update [nats]
+    :param verbose: as in ``BaseCallback``
+    :raises InvalidOption: if the target is not above 0, or the model is not PPO
+    """
+
+    def __init__(self, *, kl: float = 0.01, verbose: int = 0) -> None:
+        super().__init__(verbose)
+        if not is_number(kl) or kl <= 0.0:
+            raise InvalidOption(f"kl is {kl!r}; pass a divergence above 0, e.g. 0.01")
+        self.kl = kl
+        self.factor = 1.0
+
+    def _on_training_start(self) -> None:
+        if not isinstance(self.model, PPO):
+            raise InvalidOption(
+                f"{type(self).__name__} reads the divergence that PPO logs, but the model is a "
+                f"{type(self.model).__name__}; take it out of the callbacks"
+            )
+        self._own, self.factor = self.model.lr_schedule, 1.0
+
+    def _on_rollout_start(self) -> None:
+        super()._on_rollout_start()
+        kl = self.logger.name_to_value.get("train/approx_kl")
+        if kl is not None and kl > 2.0 * self.kl:
+            self.factor = max(self.factor / RATE_STEP, LEAST_RATE)
+        elif kl is not None and kl < 0.5 * self.kl:
+            self.factor = min(self.factor * RATE_STEP, MOST_RATE)
+
+    def _on_rollout_end(self) -> None:
+        self.model.lr_schedule = self._scaled
+
+    def _scaled(self, progress_remaining: float) -> float:
+        return self.factor * self._own(progress_remaining)
+
+    def _undo(self) -> None:
+        self.model.lr_schedule = self._own
 
 
 class MirrorCallback(_WhileLearning):
