@@ -39,7 +39,9 @@ def test_each_actuator_may_have_a_deviation_of_its_own():
 def test_a_saved_model_decides_as_before(tmp_path):
     model = make(log_std_init=[-2.0, 0.0, 0.5])
     model.save(tmp_path / "model.zip")
+    model.policy.save(tmp_path / "policy.pth")
     loaded = PPO.load(tmp_path / "model.zip")
+    assert BoundedPolicy.load(tmp_path / "policy.pth").log_std_init == [-2.0, 0.0, 0.5]
     observation = np.full(29, 0.3, np.float32)
     for deterministic in (True, False):
         actions = []

@@ -88,14 +88,15 @@ class BoundedPolicy(ActorCriticPolicy):
                 f"log_std_init has {number} numbers; expected one, or "
                 f"{get_action_dim(action_space)}, one per actuator"
             )
-        self.first_log_std = log_std_init
+        self._first_log_std = log_std_init
         super().__init__(observation_space, action_space, lr_schedule, **kwargs)
+        self.log_std_init = log_std_init  # type: ignore[assignment]  # for copies of this policy
 
     def _build(self, lr_schedule: Schedule) -> None:
         """Make the networks as SB3 does, and bound the mean."""
         super()._build(lr_schedule)
         with th.no_grad():
-            self.log_std.copy_(th.as_tensor(self.first_log_std))
+            self.log_std.copy_(th.as_tensor(self._first_log_std))
         assert isinstance(self.action_space, spaces.Box)
         self.action_net = BoundedHead(self.action_net, self.action_space)  # type: ignore[arg-type]
 
