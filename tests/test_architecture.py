@@ -49,9 +49,9 @@ STEP_AND_RESET = VOCABULARY | {"backends", "envs", "tracks"}
 LEARNING = {"callbacks", "noise", "policies"}
 
 DRAWS = {
-    "evaluation/watching.py", "rendering/game_camera.py", "rendering/game_video.py",
-    "rendering/gap.py", "rendering/highway.py", "rendering/hud.py", "rendering/scenery.py",
-    "rendering/viewer.py",
+    "evaluation/watching.py", "rendering/board.py", "rendering/game_camera.py",
+    "rendering/game_video.py", "rendering/gap.py", "rendering/highway.py", "rendering/hud.py",
+    "rendering/scenery.py", "rendering/viewer.py",
 }  # fmt: skip
 STARTS_PROGRAMS = {
     "torcs/display.py",

@@ -66,19 +66,15 @@ def test_who_is_out_has_not_won():
 
 class TestGrid:
     @pytest.fixture
-    def grids(self, monkeypatch, game):
+    def grids(self, game):
         """Hold races in which all come in as they start; return who started where."""
 
-        def hold(order, track, **options):
+        def hold(order, seed):
             (race,) = held([entrant.name for entrant in order])
             return race
 
-        monkeypatch.setattr("sb3_torcs.races.protocol.run_race", hold)
-
         def grids(drivers, **options):
-            entrants = find_entrants(drivers, game)
-            options = {"laps": 1, "races": 8, **options}
-            races = run_races(entrants, SHORT, **options)
+            races = run_races(find_entrants(drivers, game), hold, **{"races": 8, **options})
             return [[s.driver for s in race.standings] for race in races]
 
         return grids
@@ -158,6 +154,14 @@ def test_a_race_is_the_same_race_twice(game):
     assert np.array_equal(one.distances, other.distances)
     assert [standing.driver for standing in one.standings] == ["bt", "scripted"]
     assert one.places[-1].tolist() == [2, 1]
+
+
+def test_distances_count_from_the_line_and_not_from_each_car_s_slot(game):
+    """After a second, before anybody has overtaken: as they stood, and behind the line."""
+    race = run_race(find_entrants(["bt", "inferno"], game), SHORT, laps=1)
+    first, second = race.distances[0]
+    assert second < first - 5.0
+    assert first < 0.0
 
 
 def test_an_agent_that_answers_no_number_is_out_and_the_others_race_on(monkeypatch, game):

@@ -22,14 +22,16 @@ from sb3_torcs.files import writable_file
 if TYPE_CHECKING:
     from sb3_torcs.races.entrants import Entrant
     from sb3_torcs.races.protocol import Race
+    from sb3_torcs.races.video import Footage
     from sb3_torcs.telemetry import DriveLog
 
 __all__ = ["add_parser", "run"]
 
 FILES = {
-    "picture": (".png", ".svg", ".pdf"), "telemetry": (".parquet",), "report": (".html",),
+    "video": (".mp4",), "picture": (".png", ".svg", ".pdf"), "telemetry": (".parquet",),
+    "report": (".html",),
 }  # fmt: skip
-"""Endings of what can be written of the last race."""
+"""Endings of what can be written: a video of the first race, the others of the last one."""
 
 GRIDS = ("last", "reverse", "random")
 HEADERS = ("driver", "races", "wins", "win rate", "mean place", "finished", "damage/km", "rating")
@@ -67,6 +69,8 @@ def add_parser(subparsers: Any) -> None:
     add("--grid", choices=GRIDS, default="last", help="who starts where; default: last")
     add("--field", type=positive, metavar="N", help="cars in a race; default: all drivers")
     add("--seed", type=seed, default=0, metavar="S", help="of the first race; default: 0")
+    add("--video", metavar="FILE.mp4",
+        help="video of the first race from above; the camera follows its best agent")  # fmt: skip
     add("--picture", metavar="FILE",
         help="draw place and gap over distance of the last race (.png, .svg, .pdf)")  # fmt: skip
     add("--telemetry", metavar="FILE.parquet", help="write the drives of the last race")
@@ -88,13 +92,17 @@ def run(args: argparse.Namespace) -> int:
         if getattr(args, what)
     }
     from sb3_torcs.races.entrants import find_entrants
+    from sb3_torcs.races.video import Footage
     from sb3_torcs.telemetry import DriveLog
     from sb3_torcs.torcs.installation import find_game
 
     with quiet_output(args.json):
         entrants = find_entrants(args.drivers, find_game())
         log = DriveLog() if "telemetry" in files or "report" in files else None
-        races = _held(args, entrants, log)
+        footage = Footage() if "video" in files else None
+        races = _held(args, entrants, log, footage)
+        if footage is not None:
+            footage.save(files["video"], _followed(entrants, races[0]), args.laps)
         _write(files, races[-1], log, entrants[0].name)
     for race in races:
         for driver, why in race.failures.items():
@@ -104,6 +112,13 @@ def run(args: argparse.Namespace) -> int:
     else:
         _show(races, files)
     return 0
+
+
+def _followed(entrants: Sequence[Entrant], race: Race) -> str:
+    """Name the driver whom the camera follows: the best agent, or else the first one named."""
+    agents = {entrant.name for entrant in entrants if entrant.agent is not None}
+    places = [standing.driver for standing in race.standings if standing.driver in agents]
+    return next(iter(places), entrants[0].name)
 
 
 def _write(files: Mapping[str, Path], race: Race, log: DriveLog | None, first: str) -> None:
@@ -128,17 +143,29 @@ def _write(files: Mapping[str, Path], race: Race, log: DriveLog | None, first: s
 
 
 def _held(
-    args: argparse.Namespace, entrants: Sequence[Entrant], log: DriveLog | None
+    args: argparse.Namespace,
+    entrants: Sequence[Entrant],
+    log: DriveLog | None,
+    footage: Footage | None,
 ) -> list[Race]:
-    """Hold the races, behind a progress bar; the last one is noted in the log."""
+    """Hold the races behind a progress bar; the first one is recorded, the last one is noted."""
     from tqdm import tqdm
 
-    from sb3_torcs.races.protocol import run_races
+    from sb3_torcs.races.protocol import Notes, Watcher, run_race, run_races
+
+    def hold(order: Sequence[Entrant], number: int) -> Race:
+        watchers: list[Watcher] = []
+        if footage is not None and number == args.seed:
+            watchers.append(footage)
+        if log is not None and number == args.seed + args.races - 1:
+            watchers.append(Notes(log, args.track))
+        return run_race(
+            order, args.track, laps=args.laps, seed=number, trust=args.trust, watchers=watchers
+        )
 
     races = run_races(
-        entrants, args.track, laps=args.laps, races=args.races, grid=args.grid,
-        field_size=args.field, seed=args.seed, trust=args.trust, log=log,
-    )  # fmt: skip
+        entrants, hold, races=args.races, grid=args.grid, field_size=args.field, seed=args.seed
+    )
     return list(tqdm(races, total=args.races, file=sys.stderr, leave=False, disable=None))
 
 

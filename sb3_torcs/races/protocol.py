@@ -4,23 +4,34 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, Protocol, get_args
 
 import numpy as np
 
 from sb3_torcs.agents.pilots import Pilots
 from sb3_torcs.backends.native import load_race
 from sb3_torcs.backends.seats import SeatWorld, SharedRace
-from sb3_torcs.car import CONTROL_TICK, Controls
+from sb3_torcs.car import CONTROL_TICK, Controls, FloatArray
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.races.entrants import Entrant
 from sb3_torcs.telemetry import DriveLabel, DriveLog
 from sb3_torcs.torcs.starting_list import GRID_SLOTS
+from sb3_torcs.tracks.track import Track
 
 if TYPE_CHECKING:
     from sb3_torcs._engine import Engine
 
-__all__ = ["GRIDS", "GridName", "Race", "Standing", "run_race", "run_races"]
+__all__ = [
+    "GRIDS",
+    "GridName",
+    "Notes",
+    "Race",
+    "Standing",
+    "Watcher",
+    "behind_the_line",
+    "run_race",
+    "run_races",
+]
 
 GridName = Literal["last", "reverse", "random"]
 GRIDS = get_args(GridName)
@@ -60,21 +71,61 @@ class Race:
     standings: list[Standing]  # the winner first
     failures: dict[str, str]  # drivers that were taken out for what they answered
     drivers: list[str]  # by grid slot
-    distances: Any  # (moments, cars) [m] raced
+    distances: Any  # (moments, cars) [m] from the start line on
     places: Any  # (moments, cars)
+
+
+class Watcher(Protocol):
+    """What looks at a race after each control tick."""
+
+    def begin(self, engine: Engine, names: Sequence[str], road: Track) -> None:
+        """
+        Look at the grid.
+
+        :param engine: of a race that begins
+        :param names: of the drivers, by grid slot
+        :param road: of the race
+        """
+
+    def look(self) -> None:
+        """Look at the race, a control tick later."""
+
+
+class Notes:
+    """
+    Notes the drives of all cars.
+
+    :param log: that is written
+    :param track: its name there
+    """
+
+    def __init__(self, log: DriveLog, track: str) -> None:
+        self._log, self._track = log, track
+
+    def begin(self, engine: Engine, names: Sequence[str], road: Track) -> None:
+        """See :class:`Watcher`."""
+        del road
+        self._engine = engine
+        self._labels = [
+            DriveLabel(name, self._track, engine.car_name(slot), "Torcs-v0")
+            for slot, name in enumerate(names)
+        ]
+
+    def look(self) -> None:
+        """See :class:`Watcher`."""
+        for slot, label in enumerate(self._labels):
+            controls = Controls(*self._engine.controls(slot))
+            self._log.add(label, self._engine.read(slot), controls)
 
 
 def run_races(
     entrants: Sequence[Entrant],
-    track: str,
+    hold: Callable[[Sequence[Entrant], int], Race],
     *,
-    laps: int,
     races: int,
     grid: GridName = "last",
     field_size: int | None = None,
     seed: int = 0,
-    trust: bool = False,
-    log: DriveLog | None = None,
 ) -> Iterator[Race]:
     """
     Hold races one after the other.
@@ -83,15 +134,12 @@ def run_races(
     ``field_size`` who stands on it; both are drawn from the seed of the race.
 
     :param entrants: the drivers; the first one takes part in every race
-    :param track: as of ``Torcs-v0``
-    :param laps: of each race
+    :param hold: holds a race of drivers, the one in front first; with the seed of the race
     :param races: their number
     :param grid: ``"last"``: the first driver behind all others, who are drawn; ``"random"``: all
         are drawn; ``"reverse"``: in the reverse order of the race before, the first one drawn
     :param field_size: cars in each race, the others are drawn; ``None`` is all
     :param seed: of the first race; the others have the next ones
-    :param trust: as of :class:`~sb3_torcs.agents.pilots.Pilots`
-    :param log: that notes the drives of the last race
     :raises InvalidOption: if no such races can be held
     """
     if grid not in GRIDS:
@@ -103,11 +151,9 @@ def run_races(
             f"{GRID_SLOTS}, which is what a grid has room for"
         )
     before: list[str] = []
-    for number in range(races):
-        rng = np.random.default_rng(seed + number)
-        order = _grid(entrants, size, grid, before, rng)
-        noted = log if number == races - 1 else None
-        race = run_race(order, track, laps=laps, seed=seed + number, trust=trust, log=noted)
+    for number in range(seed, seed + races):
+        order = _grid(entrants, size, grid, before, np.random.default_rng(number))
+        race = hold(order, number)
         before = [standing.driver for standing in race.standings]
         yield race
 
@@ -136,7 +182,7 @@ def run_race(
     laps: int,
     seed: int = 0,
     trust: bool = False,
-    log: DriveLog | None = None,
+    watchers: Sequence[Watcher] = (),
 ) -> Race:
     """
     Hold a race by the game's rules: who crosses the line after the winner has finished.
@@ -146,7 +192,7 @@ def run_race(
     :param laps: to drive
     :param seed: which is kept with the race
     :param trust: as of :class:`~sb3_torcs.agents.pilots.Pilots`
-    :param log: that notes every car after every control tick
+    :param watchers: that look at it
     :raises ModelMismatch: if an agent does not fit this race
     """
     agents = [entrant.agent for entrant in order if entrant.agent is not None]
@@ -174,9 +220,11 @@ def run_race(
             pilots.begin(seed)
         else:
             engine.start()
+        for watcher in watchers:
+            watcher.begin(engine, names, road)
+        starts = behind_the_line(engine, road, len(order))
         limit = (laps + 1) * (PIT_STOP + road.length / SLOWEST)
-        note = None if log is None else _noting(engine, names, track, log)
-        for _ in _stretches(engine, pilots, limit, note):
+        for _ in _stretches(engine, pilots, limit, watchers):
             cars = [engine.read(number) for number in range(len(order))]
             moments.append([(car.distance_raced, car.race_position) for car in cars])
         standings = _standings(engine, names)
@@ -186,25 +234,23 @@ def run_race(
     finally:
         engine.close()
     trace = np.array(moments)
-    return Race(seed, standings, failures, names, trace[..., 0], trace[..., 1].astype(int))
+    return Race(seed, standings, failures, names, trace[..., 0] - starts, trace[..., 1].astype(int))
 
 
-def _noting(engine: Engine, names: Sequence[str], track: str, log: DriveLog) -> Callable[[], None]:
-    """Return what notes all cars."""
-    labels = [
-        DriveLabel(name, track, engine.car_name(slot), "Torcs-v0")
-        for slot, name in enumerate(names)
-    ]
+def behind_the_line(engine: Engine, road: Track, cars: int) -> FloatArray:
+    """
+    Measure how far the grid slots are behind the start line [m].
 
-    def note() -> None:
-        for slot, label in enumerate(labels):
-            log.add(label, engine.read(slot), Controls(*engine.controls(slot)))
-
-    return note
+    :param engine: of a race that begins
+    :param road: of the race
+    :param cars: their number
+    """
+    places = np.array([engine.read(slot).distance_from_start for slot in range(cars)])
+    return (road.length - places) % road.length
 
 
 def _stretches(
-    engine: Engine, pilots: Pilots | None, limit: float, note: Callable[[], None] | None
+    engine: Engine, pilots: Pilots | None, limit: float, watchers: Sequence[Watcher]
 ) -> Iterator[None]:
     """
     Drive to the end of the race, a second at a time.
@@ -212,19 +258,17 @@ def _stretches(
     :param engine: with the race
     :param pilots: of the agents
     :param limit: of the race [s]
-    :param note: called after every control tick
+    :param watchers: that look at it after every control tick
     """
     tick = 0
     while tick * CONTROL_TICK < limit and not engine.ended:
         look = tick + LOOK
         while tick < look and not engine.ended:
             ticks = look - tick if pilots is None else min(pilots.act(tick), look - tick)
-            if note is None:
-                engine.drive(ticks)
-            else:
-                for _ in range(ticks):
-                    engine.drive(1)
-                    note()
+            for part in [1] * ticks if watchers else [ticks]:
+                engine.drive(part)
+                for watcher in watchers:
+                    watcher.look()
             tick += ticks
         yield
         if all(out or engine.finished(car) for car, *_, out in engine.results()):

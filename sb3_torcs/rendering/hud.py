@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import string
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from sb3_torcs.rendering.highway import pygame, to_highway
 from sb3_torcs.rendering.scenery import Colour
 from sb3_torcs.tracks.track import Track
 
-__all__ = ["Dashboard", "lap_clock"]
+__all__ = ["MARGIN", "MUTED", "TEXT", "Dashboard", "Typeface", "lap_clock", "panel", "unit_of"]
 
 DESIGN = 640  # [px] the shorter side for which the sizes here are meant
 MARGIN = 10
@@ -25,7 +26,7 @@ GREEN: Colour = (74, 190, 92)
 RED: Colour = (226, 70, 58)
 AMBER: Colour = (242, 180, 58)
 BLUE: Colour = (92, 164, 236)
-CHARACTERS = string.ascii_letters + string.digits + " .:-/"
+CHARACTERS = string.ascii_letters + string.digits + string.punctuation + " "
 
 KMH = 3.6  # km/h per m/s
 REVS_SHOWN = 10000.0  # [rpm] at the bar's end
@@ -43,7 +44,16 @@ def lap_clock(seconds: float) -> str:
     return f"{hundredths // 6000}:{hundredths // 100 % 60:02d}.{hundredths % 100:02d}"
 
 
-class _Typeface:
+def unit_of(size: tuple[int, int]) -> float:
+    """
+    Return how much larger instruments are than their design.
+
+    :param size: width and height of the picture [px]
+    """
+    return min(size) / DESIGN
+
+
+class Typeface:
     """
     Letters of one size, rendered once, which is faster.
 
@@ -63,7 +73,11 @@ class _Typeface:
 
     def width(self, text: str) -> int:
         """Width of a text [px]."""
-        return sum(self._letters[TEXT][c].get_width() for c in text)
+        return sum(self._letter(c, TEXT).get_width() for c in text)
+
+    def _letter(self, character: str, colour: Colour) -> pygame.Surface:
+        letters = self._letters[colour]
+        return letters.get(character, letters["?"])
 
     def write(
         self,
@@ -77,14 +91,14 @@ class _Typeface:
         Write a line.
 
         :param target: the picture
-        :param text: made of ``CHARACTERS``
+        :param text: letters that are not of ``CHARACTERS`` become question marks
         :param place: left and top [px]
         :param colour: of the letters
         :param align: 0 puts the text right of the place, 0.5 on it, 1 left of it
         """
         x = round(place[0] - align * self.width(text))
         for character in text:
-            letter = self._letters[colour][character]
+            letter = self._letter(character, colour)
             target.blit(letter, (x, round(place[1])))
             x += letter.get_width()
 
@@ -98,26 +112,33 @@ class Dashboard:
     """
 
     def __init__(self, size: tuple[int, int], track: Track) -> None:
-        self._unit = unit = min(size) / DESIGN
+        self._unit = unit = unit_of(size)
         self._size = size
-        self._small, self._normal = _Typeface(19 * unit), _Typeface(26 * unit)
-        self._large, self._huge = _Typeface(44 * unit), _Typeface(72 * unit)
-        self._laps = _panel(158 * unit, 112 * unit)
-        self._panel = _panel(416 * unit, 92 * unit)
-        self._warning = _panel(140 * unit, 34 * unit)
+        self._small, self._normal = Typeface(19 * unit), Typeface(26 * unit)
+        self._large, self._huge = Typeface(44 * unit), Typeface(72 * unit)
+        self._laps = panel(158 * unit, 112 * unit)
+        self._panel = panel(416 * unit, 92 * unit)
+        self._warning = panel(140 * unit, 34 * unit)
         self._map = _Map(150 * unit, track)
 
-    def draw(self, picture: pygame.Surface, car: CarState, controls: Controls) -> None:
+    def draw(
+        self,
+        picture: pygame.Surface,
+        car: CarState,
+        controls: Controls,
+        others: Sequence[tuple[CarState, Colour]] = (),
+    ) -> None:
         """
         Draw the instruments over a picture.
 
         :param picture: of the size given to the constructor
         :param car: its state
         :param controls: its controls
+        :param others: cars that the map shows, too, and their colours
         """
         margin = MARGIN * self._unit
         self._draw_laps(picture, (margin, margin), car)
-        self._map.draw(picture, (self._size[0] - margin - self._map.side, margin), car)
+        self._map.draw(picture, (self._size[0] - margin - self._map.side, margin), car, others)
         left = 0.5 * (self._size[0] - self._panel.get_width())
         self._draw_panel(
             picture, (left, self._size[1] - margin - self._panel.get_height()), car, controls
@@ -183,11 +204,16 @@ class Dashboard:
             self._small.write(picture, label, at(x + 10, 68), MUTED, 0.5)
 
 
-def _panel(width: float, height: float) -> pygame.Surface:
-    """Make a translucent ground for instruments; width and height in pixels."""
-    panel = pygame.Surface((round(width), round(height)), pygame.SRCALPHA, 32)
-    pygame.draw.rect(panel, PANEL, panel.get_rect(), border_radius=8)
-    return panel
+def panel(width: float, height: float) -> pygame.Surface:
+    """
+    Make a translucent ground for instruments.
+
+    :param width: [px]
+    :param height: [px]
+    """
+    ground = pygame.Surface((round(width), round(height)), pygame.SRCALPHA, 32)
+    pygame.draw.rect(ground, PANEL, ground.get_rect(), border_radius=8)
+    return ground
 
 
 def _bar(
@@ -248,7 +274,7 @@ class _Map:
         low, high = points.min(0), points.max(0)
         self._centre = 0.5 * (low + high)
         self._scaling = 0.84 * self.side / float((high - low).max())
-        self._ground = _panel(self.side, self.side)
+        self._ground = panel(self.side, self.side)
         pixels = [self._pixel(point) for point in points]
         outline = pygame.Surface((2 * self.side, 2 * self.side), pygame.SRCALPHA, 32)
         outline.fill((*MUTED, 0))  # of the line's colour, or scaling would darken its edges
@@ -269,17 +295,25 @@ class _Map:
         ends = (place[0] - x, place[1] - y), (place[0] + x, place[1] + y)
         pygame.draw.line(self._ground, TEXT, *ends, max(round(0.014 * self.side), 1))
 
-    def draw(self, picture: pygame.Surface, place: tuple[float, float], car: CarState) -> None:
+    def draw(
+        self,
+        picture: pygame.Surface,
+        place: tuple[float, float],
+        car: CarState,
+        others: Sequence[tuple[CarState, Colour]] = (),
+    ) -> None:
         """
         Draw the map.
 
         :param picture: what to draw on
         :param place: upper left corner [px]
-        :param car: the dot
+        :param car: the dot in front of all others
+        :param others: cars and their colours
         """
         left, top = round(place[0]), round(place[1])
         picture.blit(self._ground, (left, top))
-        x, y = self._pixel(to_highway(car.x, car.y))
-        dot = left + min(max(x, 0.0), self.side), top + min(max(y, 0.0), self.side)
-        pygame.draw.circle(picture, TEXT, dot, 0.036 * self.side)
-        pygame.draw.circle(picture, RED, dot, 0.026 * self.side)
+        for other, colour in (*others, (car, RED)):
+            x, y = self._pixel(to_highway(other.x, other.y))
+            dot = left + min(max(x, 0.0), self.side), top + min(max(y, 0.0), self.side)
+            pygame.draw.circle(picture, TEXT, dot, 0.036 * self.side)
+            pygame.draw.circle(picture, colour, dot, 0.026 * self.side)

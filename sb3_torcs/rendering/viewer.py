@@ -15,6 +15,7 @@ import copy
 import logging
 import math
 import os
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,6 +23,7 @@ import numpy.typing as npt
 
 from sb3_torcs.car import STEER_LOCK, CarState, Controls, FloatArray
 from sb3_torcs.errors import EnvClosed, InvalidOption
+from sb3_torcs.rendering.board import Board, Field
 from sb3_torcs.rendering.highway import (
     RaceCar,
     Road,
@@ -32,7 +34,7 @@ from sb3_torcs.rendering.highway import (
     to_highway,
 )
 from sb3_torcs.rendering.hud import Dashboard
-from sb3_torcs.rendering.scenery import GRASS_FAR, WALL, WHITE, Scenery
+from sb3_torcs.rendering.scenery import GRASS_FAR, WALL, WHITE, Colour, Scenery
 from sb3_torcs.tracks.track import Track
 
 __all__ = ["Viewer"]
@@ -118,6 +120,7 @@ class _Stage(NamedTuple):
     scenery: Scenery
     road: Road
     dashboard: Dashboard | None
+    board: Board | None
 
 
 class Viewer:
@@ -147,7 +150,12 @@ class Viewer:
         self._clock = pygame.time.Clock()
 
     def frame(
-        self, track: Track, car: CarState, controls: Controls, range_finder_angles: FloatArray
+        self,
+        track: Track,
+        car: CarState,
+        controls: Controls,
+        range_finder_angles: FloatArray | None,
+        field: Field | None = None,
     ) -> Frame:
         """
         Draw one frame, and show it if there is a window.
@@ -155,17 +163,22 @@ class Viewer:
         :param track: what the car drives on
         :param car: its state
         :param controls: what it was told
-        :param range_finder_angles: (19,) of the beams against the car's axis, left negative [rad]
+        :param range_finder_angles: (19,) of the beams against the car's axis, left negative [rad];
+            ``None`` draws no beams
+        :param field: the other cars of its race, and the board
         :return: (height, width, 3)
         :raises EnvClosed: after ``close``, or when the window has been closed
         """
         if self._closed:
             raise EnvClosed("the viewer is closed; make a new environment with gym.make")
         stage = self._set_stage(track, car)
-        self._draw_world(stage, car, controls, range_finder_angles)
+        others = () if field is None else field.others
+        self._draw_world(stage, car, controls, range_finder_angles, others)
         pygame.transform.smoothscale(self._world, self._size, self._picture)
         if stage.dashboard is not None:
-            stage.dashboard.draw(self._picture, car, controls)
+            stage.dashboard.draw(self._picture, car, controls, others)
+        if stage.board is not None and field is not None:
+            stage.board.draw(self._picture, field)
         if self._window is not None:
             self._show()
         pixels = np.frombuffer(pygame.image.tobytes(self._picture, "RGB"), np.uint8)
@@ -183,31 +196,33 @@ class Viewer:
         if self._stage is None or self._stage.track is not track:
             road = Road(road_network(track))
             road.vehicles.append(RaceCar(road, track, car))
-            dashboard = None
+            dashboard = board = None
             if min(self._size) >= SMALLEST_DASHBOARD:
-                dashboard = Dashboard(self._size, track)
-            self._stage = _Stage(track, Scenery(track), road, dashboard)
+                dashboard, board = Dashboard(self._size, track), Board(self._size)
+            self._stage = _Stage(track, Scenery(track), road, dashboard, board)
         return self._stage
 
     def _draw_world(
-        self, stage: _Stage, car: CarState, controls: Controls, angles: FloatArray
+        self,
+        stage: _Stage,
+        car: CarState,
+        controls: Controls,
+        angles: FloatArray | None,
+        others: Sequence[tuple[CarState, Colour]],
     ) -> None:
         """Draw all that lies in the track's plane, far to near."""
         world = self._world
         world.look(_camera(stage.track, car, float(world.anchor[1])))
         world.fill(GRASS_FAR)
         _draw_ground(world, stage.scenery)
-        _draw_beams(world, car, angles)
+        if angles is not None:
+            _draw_beams(world, car, angles)
         vehicle = stage.road.vehicles[0]
-        vehicle.pose(car)
-        _draw_tyres(world, vehicle, controls.steering)
-        # highway-env draws the heading as it is in the world; on a turned view it is relative.
-        turned = copy.copy(vehicle)
-        turned.heading = vehicle.heading - world.up - 0.5 * math.pi
-        # It also rounds all sizes down, which moves the body to its left by a pixel or two.
-        right = np.array([-math.sin(vehicle.heading), math.cos(vehicle.heading)])
-        turned.position = vehicle.position + BODY_SHIFT / world.scaling * right
-        VehicleGraphics.display(turned, world, offscreen=True, draw_roof=True)
+        for other, colour in others:
+            vehicle.color = colour
+            _draw_car(world, vehicle, other, 0.0)
+        vehicle.color = RaceCar.color
+        _draw_car(world, vehicle, car, controls.steering)
 
     def _show(self) -> None:
         """Show the picture in the window, and wait until the next is due."""
@@ -298,6 +313,19 @@ def _draw_beams(world: TurnedSurface, car: CarState, angles: FloatArray) -> None
     for (x, y), distance in zip(world.project(ends).tolist(), car.range_finders, strict=True):
         if distance < RANGE:
             pygame.draw.circle(world, BEAM_END, (x, y), radius)
+
+
+def _draw_car(world: TurnedSurface, vehicle: RaceCar, car: CarState, steering: float) -> None:
+    """Draw a car where its state says, with its front wheels steered [-1, 1]."""
+    vehicle.pose(car)
+    _draw_tyres(world, vehicle, steering)
+    # highway-env draws the heading as it is in the world; on a turned view it is relative.
+    turned = copy.copy(vehicle)
+    turned.heading = vehicle.heading - world.up - 0.5 * math.pi
+    # It also rounds all sizes down, which moves the body to its left by a pixel or two.
+    right = np.array([-math.sin(vehicle.heading), math.cos(vehicle.heading)])
+    turned.position = vehicle.position + BODY_SHIFT / world.scaling * right
+    VehicleGraphics.display(turned, world, offscreen=True, draw_roof=True)
 
 
 def _draw_tyres(world: TurnedSurface, vehicle: RaceCar, steering: float) -> None:
