@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from array import array
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import cached_property
 from pathlib import Path
@@ -125,6 +125,10 @@ class ScrBackend:
         self._lost_before = 0  # of a client that has left
         self.driver_name = ""
         """What our own server shows and writes down; empty for the address."""
+        self.patience = PATIENCE_WITH_OTHERS
+        """Until a server at a host of its own has to answer [s]."""
+        self.watch: Callable[[], None] = self._watch
+        """Called while the server is silent; raises if it has ended."""
         self.latencies = array("d")
         """From the arrival of each state to our answer [s], at a host of its own."""
         self._owner = os.getpid()
@@ -263,11 +267,11 @@ class ScrBackend:
             self._launch()
         host, port = self._address
         manners: dict[str, Any] = {
-            "patience": PATIENCE_WITH_OTHERS, "silence": SILENCE, "latencies": self.latencies,
+            "patience": self.patience, "silence": SILENCE, "latencies": self.latencies,
         }  # fmt: skip
         if self._own:
-            manners = {"patience": PATIENCE, "pause": PAUSE, "watch": self._watch}
-        manners["name"] = self.driver_name
+            manners = {"patience": PATIENCE, "pause": PAUSE}
+        manners |= {"name": self.driver_name, "watch": self.watch}
         self._client = ScrClient(host, port, self.range_finder_angles, **manners)
         self._client.identify(start)
 

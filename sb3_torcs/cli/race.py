@@ -34,6 +34,8 @@ FILES = {
 """Endings of what can be written: a video of the first race, the others of the last one."""
 
 GRIDS = ("last", "reverse", "random")
+BAR = "{l_bar}{bar}| {n:.1f}/{total} races [{elapsed}<{remaining}]"
+UNKNOWN = "-"  # in tables
 HEADERS = ("driver", "races", "wins", "win rate", "mean place", "finished", "damage/km", "rating")
 LAST_RACE = ("place", "driver", "from", "laps", "time s", "best lap s", "damage", "contacts")
 
@@ -47,6 +49,9 @@ all; reverse begins each race in the reverse order of the standings before. With
 holds the first driver and N - 1 of the others, who are drawn.
 
 A win rate comes with its 95 % interval. Ratings are those of openskill (Plackett-Luce).
+
+With --game the installed game holds the same races, and comes to the same standings. It does not
+count contacts and metres.
 """
 
 
@@ -76,6 +81,8 @@ def add_parser(subparsers: Any) -> None:
     add("--telemetry", metavar="FILE.parquet", help="write the drives of the last race")
     add("--report", metavar="FILE.html",
         help="make the lap report of the last race, as `sb3-torcs compare` does")  # fmt: skip
+    add("--game", action="store_true",
+        help="let the installed game hold the races; it has seats for 10 agents")  # fmt: skip
     add("--trust", action="store_true", help=TRUST_HELP)
     add("--json", action="store_true", help="print one JSON object and nothing else")
     parser.set_defaults(run=run)
@@ -91,11 +98,14 @@ def run(args: argparse.Namespace) -> int:
         for what, suffixes in FILES.items()
         if getattr(args, what)
     }
+    from sb3_torcs.errors import InvalidOption
     from sb3_torcs.races.entrants import find_entrants
     from sb3_torcs.races.video import Footage
     from sb3_torcs.telemetry import DriveLog
     from sb3_torcs.torcs.installation import find_game
 
+    if args.game and files:
+        raise InvalidOption(f"--{next(iter(files))} is for races of the engine; leave out --game")
     with quiet_output(args.json):
         entrants = find_entrants(args.drivers, find_game())
         log = DriveLog() if "telemetry" in files or "report" in files else None
@@ -151,22 +161,34 @@ def _held(
     """Hold the races behind a progress bar; the first one is recorded, the last one is noted."""
     from tqdm import tqdm
 
+    from sb3_torcs.races.in_the_game import run_game_race
     from sb3_torcs.races.protocol import Notes, Watcher, run_race, run_races
 
-    def hold(order: Sequence[Entrant], number: int) -> Race:
-        watchers: list[Watcher] = []
-        if footage is not None and number == args.seed:
-            watchers.append(footage)
-        if log is not None and number == args.seed + args.races - 1:
-            watchers.append(Notes(log, args.track))
-        return run_race(
-            order, args.track, laps=args.laps, seed=number, trust=args.trust, watchers=watchers
-        )
+    races: list[Race] = []
+    with tqdm(total=args.races, file=sys.stderr, leave=False, disable=None, bar_format=BAR) as bar:
 
-    races = run_races(
-        entrants, hold, races=args.races, grid=args.grid, field_size=args.field, seed=args.seed
-    )
-    return list(tqdm(races, total=args.races, file=sys.stderr, leave=False, disable=None))
+        def tell(share: float) -> None:
+            bar.update(len(races) + share - bar.n)
+
+        def hold(order: Sequence[Entrant], number: int) -> Race:
+            options: dict[str, Any] = {
+                "laps": args.laps, "seed": number, "trust": args.trust, "progress": tell,
+            }  # fmt: skip
+            if args.game:
+                return run_game_race(order, args.track, **options)
+            watchers: list[Watcher] = []
+            if footage is not None and number == args.seed:
+                watchers.append(footage)
+            if log is not None and number == args.seed + args.races - 1:
+                watchers.append(Notes(log, args.track))
+            return run_race(order, args.track, watchers=watchers, **options)
+
+        for race in run_races(
+            entrants, hold, races=args.races, grid=args.grid, field_size=args.field, seed=args.seed
+        ):
+            races.append(race)
+            tell(0.0)
+    return races
 
 
 def _as_json(args: argparse.Namespace, races: list[Race]) -> dict[str, Any]:
@@ -192,7 +214,9 @@ def _show(races: list[Race], files: Mapping[str, Path]) -> None:
         (
             f["driver"], str(f["races"]), str(f["wins"]),
             "{1:.0%} ({0:.0%} to {2:.0%})".format(*f["win_rate"]), f"{f['mean_place']:.2f}",
-            str(f["finished"]), f"{f['damage_per_km']:.0f}", "{:.1f} ± {:.1f}".format(*f["rating"]),
+            str(f["finished"]),
+            UNKNOWN if f["damage_per_km"] is None else f"{f['damage_per_km']:.0f}",
+            "{:.1f} ± {:.1f}".format(*f["rating"]),
         )
         for f in driver_figures(races)
     ]))  # fmt: skip
@@ -200,8 +224,8 @@ def _show(races: list[Race], files: Mapping[str, Path]) -> None:
     print(table(LAST_RACE, [
         (
             "out" if s.out else str(s.place), s.driver, str(s.grid_slot), str(s.laps),
-            f"{s.time:.3f}", "-" if s.best_lap is None else f"{s.best_lap:.3f}",
-            f"{s.damage:.0f}", str(s.contacts),
+            f"{s.time:.3f}", UNKNOWN if s.best_lap is None else f"{s.best_lap:.3f}",
+            f"{s.damage:.0f}", UNKNOWN if s.contacts is None else str(s.contacts),
         )
         for s in races[-1].standings
     ]))  # fmt: skip

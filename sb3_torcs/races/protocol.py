@@ -52,9 +52,9 @@ class Standing:
     time: float  # [s] with penalties, of whole laps
     best_lap: float | None  # [s] of those that count
     damage: float  # [points]
-    contacts: int  # with other cars
+    contacts: int | None  # with other cars; the game itself does not count them
     out: bool  # did not finish
-    distance: float = field(repr=False, default=0.0)  # [m]
+    distance: float | None = field(repr=False, default=0.0)  # [m] which the game does not tell
 
     def as_dict(self) -> dict[str, Any]:
         """Return the fields as the command prints them."""
@@ -183,6 +183,7 @@ def run_race(
     seed: int = 0,
     trust: bool = False,
     watchers: Sequence[Watcher] = (),
+    progress: Callable[[float], object] = float,
 ) -> Race:
     """
     Hold a race by the game's rules: who crosses the line after the winner has finished.
@@ -193,6 +194,7 @@ def run_race(
     :param seed: which is kept with the race
     :param trust: as of :class:`~sb3_torcs.agents.pilots.Pilots`
     :param watchers: that look at it
+    :param progress: called now and then with the share of the race that is over, 0 to 1
     :raises ModelMismatch: if an agent does not fit this race
     """
     agents = [entrant.agent for entrant in order if entrant.agent is not None]
@@ -227,6 +229,7 @@ def run_race(
         for _ in _stretches(engine, pilots, limit, watchers):
             cars = [engine.read(number) for number in range(len(order))]
             moments.append([(car.distance_raced, car.race_position) for car in cars])
+            progress(min(max(car.distance_raced for car in cars) / (laps * road.length), 1.0))
         standings = _standings(engine, names)
         failed = {} if pilots is None else pilots.failed
         seats = engine.agents

@@ -45,8 +45,6 @@ def driver_figures(races: Sequence[Race]) -> list[dict[str, Any]]:
 
 def _figures(driver: str, standings: Sequence[Standing]) -> dict[str, Any]:
     wins = sum(standing.place == 1 and not standing.out for standing in standings)
-    kilometres = sum(standing.distance for standing in standings) / 1000.0
-    damage = sum(standing.damage for standing in standings)
     return {
         "driver": driver,
         "races": len(standings),
@@ -54,5 +52,14 @@ def _figures(driver: str, standings: Sequence[Standing]) -> dict[str, Any]:
         "win_rate": wilson(wins, len(standings)),
         "mean_place": fmean(standing.place for standing in standings),
         "finished": sum(not standing.out for standing in standings),
-        "damage_per_km": damage / kilometres if kilometres > 0.0 else 0.0,
+        "damage_per_km": _damage_per_km(standings),
     }
+
+
+def _damage_per_km(standings: Sequence[Standing]) -> float | None:
+    """Divide damage by distance; ``None`` if that is not known."""
+    distances = [standing.distance for standing in standings if standing.distance is not None]
+    if len(distances) < len(standings):
+        return None
+    damage = sum(standing.damage for standing in standings)
+    return 1000.0 * damage / sum(distances) if sum(distances) > 0.0 else 0.0

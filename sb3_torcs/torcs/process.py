@@ -81,7 +81,7 @@ class GameProcess:
             )
         for name, index in race.drivers:
             if name == SCR_SERVER:
-                game.find_car(race.car)
+                game.find_car(race.client_car(index))
             else:
                 game.find_robot(name, index)
         self._own_scenery: Path | None = None

@@ -57,7 +57,7 @@ class RaceSetup:
         ``("scr_server", 0)`` is the first of our own module
     :param laps: to drive
     :param session: ``"practice"``, for one driver, lap by lap; or ``"race"``
-    :param car: of the drivers of ``scr_server``
+    :param car: of the drivers of ``scr_server``, or of each of them, by their indices
     :raises InvalidOption: if the game cannot run this race
     """
 
@@ -65,7 +65,7 @@ class RaceSetup:
     drivers: Sequence[tuple[str, int]]
     laps: int = MANY_LAPS
     session: Session = "practice"
-    car: str = DEFAULT_CAR
+    car: str | Sequence[str] = DEFAULT_CAR
 
     def __post_init__(self) -> None:
         if self.session not in SESSIONS:
@@ -90,6 +90,14 @@ class RaceSetup:
         """Whether there are clients of the SCR protocol."""
         return any(name == SCR_SERVER for name, _ in self.drivers)
 
+    def client_car(self, index: int) -> str:
+        """
+        Return the car of a driver of ``scr_server``.
+
+        :param index: of the driver
+        """
+        return self.car if isinstance(self.car, str) else self.car[index]
+
     def cars(self, game: Game) -> list[str]:
         """
         List the drivers' cars.
@@ -98,7 +106,7 @@ class RaceSetup:
         :return: the cars of the drivers, in their order
         """
         return [
-            self.car if name == SCR_SERVER else game.find_robot(name, index).car
+            self.client_car(index) if name == SCR_SERVER else game.find_robot(name, index).car
             for name, index in self.drivers
         ]
 
@@ -118,7 +126,7 @@ def write_race(game: Game, folder: Path, race: RaceSetup) -> str:
     _needed(game, ENGINE_SETTINGS)
     shutil.copyfile(game.data / ENGINE_SETTINGS, settings)
     if race.has_clients:
-        _write_scr_drivers(folder, race.car)
+        _write_scr_drivers(folder, race)
         _forbid_learning(folder, race)
     template = f"config/raceman/{SESSIONS[race.session]}.xml"
     _needed(game, template)
@@ -142,20 +150,20 @@ def write_race(game: Game, folder: Path, race: RaceSetup) -> str:
     return race_name
 
 
-def _write_scr_drivers(folder: Path, car: str) -> None:
+def _write_scr_drivers(folder: Path, race: RaceSetup) -> None:
     """
     Describe the drivers of our module, as the game wants it of a robot.
 
     :param folder: private to the game
-    :param car: that they drive
+    :param race: in which they drive
     """
     root = Node.new(SCR_SERVER, "robotdef")
-    for number in range(SCR_DRIVERS):
+    for number in sorted(index for name, index in race.drivers if name == SCR_SERVER):
         driver = root.make("Robots", "index", str(number))
         driver.set("name", f"{SCR_SERVER} {number}")
         driver.set("team", SCR_SERVER)
         driver.set("author", "sb3_torcs")
-        driver.set("car name", car)
+        driver.set("car name", race.client_car(number))
         driver.set("race number", number + 1)
         for channel, share in (("red", 1.0), ("green", 0.4), ("blue", 0.0)):
             driver.set(channel, share)

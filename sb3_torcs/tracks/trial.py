@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from sb3_torcs import errors
-from sb3_torcs.car import FloatArray
+from sb3_torcs.car import DEFAULT_CAR, FloatArray
 from sb3_torcs.errors import BackendUnavailable, TrackFileError
 from sb3_torcs.torcs.installation import Game, torcs_folders
 from sb3_torcs.torcs.params import digests
@@ -233,10 +233,12 @@ def check_track(game: Game, race: RaceSetup, file: Path) -> None:
     """
     load_track(file)
     robots = [driver for driver in race.drivers if driver[0] != SCR_SERVER]
-    agent = [("", 0)] if race.has_clients else []  # the engine has one, whoever drives it
+    clients = [index for name, index in race.drivers if name == SCR_SERVER]
+    agent = [("", 0)] if clients else []  # one stands for all, as they have no part in the track
+    cars = [race.client_car(index) for index in clients[:1]] or [DEFAULT_CAR]
     try_race(
         file,
         engine_arguments(
-            game, file, agent + robots, cars=[race.car], session=race.session, laps=race.laps
+            game, file, agent + robots, cars=cars, session=race.session, laps=race.laps
         ),
     )
