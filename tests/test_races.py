@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 
+from sb3_torcs.agents.pilots import Crew
 from sb3_torcs.agents.robots import race as robots_race
 from sb3_torcs.agents.scripted import ScriptedDriver
 from sb3_torcs.cli import main
@@ -124,13 +125,23 @@ class TestGrid:
     [
         (["bt", "bt:2"], "driver 'bt' is named twice"),
         (["ddpg-roads", "ddpg-roads"], "driver 'ddpg-roads' is named twice"),
-        (["infermo"], "infermo.*nor is it a robot of the game; did you mean 'inferno'"),
+        (["infermo"], "infermo.*and there is no robot 'infermo'; did you mean 'inferno'"),
         (["lap.npz"], "is a ghost, which looks at nobody"),
     ],
 )
 def test_a_driver_that_cannot_take_part(drivers, message, game):
     with pytest.raises(InvalidOption, match=message):
         find_entrants(drivers, game)
+
+
+def test_the_error_is_one_wherever_robots_and_agents_can_be_named(capsys, game):
+    message = "and there is no robot 'infermo'; did you mean 'inferno'"
+    for find in (lambda: find_entrants(["infermo"], game), lambda: Crew(["infermo"])):
+        with pytest.raises(InvalidOption, match=message):
+            find()
+    for command in (["compare", "infermo", "bt"], ["watch", "infermo"], ["race", "infermo"]):
+        assert main(command) == 2
+        assert message in capsys.readouterr().err
 
 
 def test_robots_race_as_by_the_game_s_rules(game):

@@ -8,7 +8,7 @@ import os
 import pickle
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
@@ -35,9 +35,13 @@ from sb3_torcs.errors import (
 )
 from sb3_torcs.sensors import range_finder_angles
 
+if TYPE_CHECKING:
+    from sb3_torcs.torcs.installation import Game
+
 __all__ = [
     "ModelDriver",
     "TrainingRecord",
+    "agent_record",
     "check_resumable",
     "check_spaces",
     "driver_name",
@@ -188,6 +192,22 @@ def driver_record(driver: str | Path) -> TrainingRecord:
     if is_ghost(driver):
         return TrainingRecord(env_id="Torcs-v0", env_kwargs=read_ghost(driver).env_kwargs)
     return TrainingRecord() if str(driver) == SCRIPTED else training_record(find_model(driver))
+
+
+def agent_record(driver: str | Path, game: Game | None) -> TrainingRecord:
+    """
+    Read how an agent was trained, where a robot of the game could be named as well.
+
+    :param driver: that is none of the game's robots, as of :func:`driver_record`
+    :param game: the installation; without one there are no robots
+    :return: what is known
+    :raises InvalidOption: if there is no such agent; names robots of a similar name
+    """
+    try:
+        return driver_record(driver)
+    except InvalidOption as error:
+        hint = near_miss(str(driver), () if game is None else game.robots())
+        raise InvalidOption(f"{error}; and there is no robot '{driver}'{hint}") from None
 
 
 def driver_name(driver: str | Path) -> str:

@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 
 from sb3_torcs.agents.ghosts import is_ghost
-from sb3_torcs.agents.models import driver_record, load_driver
+from sb3_torcs.agents.models import agent_record, load_driver
 from sb3_torcs.agents.wrapping import wrapped
 from sb3_torcs.backends.seats import SeatWorld, SharedRace
 from sb3_torcs.car import DEFAULT_CAR, FloatArray
 from sb3_torcs.envs.torcs_race import RaceCarEnv
 from sb3_torcs.errors import InvalidAction, InvalidOption, ModelMismatch
 from sb3_torcs.sensors import range_finder_angles
+from sb3_torcs.torcs.installation import find_game
 
 __all__ = ["CarOfAnAgent", "Crew", "Pilots"]
 
@@ -27,14 +28,14 @@ class CarOfAnAgent:
     What an agent's car needs before its race is loaded.
 
     :param driver: as of :func:`~sb3_torcs.agents.models.load_driver`
-    :raises InvalidOption: if there is no such driver, or it is a ghost
+    :raises InvalidOption: if there is no such agent, or it is a ghost
     """
 
     def __init__(self, driver: str) -> None:
         if is_ghost(driver):
             raise InvalidOption(f"'{driver}' is a ghost, which looks at nobody and cannot race")
         self.driver = driver
-        self.record = driver_record(driver)
+        self.record = agent_record(driver, find_game())
         kwargs = self.record.env_kwargs
         car = kwargs.get("car", DEFAULT_CAR)
         self.car: str = car if isinstance(car, str) else DEFAULT_CAR

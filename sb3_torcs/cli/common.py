@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from sb3_torcs.agents.models import TrainingRecord
+    from sb3_torcs.torcs.installation import Game
 
 __all__ = [
     "MODEL_HELP",
@@ -31,17 +32,18 @@ MODEL_HELP = "a saved .zip, a run's folder, a shipped agent, a ghost, or 'script
 TRUST_HELP = "run the code that is pickled in the model: only if you trust its author"
 
 
-def told_record(driver: str) -> TrainingRecord:
+def told_record(driver: str, game: Game | None = None) -> TrainingRecord:
     """
     Read how a driver was trained; warn on standard error if no record is found.
 
     :param driver: as typed
+    :param game: the installation, where one of its robots can be named instead
     :return: the record, which may be empty
     """
-    from sb3_torcs.agents.models import driver_record
+    from sb3_torcs.agents.models import agent_record, driver_record
     from sb3_torcs.agents.scripted import SCRIPTED
 
-    record = driver_record(driver)
+    record = driver_record(driver) if game is None else agent_record(driver, game)
     if not record.known and driver != SCRIPTED:
         print(
             f"sb3-torcs: '{driver}' has no record of its training; track, car, action repeat "

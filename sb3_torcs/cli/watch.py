@@ -11,7 +11,6 @@ from sb3_torcs.cli.results import show_results
 from sb3_torcs.files import writable_file
 
 if TYPE_CHECKING:
-    from sb3_torcs.agents.models import TrainingRecord
     from sb3_torcs.evaluation.watching import Show
     from sb3_torcs.torcs.installation import Game
 
@@ -135,15 +134,14 @@ def _shows(game: Game, names: Sequence[str], args: argparse.Namespace) -> list[S
     from sb3_torcs.errors import InvalidOption
     from sb3_torcs.evaluation.watching import Show
 
-    known = game.robots()
-    robots = [game.parse_robot(n) if n.partition(":")[0] in known else None for n in names]
+    robots = [game.parse_robot(name) if game.has_robot(name) else None for name in names]
     if args.car is not None and all(robots):
         raise InvalidOption(
             f"--car is for models; a robot has one for each index, e.g. {names[0]}:1, and "
             "`sb3-torcs robots` lists them"
         )
     records = [
-        _record(game, name) if robot is None else TrainingRecord()
+        told_record(name, game) if robot is None else TrainingRecord()
         for name, robot in zip(names, robots, strict=True)
     ]
     trained = [r.env_kwargs["track"] for r in records if "track" in r.env_kwargs]
@@ -157,22 +155,6 @@ def _shows(game: Game, names: Sequence[str], args: argparse.Namespace) -> list[S
         )
         for name, robot, record in zip(names, robots, records, strict=True)
     ]
-
-
-def _record(game: Game, name: str) -> TrainingRecord:
-    """
-    Read how a model was trained; if there is no such model, suggest a robot.
-
-    :param game: the installation
-    :param name: as typed
-    """
-    from sb3_torcs.errors import InvalidOption, near_miss
-
-    try:
-        return told_record(name)
-    except InvalidOption as error:
-        hint = near_miss(name, game.robots())
-        raise InvalidOption(f"{error}; and there is no robot '{name}'{hint}") from None
 
 
 def _in_window(show: Show, args: argparse.Namespace) -> None:

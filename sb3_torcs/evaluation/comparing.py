@@ -11,11 +11,11 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sb3_torcs.agents.models import driver_name, driver_record, load_driver, one_track
+from sb3_torcs.agents.models import agent_record, driver_name, load_driver, one_track
 from sb3_torcs.agents.robots import drive_log
 from sb3_torcs.agents.rollout import drive
 from sb3_torcs.car import checked_laps
-from sb3_torcs.errors import BackendUnavailable, DriveFileError, InvalidOption, near_miss
+from sb3_torcs.errors import BackendUnavailable, DriveFileError, InvalidOption
 from sb3_torcs.evaluation.protocol import RACE_LAPS, choose_world, race_environment
 from sb3_torcs.evaluation.ticks import log_drives
 from sb3_torcs.files import writable_file
@@ -24,7 +24,7 @@ from sb3_torcs.telemetry.document import write_document
 from sb3_torcs.telemetry.drives import read_drives
 from sb3_torcs.telemetry.laps import Drive, drives_of
 from sb3_torcs.telemetry.page import lap_report
-from sb3_torcs.torcs.installation import find_game
+from sb3_torcs.torcs.installation import Game, find_game
 from sb3_torcs.torcs.track_names import RANDOM_TRACK
 from sb3_torcs.tracks.catalogue import load_track
 from sb3_torcs.tracks.track import Track
@@ -168,20 +168,24 @@ def _trained_on(drivers: Sequence[str | Path]) -> str:
     """Return the track of the first agent whose training is known."""
     for driver in drivers:
         if _robot(str(driver)) is None:
-            track = driver_record(driver).env_kwargs.get("track")
+            track = agent_record(driver, _game()).env_kwargs.get("track")
             if track is not None:
                 return str(one_track(track))
     return DEFAULT_TRACK
 
 
+def _game() -> Game | None:
+    """Return the installation; without one there are no robots, and agents drive elsewhere."""
+    try:
+        return find_game()
+    except BackendUnavailable:
+        return None
+
+
 def _robot(driver: str) -> tuple[str, int] | None:
     """Return the name and the index of a robot; ``None`` if there is none of this name."""
-    try:
-        game = find_game()
-    except BackendUnavailable:  # no game, no robots
-        return None
-    known = driver.partition(":")[0] in game.robots()
-    return game.parse_robot(driver) if known else None
+    game = _game()
+    return None if game is None or not game.has_robot(driver) else game.parse_robot(driver)
 
 
 def _driven(driver: str, track: str, laps: int, trust: bool) -> list[Drive]:
@@ -194,11 +198,7 @@ def _driven(driver: str, track: str, laps: int, trust: bool) -> list[Drive]:
 
 def _agent_log(driver: str, track: str, laps: int, trust: bool) -> DriveLog:
     """Let an agent drive, where it was trained, and note each control tick."""
-    try:
-        record = driver_record(driver)
-    except InvalidOption as error:
-        hint = near_miss(driver, _robots())
-        raise InvalidOption(f"{error}; and there is no robot '{driver}'{hint}") from None
+    record = agent_record(driver, _game())
     world = choose_world(driver, record.env_id, track)
     env = race_environment(
         world.env_id,
@@ -215,13 +215,6 @@ def _agent_log(driver: str, track: str, laps: int, trust: bool) -> DriveLog:
     finally:
         env.close()
     return log
-
-
-def _robots() -> list[str]:
-    try:
-        return list(find_game().robots())
-    except BackendUnavailable:
-        return []
 
 
 def _told_apart(drives: Sequence[Drive]) -> list[Drive]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from sb3_torcs.agents.models import driver_name
 from sb3_torcs.agents.pilots import CarOfAnAgent
-from sb3_torcs.errors import InvalidOption, UnknownRobot, near_miss
+from sb3_torcs.errors import InvalidOption
 from sb3_torcs.torcs.installation import Game
 
 __all__ = ["Entrant", "find_entrants"]
@@ -45,13 +45,8 @@ def find_entrants(drivers: Sequence[str], game: Game) -> list[Entrant]:
 
 
 def _find(driver: str, game: Game) -> Entrant:
-    name = driver.partition(":")[0]
-    if name in game.robots():
-        robot = game.parse_robot(driver)
-        usual = game.parse_robot(name) == robot
-        return Entrant(name if usual else f"{name}:{robot[1]}", robot=robot)
-    try:
+    if not game.has_robot(driver):
         return Entrant(driver_name(driver), agent=CarOfAnAgent(driver))
-    except (InvalidOption, UnknownRobot) as error:
-        hint = near_miss(name, game.robots())
-        raise InvalidOption(f"{error}; nor is it a robot of the game{hint}") from error
+    robot = name, index = game.parse_robot(driver)
+    usual = game.parse_robot(name) == robot
+    return Entrant(name if usual else f"{name}:{index}", robot=robot)

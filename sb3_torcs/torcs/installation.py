@@ -141,6 +141,14 @@ class Game:
             raise UnknownCar(f"the game at {self.data} has no car '{name}'{hint}")
         return cars[name]
 
+    def has_robot(self, text: str) -> bool:
+        """
+        Tell a robot from other drivers.
+
+        :param text: ``"inferno:5"``, ``"inferno"``, or the name or path of an agent
+        """
+        return text.strip().partition(":")[0] in self.robots()
+
     def parse_robot(self, text: str) -> tuple[str, int]:
         """
         Read a robot's name, perhaps with the index of its driver.

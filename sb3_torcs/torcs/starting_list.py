@@ -71,7 +71,4 @@ def guests_of(opponents: Sequence[str], game: Game) -> list[str]:
     """
     if not isinstance(opponents, (list, tuple)):
         return []
-    robots = game.robots()
-    return [
-        name for name in opponents if isinstance(name, str) and name.partition(":")[0] not in robots
-    ]
+    return [name for name in opponents if isinstance(name, str) and not game.has_robot(name)]
