@@ -183,6 +183,24 @@ def test_hard_starts_lie_before_places_where_episodes_ended_badly(oval):
             env.set_hard_starts(share)
 
 
+def test_an_episode_whose_drawn_place_is_a_wall_begins_on_the_grid(oval):
+    """A training does not end of it; who asked for the place is told."""
+
+    class Walled(ScriptedBackend):
+        def reset(self, rng, start):
+            if start is not None:
+                raise InvalidOption("agent would stand in a wall")
+            return super().reset(rng, start)
+
+    env = RacingEnv(Walled(oval), start="random")
+    env.reset(seed=0)
+    for _ in range(5):
+        env.reset()
+    assert env.backend.calls == [("reset", None)] * 6
+    with pytest.raises(InvalidOption, match="in a wall"):
+        env.reset(options={"distance": 5.0})
+
+
 def test_without_hard_starts_mishaps_change_no_start(oval):
     """To the bit: no random number is drawn for them."""
     drawn = []

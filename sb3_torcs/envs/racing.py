@@ -287,7 +287,14 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
             start = self._starts.draw(self.np_random, self.track)
         self.delay = self.conditions.draw(self.np_random, self.backend, self.action_repeat)
         self.car = None  # if the reset fails, no step is possible
-        self.car = self.backend.reset(self.np_random, start)
+        try:
+            self.car = self.backend.reset(self.np_random, start)
+        except InvalidOption:
+            if options or start is None:
+                raise
+            # A wall stands where a start was drawn, which happens once in some hundred thousand.
+            start = None
+            self.car = self.backend.reset(self.np_random, start)
         self._controls = Controls(0.0, 0.0, 0.0)
         self.patience = STUCK_TICKS if start is not None and start.speed > 0.0 else GRACE_TICKS
         self.standing = 0
