@@ -102,11 +102,19 @@ def off_line(before: CarState, after: CarState, controls: Controls) -> float:
     return max(over, 0.0) * abs(after.speed_x)
 
 
+def leaving(before: CarState, after: CarState, controls: Controls) -> float:
+    """Speed² where the car leaves the road, else 0 [m²/s²]: the energy that gravel or a wall takes
+    (Wurman et al., Nature 602, 2022, charge both so). So a car that cannot stay on the road still
+    learns to brake.
+    """
+    return after.speed_x**2 + after.speed_y**2 if after.off_track else 0.0
+
+
 TERMS: dict[str, Term] = {
     term.__name__: term
     for term in (
         speed_along, speed_across, speed_off_axis, progress, time, damage, pedals, overspeed,
-        places, gap, contact, fault, off_line,
+        places, gap, contact, fault, off_line, leaving,
     )
 }  # fmt: skip
 
