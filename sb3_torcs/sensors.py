@@ -1,9 +1,10 @@
 """The sensor table, from which all that concerns observations is derived.
 
 Its rows stand in groups, which an environment's ``sensors`` names: ``"base"`` are sensors of the
-SCR manual (arXiv:1304.1672, table 1), ``"preview"`` is the road ahead, and ``"opponents"``,
-``"rivals"`` and ``"race"`` are the other cars. The observation space, the encoder, the mirror
-image, the documentation and the policy's view of the observation are all derived from the table.
+SCR manual (arXiv:1304.1672, table 1), ``"preview"`` is the road ahead, ``"limits"`` are the speeds
+that it allows, and ``"opponents"``, ``"rivals"`` and ``"race"`` are the other cars. The observation
+space, the encoder, the mirror image, the documentation and the policy's view of the observation are
+all derived from the table.
 
 To add a group, write its rows, put them into :data:`GROUPS`, and its function into ``_WRITERS``.
 """
@@ -24,7 +25,7 @@ from numba.extending import overload
 
 from sb3_torcs.car import RIVALS, CarState, FloatArray
 from sb3_torcs.errors import InvalidOption
-from sb3_torcs.tracks.profile import INTERVALS, QUANTITIES, look_ahead
+from sb3_torcs.tracks.profile import INTERVALS, QUANTITIES, RoadProfile, look_ahead, speed_margins
 
 __all__ = [
     "GROUPS",
@@ -47,7 +48,7 @@ __all__ = [
     "sensors_of_size",
 ]
 
-SensorsName = Literal["base", "preview", "opponents", "rivals", "race"]
+SensorsName = Literal["base", "preview", "limits", "opponents", "rivals", "race"]
 Mirror = Literal["same", "opposite", "reversed", "sides"]
 
 
@@ -96,6 +97,11 @@ learning.
 """
 USUAL_BEND = 1.0 / 50.0  # [1/m] seen as 0.5
 
+LIMITS = (Sensor("speed_margins_ahead", "", INTERVALS, "m/s", -40.0, 40.0, 1.0 / 20.0),)
+"""By how much the car may be faster now, in the light of each interval of the road ahead: below 0
+it has to brake. Bends are taken at 15 m/s² and brakes slow down by 10 m/s². A car on asphalt can do
+more, so that an agent learns how much more is possible."""
+
 OPPONENTS = (Sensor("opponents", "opponents", 36, "m", 0.0, 200.0, 1.0 / 200.0, "reversed"),)
 """Distances to the nearest car in sectors of 10°, clockwise; the first begins straight behind."""
 
@@ -124,6 +130,7 @@ NEEDS_RACE = frozenset({"rivals", "race"})
 GROUPS: Mapping[SensorsName, tuple[Sensor, ...]] = {
     "base": SENSORS,
     "preview": PREVIEW,
+    "limits": LIMITS,
     "opponents": OPPONENTS,
     "rivals": RIVAL_ROWS,
     "race": RACE,
@@ -314,9 +321,37 @@ def _scale_preview(
         numbers[i] = _scaled(means[i // INTERVALS, i % INTERVALS], _PREVIEW_AT + i)
 
 
+def _profile(world: Any) -> RoadProfile:
+    """The road of a world, with hills if it has some."""
+    return getattr(world, "profile", None) or world.track.profile
+
+
 def _write_preview(world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> None:
-    profile = getattr(world, "profile", None) or world.track.profile
-    _scale_preview(profile.sums, profile.step, car.distance_from_start, numbers)
+    sums, step = _profile(world)
+    _scale_preview(sums, step, car.distance_from_start, numbers)
+
+
+_LIMITS_AT = _PARTS["limits"].start
+
+
+@njit(cache=True)
+def _scale_limits(
+    sums: FloatArray,
+    step: float,
+    distance: float,
+    speed: float,
+    numbers: npt.NDArray[np.float32],
+) -> None:
+    """Find the margins, scale and clip; as :func:`_scale_preview`."""
+    margins = np.empty(INTERVALS)
+    speed_margins(sums, step, distance, speed, margins)
+    for i in range(INTERVALS):
+        numbers[i] = _scaled(margins[i], _LIMITS_AT + i)
+
+
+def _write_limits(world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> None:
+    sums, step = _profile(world)
+    _scale_limits(sums, step, car.distance_from_start, car.speed_x, numbers)
 
 
 @njit(cache=True)
@@ -344,6 +379,7 @@ def _write_race(world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> 
 
 _WRITERS: dict[str, Callable[[Any, CarState, npt.NDArray[np.float32]], None]] = {
     "preview": _write_preview,
+    "limits": _write_limits,
     "opponents": _write_opponents,
     "rivals": _write_rivals,
     "race": _write_race,

@@ -167,6 +167,7 @@ GENERATED = {
         "torcs-arguments": torcs_arguments_table,
         "sensors": sensor_table,
         "preview": functools.partial(sensor_table, "preview"),
+        "limits": functools.partial(sensor_table, "limits"),
         "opponents": functools.partial(sensor_table, "opponents"),
         "rivals": functools.partial(sensor_table, "rivals"),
         "race": functools.partial(sensor_table, "race"),

@@ -23,7 +23,7 @@ from sb3_torcs.errors import InvalidOption
 from sb3_torcs.evaluation.protocol import race_environment
 from sb3_torcs.policies.mirror import mirror_observations
 from sb3_torcs.sensors import GROUPS, View, feature_slices, sensors_of_size
-from sb3_torcs.tracks.profile import INTERVALS, look_ahead, road_profile
+from sb3_torcs.tracks.profile import DISTANCES, INTERVALS, look_ahead, road_profile, speed_margins
 from sb3_torcs.tracks.track import Segment, Track
 from sb3_torcs.vec_env import TorcsVecEnv
 
@@ -110,6 +110,44 @@ def test_the_game_has_hills_and_the_fallback_none(game):
         flat, _ = env.reset(seed=0, options={"distance": 1000.0})
     assert not flat[SLOPES].any()
     np.testing.assert_allclose(flat[BENDS], observation[BENDS], atol=1e-3)
+
+
+# ---------------------------------------------------------------------------- limits of speed
+
+
+def margins(profile, distance, speed):
+    numbers = np.empty(INTERVALS)
+    speed_margins(profile.sums, profile.step, distance, speed, numbers)
+    return numbers
+
+
+def test_a_limit_is_a_speed_that_can_be_lost_before_the_bend():
+    """300 m of straight, then a bend of 40 m, which is taken at the root of 15 times 40 m/s."""
+    road = ([300.0, 300.0, 200.0], [0.0, 0.025, 0.0], [10.0] * 3, [0.0] * 3)
+    profile = road_profile(*map(np.array, road))
+    for distance in (150.0, 230.0, 277.0):
+        free = [a < 300.0 - distance - 15.0 for a in DISTANCES[1:]]
+        found = margins(profile, distance, 30.0)
+        first = free.index(False)
+        assert np.all(found[:first] == 70.0)  # of 100 m/s, which is no limit
+        way = 300.0 - distance
+        assert min(found) == pytest.approx(np.sqrt(600.0 + 20.0 * way) - 30.0, abs=2.5)
+    in_bend = margins(profile, 400.0, 30.0)
+    assert in_bend[0] == pytest.approx(np.sqrt(600.0) - 30.0)
+    np.testing.assert_allclose(margins(profile, 400.0, 20.0), in_bend + 10.0)
+    np.testing.assert_allclose(margins(profile, 150.0 + 800.0, 30.0), margins(profile, 150.0, 30.0))
+
+
+def test_limits_are_seen_in_steps_of_20_metres_per_second(oval):
+    """Clipped beyond 40 m/s."""
+    state = car_state(distance_from_start=350.0, speed_x=20.0)
+    sensors = ("base", "limits")
+    shown = View(sensors).encode(state, ScriptedBackend(oval))[
+        feature_slices(sensors)["speed_margins_ahead"]
+    ]
+    found = margins(oval.profile, 350.0, 20.0)
+    np.testing.assert_array_equal(shown, np.clip(found / 20.0, -2.0, 2.0).astype(np.float32))
+    assert shown[0] == pytest.approx((np.sqrt(15.0 * 50.0) - 20.0) / 20.0)
 
 
 # -------------------------------------------------------------------------- everybody sees it so

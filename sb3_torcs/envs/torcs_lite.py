@@ -71,7 +71,7 @@ class TorcsLiteEnv(RacingEnv):
     :param action_repeat: control ticks of 0.02 s per timestep
     :param range_finders: ``"scr"``, ``"narrow"``, or 19 angles in degrees, left to right
     :param sensors: groups of sensors in an observation: ``"base"``, the 29 numbers, and any of
-        ``"preview"``, the road ahead, or
+        ``"preview"``, the road ahead, ``"limits"``, the speeds that it allows, or
         ``"opponents"``
     :param action: ``"pedals"``: steering, throttle, brake; ``"pedal"``: steering and one signed
         pedal; or ``"manual"``: steering, throttle, brake, gear, clutch

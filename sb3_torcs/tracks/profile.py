@@ -22,6 +22,7 @@ __all__ = [
     "game_profile",
     "look_ahead",
     "road_profile",
+    "speed_margins",
 ]
 
 DISTANCES = (0, 15, 30, 45, 60, 80, 100, 125, 155, 190, 230, 280, 340, 400)
@@ -32,6 +33,10 @@ QUANTITIES = 3  # curvature, width, slope
 
 STEP = 1.0  # [m] between the places of a profile, about
 _AHEAD = np.array(DISTANCES, np.float64)
+
+LATERAL, BRAKING = 15.0, 10.0  # [m/s²] in a bend and before it; what a careful driver dares
+FASTEST = 100.0  # [m/s] on a straight
+WINDOW = 5.0  # [m] between places where bends are measured, each over twice this length
 
 
 class RoadProfile(NamedTuple):
@@ -98,3 +103,46 @@ def look_ahead(sums: FloatArray, step: float, distance: float, means: FloatArray
                 means[quantity, i - 1] /= _AHEAD[i] - _AHEAD[i - 1]
             if i < len(_AHEAD) - 1:
                 means[quantity, i] = -total
+
+
+@njit(cache=True)
+def _turned(sums: FloatArray, step: float, distance: float) -> float:
+    """How much a road has turned since the start line [rad]; ``distance`` may be beyond a lap."""
+    places = len(sums) - 1
+    where = distance / step
+    laps = math.floor(where / places)
+    where -= laps * places
+    place = min(int(where), places - 1)
+    here, there = sums[place, 0], sums[place + 1, 0]
+    return float(laps * sums[places, 0] + here + (where - place) * (there - here))
+
+
+@njit(cache=True)
+def speed_margins(
+    sums: FloatArray, step: float, distance: float, speed: float, margins: FloatArray
+) -> None:
+    """
+    Find by how much a car may be faster now, in the light of each interval ahead.
+
+    A bend of radius R is driven at √(15 m/s² · R), and 10 m/s² slow down on the way to it. Of each
+    interval the place that asks for the lowest speed counts.
+
+    :param sums: of a :class:`RoadProfile`
+    :param step: of it [m]
+    :param distance: of the car from the start line [m]
+    :param speed: of the car [m/s]
+    :param margins: (intervals,) filled [m/s]
+    """
+    ahead = 0.0
+    before = _turned(sums, step, distance - WINDOW)
+    here = _turned(sums, step, distance)
+    for i in range(len(margins)):
+        least = FASTEST
+        while ahead < _AHEAD[i + 1]:
+            after = _turned(sums, step, distance + ahead + WINDOW)
+            curvature = abs(after - before) / (2.0 * WINDOW)
+            in_bend = min(LATERAL / max(curvature, 1e-9), FASTEST**2)
+            least = min(least, math.sqrt(in_bend + 2.0 * BRAKING * ahead))
+            before, here = here, after
+            ahead += WINDOW
+        margins[i] = least - speed
