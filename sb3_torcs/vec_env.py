@@ -14,11 +14,11 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
-from sb3_torcs.backends.seats import SharedRace
+from sb3_torcs.backends.seats import Seat, SharedRace
 from sb3_torcs.car import is_count
 from sb3_torcs.envs.batch import Batch, Timestep
 from sb3_torcs.envs.racing import RacingEnv, RacingInfo
-from sb3_torcs.envs.torcs_race import RaceCarEnv, make_race
+from sb3_torcs.envs.torcs_race import make_race
 from sb3_torcs.errors import EnvClosed, InvalidOption
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.starting_list import guests_of
@@ -401,8 +401,9 @@ def _shared_races(envs: Sequence[RacingEnv]) -> dict[SharedRace, list[int]]:
     """Return the races of several agents, and the indices of their environments."""
     members: dict[SharedRace, list[int]] = {}
     for i, env in enumerate(envs):
-        if isinstance(env, RaceCarEnv):
-            members.setdefault(env.seat.race, []).append(i)
+        seat: Any = env.backend
+        if isinstance(seat, Seat):
+            members.setdefault(seat.race, []).append(i)
     return members
 
 

@@ -18,6 +18,7 @@ from sb3_torcs.backends.seats import REJOIN_SPEED
 from sb3_torcs.car import CAR_RECORD, CONTROL_TICK, RIVALS
 from sb3_torcs.envs.torcs_race import make_grid, make_race
 from sb3_torcs.errors import CarLost, InvalidAction, InvalidOption
+from sb3_torcs.evaluation.ticks import log_drives
 from sb3_torcs.policies.mirror import mirror_observations
 from sb3_torcs.sensors import feature_slices
 from sb3_torcs.torcs.installation import find_game
@@ -575,3 +576,42 @@ class TestAgentsAsOpponents:
     def test_they_need_the_same_timestep(self):
         with pytest.raises(InvalidOption, match=r"action_repeat is 3, .* were trained with 5"):
             make_race(2, opponents=["ddpg-roads"], action_repeat=3)
+
+    def test_one_environment_against_them_is_a_vector_of_one(self, make):
+        """To the bit; also as one of a vector, and where each control tick is noted."""
+        kwargs = {"track": TRACK, "opponents": ["bt", "scripted"], "grid_place": 2}
+        alone, noted = (gym.make("sb3_torcs:Torcs-v0", **kwargs) for _ in range(2))
+        log = log_drives(noted, "x")
+        own = TorcsVecEnv([lambda: gym.make("sb3_torcs:Torcs-v0", **kwargs)])
+        vectors = make(1, **kwargs), own
+        for _ in range(2):
+            for vector in vectors:
+                vector.seed(0)
+            seen = [env.reset(seed=0)[0] for env in (alone, noted)]
+            seen += [vector.reset()[0] for vector in vectors]
+            for action in random_actions(20, 1):
+                assert all(np.array_equal(seen[0], other) for other in seen[1:])
+                seen = [env.step(action[0])[0] for env in (alone, noted)]
+                seen += [vector.step(action)[0][0] for vector in vectors]
+        opponent = alone.unwrapped.backend.worlds[0].engine.read(2)
+        assert opponent.distance_raced > 1.0, "the agent behind has set off, too"
+        assert len(log.frame()) == 2 * 20 * 5
+        for env in (alone, noted, own):
+            env.close()
+
+    @pytest.mark.parametrize(
+        ("options", "message"),
+        [
+            ({"action_repeat": 2}, "action_repeat is 2, .* were trained with 5"),
+            ({"grip": 0.9}, "grip is .* which this world cannot change"),
+            ({"picture": "game", "render_mode": "rgb_array"}, "'scripted' is an agent"),
+            ({"opponents": ["infermo"]}, "no robot 'infermo'; did you mean 'inferno'"),
+        ],
+    )
+    def test_what_one_environment_against_them_cannot_do(self, options, message):
+        with pytest.raises(InvalidOption, match=message):
+            gym.make("sb3_torcs:Torcs-v0", **{"opponents": ["scripted"], **options})
+
+    def test_gymnasium_s_threads_would_not_ask_them(self):
+        with pytest.raises(InvalidOption, match=r"with agents among them.*TorcsVecEnv"):
+            gym.make_vec("sb3_torcs:Torcs-v0", 2, opponents=["scripted"])

@@ -17,7 +17,16 @@ from sb3_torcs.tracks.track import Track
 if TYPE_CHECKING:
     from sb3_torcs._engine import Engine
 
-__all__ = ["REJOIN_SPEED", "Grid", "Seat", "SeatWorld", "SharedRace", "align", "profile_of"]
+__all__ = [
+    "REJOIN_SPEED",
+    "Grid",
+    "LoneSeat",
+    "Seat",
+    "SeatWorld",
+    "SharedRace",
+    "align",
+    "profile_of",
+]
 
 REJOIN_SPEED = 20.0
 """[m/s] of a car that is put back on the road, where no start was drawn for it."""
@@ -306,9 +315,19 @@ class Seat:
 
     def __reduce__(self) -> NoReturn:
         raise InvalidOption(
-            "an environment that shares its race with others cannot be copied or sent to another "
-            "process; make the whole vector environment there"
+            "an environment that shares its race with other agents cannot be copied or sent to "
+            "another process; make it there, and a vector of environments as a whole"
         )
 
     def __deepcopy__(self, memo: dict[int, Any]) -> NoReturn:
         self.__reduce__()
+
+
+class LoneSeat(Seat):
+    """The world of the only agent of a shared race that is stepped; a crew drives the others."""
+
+    def step(self, controls: Controls, ticks: int) -> CarState:  # type: ignore[override]
+        """Drive on; see :class:`~sb3_torcs.backends.base.Backend`."""
+        self.hold(controls)
+        self.race.drive(ticks)
+        return self.read()

@@ -119,7 +119,7 @@ class Conditions:
             if name not in getattr(world, "conditions", ()):
                 raise InvalidOption(
                     f"{name} is {tuple(self._factors[name])!r}, which this world cannot change; "
-                    "leave it out, or use backend 'native' of Torcs-v0"
+                    "leave it out, or use backend 'native' of Torcs-v0, with no agents as opponents"
                 )
 
     def draw(self, rng: np.random.Generator, world: Any, repeat: int) -> Delay:

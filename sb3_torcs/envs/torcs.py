@@ -13,14 +13,17 @@ from sb3_torcs.actions import ActionName, GearboxName, used_gearbox
 from sb3_torcs.backends.base import Backend
 from sb3_torcs.backends.native import NativeBackend
 from sb3_torcs.backends.scr import ScrBackend
+from sb3_torcs.backends.seats import LoneSeat
 from sb3_torcs.backends.several import is_several, one_or_several
 from sb3_torcs.car import DEFAULT_CAR, StartName, is_count
 from sb3_torcs.envs.racing import RacingEnv, RenderMode
+from sb3_torcs.envs.torcs_race import make_shared_race
 from sb3_torcs.errors import EnvClosed, InvalidOption, near_miss
 from sb3_torcs.rewards import RewardChoice
 from sb3_torcs.sensors import RangeFinderName, SensorsName
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.scenery import find_scenery
+from sb3_torcs.torcs.starting_list import guests_of
 from sb3_torcs.torcs.track_names import find_track
 from sb3_torcs.torcs.window import ViewName, Window
 
@@ -80,7 +83,8 @@ class TorcsEnv(RacingEnv):
     :param boards: whether the game's picture has lap times, instruments and a map drawn over it
     :param render_size: width and height of the game's picture [pixels]
     :param backend: ``"native"``, the game in this process, or ``"scr"``
-    :param opponents: robots of the game, e.g. ``("inferno", "berniw:3")``
+    :param opponents: robots of the game, e.g. ``("inferno", "berniw:3")``; with ``"native"`` also
+        agents, by name or path
     :param grid_place: of the agent on the grid, 1 in front; ``None`` is behind all opponents
     :param sensor_noise: range finders and opponent sensors err by 10 % and 2 %, as those of the
         SCR server's ``-noisy``; not with ``"scr"``
@@ -140,6 +144,12 @@ class TorcsEnv(RacingEnv):
             )
         if self.picture == "game" and (is_several(track) or is_several(car, "car")):
             raise InvalidOption("picture 'game' is for one track and one car, not for a list")
+        guests = bool(opponents) and guests_of(opponents, find_game())
+        if self.picture == "game" and guests:
+            raise InvalidOption(
+                f"picture 'game' is for races against robots, and '{guests[0]}' is an agent; use "
+                "picture 'above'"
+            )
         if self.picture == "game":
             one: Any = track
             game = find_game()
@@ -151,6 +161,8 @@ class TorcsEnv(RacingEnv):
                 car,
                 sensor_noise=sensor_noise,
                 address={"host": host, "port": port},
+                guests=bool(guests),
+                action_repeat=action_repeat,
                 range_finders=range_finders,
                 gearbox=used_gearbox(gearbox, action),
                 opponents=opponents,
@@ -207,6 +219,8 @@ def _world(
     *,
     sensor_noise: bool,
     address: Mapping[str, Any],
+    guests: bool,
+    action_repeat: int,
     **options: Any,
 ) -> Backend:
     """
@@ -217,6 +231,8 @@ def _world(
     :param car: as there
     :param sensor_noise: as there
     :param address: host and port, as there
+    :param guests: whether there are agents among the opponents
+    :param action_repeat: as there
     :param options: that all worlds have
     :raises InvalidOption: if an option is for another world
     """
@@ -238,6 +254,15 @@ def _world(
             raise InvalidOption(
                 f"{name} is {value!r}, which is for an SCR server; add backend='scr'"
             )
+
+    if guests:
+        opponents, grid_place = options.pop("opponents"), options.pop("grid_place")
+        race = make_shared_race(
+            1, track, car, opponents, grid_place, sensor_noise=sensor_noise,
+            action_repeat=action_repeat, **options,
+        )  # fmt: skip
+        world: Any = LoneSeat(race, 0)  # whose track and car may not be set
+        return world
 
     def make(track: Any, car: str) -> Backend:
         return NativeBackend(track, car=car, **options, sensor_noise=sensor_noise)

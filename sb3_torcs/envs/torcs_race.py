@@ -19,7 +19,7 @@ from sb3_torcs.torcs.drivers import crew_of
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.starting_list import guests_of, starting_list
 
-__all__ = ["RaceCarEnv", "make_grid", "make_race"]
+__all__ = ["RaceCarEnv", "make_grid", "make_race", "make_shared_race"]
 
 
 class RaceCarEnv(RacingEnv):
@@ -122,6 +122,37 @@ def make_race(
     """
     if options.pop("delay", 0) != 0:
         raise InvalidOption("delay is for a race of one agent; leave it out")
+    race = make_shared_race(
+        agents, track, car, opponents, grid_place, sensor_noise=sensor_noise,
+        action_repeat=options.get("action_repeat", 5), range_finders=range_finders,
+        gearbox=used_gearbox(gearbox, action), laps=laps, flagged=flagged,
+    )  # fmt: skip
+    return [RaceCarEnv(seat, action=action, laps=laps, **options) for seat in race.seats]
+
+
+def make_shared_race(
+    agents: int,
+    track: str | Path | Sequence[str | Path],
+    car: str | Sequence[str],
+    opponents: Sequence[str] | Sequence[Sequence[str]],
+    grid_place: int | Sequence[int] | None,
+    *,
+    sensor_noise: bool,
+    action_repeat: int,
+    **shared: Any,
+) -> SharedRace:
+    """
+    Load all races that can be drawn.
+
+    :param agents: as of :func:`make_race`
+    :param track: as there
+    :param car: as there
+    :param opponents: as there
+    :param grid_place: as there
+    :param sensor_noise: as there
+    :param action_repeat: of the agents; opponents that are agents have to have the same
+    :param shared: of all races, as of :func:`make_grid`
+    """
     several = not isinstance(opponents, str) and any(
         is_several(field, "opponents") for field in opponents
     )
@@ -132,23 +163,14 @@ def make_race(
         fields,
         grid_place if is_several(grid_place, "grid_place") else [grid_place],
     )
-    shared: dict[str, Any] = {
-        "agents": agents,
-        "range_finders": range_finders,
-        "gearbox": used_gearbox(gearbox, action),
-        "laps": laps,
-        "flagged": flagged,
-    }
     grids = [
-        make_grid(one, model, opponents=field, grid_place=place, **shared)
+        make_grid(one, model, agents=agents, opponents=field, grid_place=place, **shared)
         for one, model, field, place in choices
     ]
-    repeat = options.get("action_repeat", 5)
     for grid in grids:
-        if grid.crew is not None and grid.crew.action_repeats != {repeat}:
+        if grid.crew is not None and grid.crew.action_repeats != {action_repeat}:
             raise InvalidOption(
-                f"action_repeat is {repeat!r}, and agents among the opponents were trained with "
-                f"{', '.join(map(str, sorted(grid.crew.action_repeats)))}; give all the same"
+                f"action_repeat is {action_repeat!r}, and agents among the opponents were trained "
+                f"with {', '.join(map(str, sorted(grid.crew.action_repeats)))}; give all the same"
             )
-    race = SharedRace([grid.worlds for grid in grids], sensor_noise, [grid.crew for grid in grids])
-    return [RaceCarEnv(seat, action=action, laps=laps, **options) for seat in race.seats]
+    return SharedRace([grid.worlds for grid in grids], sensor_noise, [grid.crew for grid in grids])

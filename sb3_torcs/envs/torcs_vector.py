@@ -23,6 +23,8 @@ from sb3_torcs.envs.conditions import Part
 from sb3_torcs.envs.racing import Observation
 from sb3_torcs.envs.torcs import TorcsEnv
 from sb3_torcs.errors import CarLost, EnvClosed, InvalidAction, InvalidOption
+from sb3_torcs.torcs.installation import find_game
+from sb3_torcs.torcs.starting_list import guests_of
 
 __all__ = ["TorcsVectorEnv"]
 
@@ -72,6 +74,12 @@ class TorcsVectorEnv(SyncVectorEnv):
             raise InvalidOption(
                 f"backend is {options['backend']!r}; races on threads are for backend 'native', "
                 "others drive with gym.make_vec(..., vectorization_mode='async')"
+            )
+        opponents = options.get("opponents", ())
+        if opponents and guests_of(opponents, find_game()):
+            raise InvalidOption(
+                f"opponents is {opponents!r}, with agents among them; such races drive by "
+                "sb3_torcs.vec_env.TorcsVecEnv, or gym.make_vec(..., vectorization_mode='async')"
             )
         registered = gym.spec("Torcs-v0").max_episode_steps or NO_LIMIT
         limit = registered if max_episode_steps is None else max_episode_steps
