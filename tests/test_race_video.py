@@ -100,7 +100,7 @@ def test_the_first_race_is_recorded_and_comes_out_as_if_nobody_looked(
     written = []
     monkeypatch.setattr(
         "sb3_torcs.rendering.encoder.write_video",
-        lambda path, frames, fps, total: written.extend([path, list(frames), total]),
+        lambda path, frames, fps, total, encoding: written.extend([path, list(frames), total]),
     )
     words = ["race", "scripted", "bt", "--track", "g-track-1", "--laps", "1", "--races", "2",
              "--json"]  # fmt: skip
@@ -117,3 +117,38 @@ def test_the_first_race_is_recorded_and_comes_out_as_if_nobody_looked(
 def test_a_video_that_is_no_mp4_is_refused_before_any_race(capsys):
     assert main(["race", "bt", "--video", "race.gif"]) == 2
     assert "'race.gif' should end in .mp4" in capsys.readouterr().err
+
+
+def test_the_game_draws_the_race_with_the_board(monkeypatch, capsys, game, tmp_path):
+    """The camera follows the agent, who starts last; another view is another picture."""
+    monkeypatch.setattr(video, "FPS", 0.05)
+    monkeypatch.setattr(video, "LAST_PICTURE", 1)
+    monkeypatch.setattr(video, "GAME_SIZE", (320, 240))
+    written = []
+    monkeypatch.setattr(
+        "sb3_torcs.rendering.encoder.write_video",
+        lambda path, frames, fps, total, encoding: written.append((list(frames), total)),
+    )
+    words = ["race", "scripted", "bt", "--track", "g-track-1", "--laps", "1", "--races", "1"]
+    for view in ("behind", "cockpit"):
+        assert main([*words, "--view", view, "--video", str(tmp_path / "race.mp4")]) == 0
+    for frames, total in written:
+        assert len(frames) == total >= 4
+        assert {frame.shape for frame in frames} == {(240, 320, 3)}
+        assert not np.array_equal(frames[0], frames[1])
+    assert not np.array_equal(written[0][0][1], written[1][0][1])
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--view", "tv"], "--view is for videos; add --video FILE.mp4"),
+        (["--view", "tv", "--video", "{}/x.mp4", "--track", "{}/own.xml"], "own.xml"),
+    ],
+)
+def test_what_the_game_cannot_draw_is_refused_before_any_race(
+    words, message, monkeypatch, capsys, game, tmp_path
+):
+    monkeypatch.setattr("sb3_torcs.races.protocol.run_race", None)
+    assert main(["race", "bt", *(word.format(tmp_path) for word in words)]) == 2
+    assert message in capsys.readouterr().err

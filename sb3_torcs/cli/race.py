@@ -59,6 +59,8 @@ def add_parser(subparsers: Any) -> None:
     """
     :param subparsers: of the command
     """
+    from sb3_torcs.torcs.window import VIEWS
+
     parser = subparsers.add_parser(
         "race",
         help="race agents and robots against each other",
@@ -75,7 +77,9 @@ def add_parser(subparsers: Any) -> None:
     add("--field", type=positive, metavar="N", help="cars in a race; default: all drivers")
     add("--seed", type=seed, default=0, metavar="S", help="of the first race; default: 0")
     add("--video", metavar="FILE.mp4",
-        help="video of the first race from above; the camera follows its best agent")  # fmt: skip
+        help="video of the first race; the camera follows its best agent")  # fmt: skip
+    add("--view", choices=VIEWS, metavar="V",
+        help=f"let the game draw the video: {', '.join(VIEWS)}; default: from above")  # fmt: skip
     add("--picture", metavar="FILE",
         help="draw place and gap over distance of the last race (.png, .svg, .pdf)")  # fmt: skip
     add("--telemetry", metavar="FILE.parquet", help="write the drives of the last race")
@@ -100,7 +104,6 @@ def run(args: argparse.Namespace) -> int:
     }
     from sb3_torcs.errors import InvalidOption
     from sb3_torcs.races.entrants import find_entrants
-    from sb3_torcs.races.video import Footage
     from sb3_torcs.telemetry import DriveLog
     from sb3_torcs.torcs.installation import find_game
 
@@ -109,7 +112,7 @@ def run(args: argparse.Namespace) -> int:
     with quiet_output(args.json):
         entrants = find_entrants(args.drivers, find_game())
         log = DriveLog() if "telemetry" in files or "report" in files else None
-        footage = Footage() if "video" in files else None
+        footage = _footage(args)
         races = _held(args, entrants, log, footage)
         if footage is not None:
             footage.save(files["video"], _followed(entrants, races[0]), args.laps)
@@ -122,6 +125,21 @@ def run(args: argparse.Namespace) -> int:
     else:
         _show(races, files)
     return 0
+
+
+def _footage(args: argparse.Namespace) -> Footage | None:
+    """Prepare the video of the first race; what cannot be drawn is refused before any race."""
+    from sb3_torcs.errors import InvalidOption
+    from sb3_torcs.races.video import GAME_SIZE, Footage
+    from sb3_torcs.torcs.installation import find_game
+
+    if args.view is not None:
+        if args.video is None:
+            raise InvalidOption("--view is for videos; add --video FILE.mp4")
+        from sb3_torcs.rendering.game_camera import check_view
+
+        check_view(find_game(), args.track, GAME_SIZE)
+    return None if args.video is None else Footage(args.view)
 
 
 def _followed(entrants: Sequence[Entrant], race: Race) -> str:
@@ -161,7 +179,7 @@ def _held(
     """Hold the races behind a progress bar; the first one is recorded, the last one is noted."""
     from tqdm import tqdm
 
-    from sb3_torcs.races.in_the_game import run_game_race
+    from sb3_torcs.races.in_the_game import run_game_race, setup_in_the_game
     from sb3_torcs.races.protocol import Notes, Watcher, run_race, run_races
 
     races: list[Race] = []
@@ -178,6 +196,8 @@ def _held(
                 return run_game_race(order, args.track, **options)
             watchers: list[Watcher] = []
             if footage is not None and number == args.seed:
+                if args.view is not None:
+                    footage.setup = setup_in_the_game(order, args.track, args.laps)
                 watchers.append(footage)
             if log is not None and number == args.seed + args.races - 1:
                 watchers.append(Notes(log, args.track))

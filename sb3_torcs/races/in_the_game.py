@@ -26,13 +26,33 @@ from sb3_torcs.tracks.catalogue import load_track
 if TYPE_CHECKING:
     from sb3_torcs.torcs.process import GameProcess
 
-__all__ = ["run_game_race"]
+__all__ = ["run_game_race", "setup_in_the_game"]
 
 
 LOOK = 0.2  # [s] between two reports of how far the race is
 PATIENCE = 60.0  # [s] for the game to load, on a busy machine
 ENDED = (ServerLost, GameFailed)  # what agents say when the game is gone; its own words say more
 GRACE = 20.0  # [s] for the game to end after its race
+
+
+def setup_in_the_game(order: Sequence[Entrant], track: str, laps: int) -> RaceSetup:
+    """
+    Describe a race to the game, whose SCR server has a seat for each agent.
+
+    :param order: the drivers, the one in front first
+    :param track: as of ``Torcs-v0``
+    :param laps: to drive
+    :raises InvalidOption: if there are more agents than the game has seats
+    """
+    seats = itertools.count()
+    drivers = [entrant.robot or (SCR_SERVER, next(seats)) for entrant in order]
+    cars = [entrant.agent.car for entrant in order if entrant.agent is not None]
+    if len(cars) > SCR_DRIVERS:
+        raise InvalidOption(
+            f"{len(cars)} agents in a race of the game, which has {SCR_DRIVERS} seats for them; "
+            "name fewer, or leave out --game and --view"
+        )
+    return RaceSetup(track, drivers, laps, session_for(drivers), cars)
 
 
 def run_game_race(
@@ -58,34 +78,22 @@ def run_game_race(
     :raises ModelMismatch: if an agent does not fit this race
     :raises GameFailed: if the game ends without results
     """
-    seats = itertools.count()
-    drivers = [entrant.robot or (SCR_SERVER, next(seats)) for entrant in order]
-    agents = [entrant for entrant in order if entrant.robot is None]
-    if len(agents) > SCR_DRIVERS:
-        raise InvalidOption(
-            f"{len(agents)} agents in a race of the game, which has {SCR_DRIVERS} seats for them; "
-            "name fewer, or leave out --game"
-        )
+    race = setup_in_the_game(order, track, laps)
+    agents = [entrant for entrant in order if entrant.agent is not None]
     if agents:
         goal = laps * load_track(find_track(track).path).length
         results = _with_clients(
-            agents,
-            RaceSetup(track, drivers, laps, session_for(drivers), _cars(agents)),
-            trust,
-            lambda distance: progress(min(distance / goal, 1.0)),
+            agents, race, trust, lambda distance: progress(min(distance / goal, 1.0))
         )
     else:
-        results = text_mode.run(find_game(), track, drivers, laps, session_for(drivers))
+        results = text_mode.run(find_game(), track, race.drivers, laps, race.session)
     names = [entrant.name for entrant in order]
     standings = [
-        _standing(result, drivers.index((result.robot, result.index)), names) for result in results
+        _standing(result, race.drivers.index((result.robot, result.index)), names)
+        for result in results
     ]
     nothing = np.empty((0, len(order)))
     return Race(seed, standings, {}, names, nothing, nothing)
-
-
-def _cars(agents: Sequence[Entrant]) -> list[str]:
-    return [entrant.agent.car for entrant in agents if entrant.agent is not None]
 
 
 def _with_clients(

@@ -1,11 +1,11 @@
-"""A video of a race from above: all cars, and a board with places, gaps and laps."""
+"""A video of a race: all cars, from above or as the game draws them, and a board of the gaps."""
 
 from __future__ import annotations
 
 import colorsys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -13,16 +13,21 @@ import numpy.typing as npt
 from sb3_torcs.car import CarState, Controls, FloatArray
 from sb3_torcs.races.protocol import behind_the_line
 from sb3_torcs.telemetry import STATE_FIELDS
+from sb3_torcs.torcs.installation import find_game
+from sb3_torcs.torcs.race_setup import RaceSetup
+from sb3_torcs.torcs.window import ViewName, Window
 from sb3_torcs.tracks.track import Track
 
 if TYPE_CHECKING:
     from sb3_torcs._engine import Engine
-    from sb3_torcs.rendering.board import Row
+    from sb3_torcs.rendering.board import Field
     from sb3_torcs.rendering.scenery import Colour
 
-__all__ = ["Footage", "gaps"]
+__all__ = ["GAME_SIZE", "Footage", "gaps"]
 
-SIZE = (960, 720)  # [px]
+Frame = npt.NDArray[np.uint8]
+
+SIZE, GAME_SIZE = (960, 720), (1280, 720)  # [px] of pictures from above, and of the game's
 FPS = 25
 LAST_PICTURE = 3 * FPS  # frames for which the final board is shown
 
@@ -40,12 +45,21 @@ class Moment(NamedTuple):
     controls: FloatArray  # (cars, 5) as of Controls
     finished: npt.NDArray[np.bool_]  # (cars,)
     out: npt.NDArray[np.bool_]  # (cars,)
+    appearance: bytes = b""  # for the game's own picture
 
 
 class Footage:
-    """What a camera recorded of a race; a :class:`~sb3_torcs.races.protocol.Watcher`."""
+    """
+    What a camera recorded of a race; a :class:`~sb3_torcs.races.protocol.Watcher`.
 
-    def __init__(self) -> None:
+    :param view: one of :data:`sb3_torcs.torcs.window.VIEWS`, from which the game draws the race;
+        ``None`` draws it from above
+    """
+
+    def __init__(self, view: ViewName | None = None) -> None:
+        self.view = view
+        self.setup: RaceSetup | None = None
+        """The race as the game would hold it, which it has to know to draw it."""
         self.moments: list[Moment] = []
 
     def begin(self, engine: Engine, names: Sequence[str], road: Track) -> None:
@@ -70,6 +84,7 @@ class Footage:
                 np.array([engine.controls(slot) for slot in slots], float),
                 np.array([engine.finished(slot) for slot in slots]),
                 out,
+                engine.appearance(),
             )
         )
 
@@ -80,21 +95,67 @@ class Footage:
         :param path: of the video, ending in ``.mp4``
         :param driver: whom the camera follows
         :param laps: of the race
+        :raises DisplayUnavailable: if there is no virtual display, which the game needs
         :raises OutputNotWritable: if the file cannot be written; no part of it is left behind
         """
+        followed = self.names.index(driver)
+        if self.setup is None or self.view is None:
+            self._save_from_above(path, followed, laps)
+        else:
+            self._save_game_view(path, followed, laps, self.setup, self.view)
+
+    def _save_from_above(self, path: Path, followed: int, laps: int) -> None:
+        from sb3_torcs.rendering.encoder import ENCODING
+        from sb3_torcs.rendering.viewer import Viewer
+
+        viewer = Viewer(size=SIZE)
+
+        def draw(moment: Moment, car: CarState, field: Field) -> Frame:
+            controls = Controls(*moment.controls[followed])
+            return viewer.frame(self.road, car, controls, None, field)
+
+        self._write(path, followed, laps, draw, ENCODING)
+        viewer.close()
+
+    def _save_game_view(
+        self, path: Path, followed: int, laps: int, race: RaceSetup, view: ViewName
+    ) -> None:
+        from sb3_torcs.rendering.board import Board
+        from sb3_torcs.rendering.encoder import PHOTOGRAPHIC
+        from sb3_torcs.rendering.game_camera import GameView
+
+        game = find_game()
+        window = Window(GAME_SIZE, view, driver=race.driver_name(followed, game), boards=False)
+        board = Board(GAME_SIZE)
+        with GameView(game, race, window) as camera:
+
+            def draw(moment: Moment, car: CarState, field: Field) -> Frame:
+                del car
+                return board.over(camera.frame(moment.appearance), field)
+
+            self._write(path, followed, laps, draw, PHOTOGRAPHIC)
+
+    def _write(
+        self,
+        path: Path,
+        followed: int,
+        laps: int,
+        draw: Callable[[Moment, CarState, Field], Frame],
+        encoding: Mapping[str, Any],
+    ) -> None:
         from sb3_torcs.rendering.encoder import write_video
 
         total = len(self.moments) + LAST_PICTURE
-        write_video(path, self._frames(self.names.index(driver), laps), FPS, total)
+        write_video(path, self._frames(followed, laps, draw), FPS, total, encoding)
 
-    def _frames(self, followed: int, laps: int) -> Iterator[npt.NDArray[np.uint8]]:
-        from sb3_torcs.rendering.board import Field
-        from sb3_torcs.rendering.viewer import Viewer
+    def _frames(
+        self, followed: int, laps: int, draw: Callable[[Moment, CarState, Field], Frame]
+    ) -> Iterator[Frame]:
+        """Draw all moments; the last one stays for a while."""
+        from sb3_torcs.rendering.board import Field, Row
 
         colours = _colours(len(self.names), followed)
-        told = gaps(self, laps)
-        viewer = Viewer(size=SIZE)
-        for moment, texts in zip(self.moments, told, strict=True):
+        for moment, texts in zip(self.moments, gaps(self, laps), strict=True):
             cars = [_car(row) for row in moment.states]
             others = [
                 (car, colours[slot])
@@ -102,29 +163,15 @@ class Footage:
                 if slot != followed and not moment.out[slot]
             ]
             order = sorted(range(len(cars)), key=lambda slot: cars[slot].race_position)
+            rows = [
+                Row(str(place), self.names[slot], texts[slot], colours[slot], slot == followed)
+                for place, slot in enumerate(order, start=1)
+            ]
             lap = min(cars[order[0]].laps + 1, laps)
-            rows = [self._row(slot, cars, texts, colours, followed) for slot in order]
-            controls = Controls(*moment.controls[followed])
-            field = Field(others, f"LAP {lap} of {laps}", rows)
-            picture = viewer.frame(self.road, cars[followed], controls, None, field)
+            picture = draw(moment, cars[followed], Field(others, f"LAP {lap} of {laps}", rows))
             yield picture
         for _ in range(LAST_PICTURE):
             yield picture
-        viewer.close()
-
-    def _row(
-        self,
-        slot: int,
-        cars: Sequence[CarState],
-        texts: Sequence[str],
-        colours: Sequence[Colour],
-        followed: int,
-    ) -> Row:
-        """Write a line of the board."""
-        from sb3_torcs.rendering.board import Row
-
-        place = str(cars[slot].race_position)
-        return Row(place, self.names[slot], texts[slot], colours[slot], slot == followed)
 
 
 def gaps(footage: Footage, laps: int) -> list[list[str]]:

@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
+import numpy.typing as npt
+
 from sb3_torcs.car import CarState
 from sb3_torcs.rendering.highway import pygame
 from sb3_torcs.rendering.hud import MUTED, TEXT, Typeface, panel, unit_of
@@ -26,7 +29,7 @@ class Row(NamedTuple):
     place: str
     driver: str
     gap: str
-    colour: Colour  # of the car
+    colour: Colour | None  # of the car
     followed: bool  # by the camera
 
 
@@ -67,6 +70,19 @@ class Board:
         for number, row in enumerate(rows):
             self._draw_row(picture, row, left, top + (SPACE + HEAD + LINE * number) * unit)
 
+    def over(self, frame: npt.NDArray[np.uint8], field: Field) -> npt.NDArray[np.uint8]:
+        """
+        Draw the board over a picture that was drawn elsewhere, without the colours of the cars.
+
+        :param frame: (height, width, 3)
+        :param field: of the race
+        :return: another picture
+        """
+        height, width, _ = frame.shape
+        picture = pygame.image.frombuffer(frame.tobytes(), (width, height), "RGB")
+        self.draw(picture, field._replace(rows=[row._replace(colour=None) for row in field.rows]))
+        return np.frombuffer(pygame.image.tobytes(picture, "RGB"), np.uint8).reshape(frame.shape)
+
     def _draw_row(self, picture: pygame.Surface, row: Row, left: float, top: float) -> None:
         """Draw a line from its upper left corner [px] on."""
         unit = self._unit
@@ -79,7 +95,8 @@ class Board:
             pygame.draw.rect(picture, FOLLOWED, box(4, -3, WIDTH - 8, LINE))
         colour = TEXT if row.followed else MUTED
         self._small.write(picture, row.place, (left + 28 * unit, top), colour, align=1.0)
-        pygame.draw.rect(picture, row.colour, box(36, 1, 11, 11))
+        if row.colour is not None:
+            pygame.draw.rect(picture, row.colour, box(36, 1, 11, 11))
         name = row.driver if len(row.driver) <= LONGEST else f"{row.driver[: LONGEST - 2]}.."
         self._small.write(picture, name, (left + 54 * unit, top), TEXT)
         self._small.write(picture, row.gap, (left + (WIDTH - SPACE) * unit, top), colour, 1.0)

@@ -21,22 +21,39 @@ from sb3_torcs.torcs.display import VirtualDisplay
 from sb3_torcs.torcs.installation import Game
 from sb3_torcs.torcs.process import GameProcess
 from sb3_torcs.torcs.race_setup import SCR_SERVER, RaceSetup
+from sb3_torcs.torcs.scenery import find_scenery
+from sb3_torcs.torcs.track_names import find_track
 from sb3_torcs.torcs.window import Window, window_arguments
 from sb3_torcs.tracks.trial import check_track
 
-__all__ = ["GameView"]
+__all__ = ["GameView", "check_view"]
 
 AGENT = f"{SCR_SERVER} 0"  # the agent's name in the game
 GRACE = 5.0  # [s] for a game to end after it closed the connection
 
 
-class GameView:
+def check_view(game: Game, track: str, size: tuple[int, int]) -> None:
     """
-    Pictures of a race, with the agent in view. The game ends when this is closed.
+    Make sure that the game can draw a track here, before long work.
 
     :param game: the installation
-    :param race: who races where; the agent is ``("scr_server", 0)``
-    :param window: that the game would show: its size, its view, and whether it has boards
+    :param track: as of :class:`~sb3_torcs.torcs.race_setup.RaceSetup`
+    :param size: of the pictures, width and height [pixels]
+    :raises DisplayUnavailable: if there is no virtual display
+    :raises SceneryMissing: if the game cannot draw the track
+    """
+    find_scenery(game, find_track(track, game).path)
+    VirtualDisplay(size).close()
+
+
+class GameView:
+    """
+    Pictures of a race. The game ends when this is closed.
+
+    :param game: the installation
+    :param race: who races where; agents are ``("scr_server", 0)`` and so on
+    :param window: that the game would show: its size, its view, whether it has boards, and who is
+        looked at; without a name it is the first agent
     :raises DisplayUnavailable: if there is no virtual display
     :raises GameIncomplete: if the game lacks its program, or a file that it needs for this
     :raises BackendUnavailable: if our libraries that the game loads were not built
@@ -49,7 +66,8 @@ class GameView:
             stack.enter_context(self._line)
             with end:
                 window = replace(
-                    window, driver=AGENT, display=display.name, frames=end.fileno(),
+                    window, driver=window.driver or AGENT,
+                    display=display.name, frames=end.fileno(),
                     traces=False,  # the moments before were not drawn, or were of another race
                 )  # fmt: skip
                 arguments = window_arguments(game, window)

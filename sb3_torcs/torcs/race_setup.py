@@ -98,6 +98,16 @@ class RaceSetup:
         """
         return self.car if isinstance(self.car, str) else self.car[index]
 
+    def driver_name(self, slot: int, game: Game) -> str:
+        """
+        Return a driver's name as the game's window has it.
+
+        :param slot: on the grid, from 0
+        :param game: the installation
+        """
+        name, index = self.drivers[slot]
+        return f"{name} {index}" if name == SCR_SERVER else game.find_robot(name, index).name
+
     def cars(self, game: Game) -> list[str]:
         """
         List the drivers' cars.
