@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
 __all__ = ["run_game_race", "setup_in_the_game"]
 
-
 LOOK = 0.2  # [s] between two reports of how far the race is
 PATIENCE = 60.0  # [s] for the game to load, on a busy machine
 ENDED = (ServerLost, GameFailed)  # what agents say when the game is gone; its own words say more
@@ -144,8 +143,8 @@ def _drive(clients: Sequence[Agent], process: GameProcess, tell: Callable[[float
     """
     threads = [_begin(client, process) for client in clients]
     try:
-        while any(thread.is_alive() for thread in threads):
-            threads[0].join(LOOK)
+        while driving := [thread for thread in threads if thread.is_alive()]:
+            driving[0].join(LOOK)
             tell(max(client.distance for client in clients))
     except BaseException:
         process.stop()
