@@ -9,9 +9,10 @@ import tempfile
 
 import pytest
 
+from sb3_torcs.agents.models import TrainingRecord
 from sb3_torcs.agents.scripted import ScriptedDriver
 from sb3_torcs.cli import main
-from sb3_torcs.errors import GameFailed, InvalidAction, InvalidOption
+from sb3_torcs.errors import GameFailed, InvalidAction, InvalidOption, ModelMismatch
 from sb3_torcs.races import in_the_game
 from sb3_torcs.races.entrants import find_entrants
 from sb3_torcs.races.in_the_game import run_game_race
@@ -84,6 +85,16 @@ def test_more_agents_than_seats_are_refused(game, alone):
     (scripted,) = find_entrants(["scripted"], game)
     with pytest.raises(InvalidOption, match=r"11 agents.*10 seats.*leave out --game"):
         run_game_race([scripted] * 11, TRACK, laps=1)
+    assert list(alone.iterdir()) == []
+
+
+def test_an_agent_that_sees_more_than_the_server_tells_is_refused(game, alone):
+    order = find_entrants(["bt", "scripted"], game)
+    order[1].agent.record = TrainingRecord(env_kwargs={"sensors": ["base", "rivals", "race"]})
+    with pytest.raises(
+        ModelMismatch, match=r"sensors 'race', 'rivals', of which.*leave out --game"
+    ):
+        run_game_race(order, TRACK, laps=1)
     assert list(alone.iterdir()) == []
 
 

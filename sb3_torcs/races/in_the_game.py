@@ -12,10 +12,11 @@ import numpy as np
 from sb3_torcs.agents import text_mode
 from sb3_torcs.agents.pilots import SEEN
 from sb3_torcs.agents.remote import Agent
-from sb3_torcs.errors import GameFailed, InvalidOption, ServerLost
+from sb3_torcs.errors import GameFailed, InvalidOption, ModelMismatch, ServerLost
 from sb3_torcs.races.entrants import Entrant
 from sb3_torcs.races.protocol import Race, Standing
 from sb3_torcs.scr.server import open_ports, start_server
+from sb3_torcs.sensors import NEEDS_RACE
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.race_results import RobotResult
 from sb3_torcs.torcs.race_setup import SCR_DRIVERS, SCR_SERVER, RaceSetup, session_for
@@ -126,6 +127,12 @@ def _client(entrant: Entrant, race: RaceSetup, port: int, trust: bool) -> Agent:
     """Load an agent with what it sees and drives as in its training."""
     pilot = entrant.agent
     assert pilot is not None, "robots are the game's"
+    untold = NEEDS_RACE.intersection(pilot.record.env_kwargs.get("sensors", ()))
+    if untold:
+        raise ModelMismatch(
+            f"'{entrant.name}' was trained with sensors {', '.join(map(repr, sorted(untold)))}, of "
+            "which the game's server does not tell; leave out --game"
+        )
     settings: dict[str, Any] = {
         **pilot.record.kept((*SEEN, "range_finders", "gearbox")),
         "track": race.track, "car": pilot.car, "host": "127.0.0.1", "port": port,
