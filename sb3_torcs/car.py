@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from numbers import Integral, Real
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -24,6 +25,7 @@ __all__ = [
     "LIMITER_RPM",
     "MANY_LAPS",
     "MAX_DAMAGE",
+    "MAX_DELAY",
     "NO_RACE",
     "RIVALS",
     "RPM",
@@ -31,9 +33,12 @@ __all__ = [
     "CarState",
     "Controls",
     "FloatArray",
+    "Range",
     "Start",
     "StartName",
     "car_from_record",
+    "checked_delay",
+    "checked_factor",
     "checked_hard_starts",
     "checked_laps",
     "checked_start",
@@ -161,6 +166,62 @@ def checked_hard_starts(share: float) -> float:
     if not is_number(share) or not 0.0 <= share <= 1.0:
         raise InvalidOption(f"the share of hard starts is {share!r}; expected 0 to 1")
     return float(share)
+
+
+MAX_DELAY = 50  # control ticks: 1 s
+LEAST_FACTOR = 0.5  # of grip or mass; ice is another game
+
+
+class Range(NamedTuple):
+    """The bounds of a number that each episode draws; equal ones draw nothing."""
+
+    low: float
+    high: float
+
+
+def checked_range(name: str, choice: Any, low: float, high: float, unit: str) -> Range:
+    """
+    Check a number, or the two bounds of one that is drawn.
+
+    :param name: of the option
+    :param choice: what was given
+    :param low: the least that is allowed
+    :param high: the most that is allowed
+    :param unit: of both, in words
+    :raises InvalidOption: if it is no such number
+    """
+    pair = list(choice) if isinstance(choice, Sequence | np.ndarray) else [choice, choice]
+    numbers = not isinstance(choice, str) and len(pair) == 2 and all(map(is_number, pair))
+    if not numbers or not low <= pair[0] <= pair[1] <= high:
+        raise InvalidOption(
+            f"{name} is {choice!r}; expected {unit} from {low:g} to {high:g}, or a pair of them, "
+            "between which each episode draws"
+        )
+    return Range(*pair)
+
+
+def checked_delay(choice: Any) -> Range:
+    """
+    Check the option ``delay``.
+
+    :param choice: control ticks, or a pair of them
+    :raises InvalidOption: if it is no such number
+    """
+    bounds = checked_range("delay", choice, 0, MAX_DELAY, "whole control ticks")
+    if not all(bound == 0 or is_count(bound) for bound in bounds):
+        raise InvalidOption(f"delay is {choice!r}; expected whole control ticks of 0.02 s")
+    return bounds
+
+
+def checked_factor(name: str, choice: Any) -> Range:
+    """
+    Check the option ``grip`` or ``mass``.
+
+    :param name: of the option
+    :param choice: a factor, or a pair of them
+    :raises InvalidOption: if it is no such number
+    """
+    return checked_range(name, choice, LEAST_FACTOR, 1.0 / LEAST_FACTOR, "a factor")
 
 
 RIVALS = 4

@@ -8,10 +8,13 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from conftest import ScriptedBackend
+from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 import sb3_torcs  # noqa: F401  # registers the ids
+from sb3_torcs.callbacks import ConditionsCallback
 from sb3_torcs.envs.conditions import RESTING, Delay
 from sb3_torcs.envs.racing import RacingEnv
 from sb3_torcs.errors import InvalidOption
@@ -245,3 +248,48 @@ def test_a_world_that_cannot_change_says_so(oval):
         RacingEnv(ScriptedBackend(oval), grip=0.9)
     with pytest.raises(InvalidOption, match=r"mass is 1\.1, which needs the installed game"):
         gym.make("TorcsLite-v0", mass=1.1)
+
+
+def test_conditions_of_a_training_are_those_of_its_environments_alone(game):
+    """They begin with the next episode; what was before comes back, also to the world."""
+    del game
+    env = TorcsVecEnv(2, threads=1, track=["aalborg", "g-track-1"])
+    drawn = []
+
+    class Grips(BaseCallback):
+        def _on_step(self):
+            if any(self.locals["dones"]):
+                drawn.extend(self.training_env.env_method("get_wrapper_attr", "conditions"))
+            return True
+
+    model = PPO("MlpPolicy", env, n_steps=64, batch_size=64, device="cpu", seed=0)
+    grip = ConditionsCallback(grip=(0.7, 0.8), delay=1)
+    model.learn(600, callback=[grip, Grips()])
+    assert drawn
+    assert {0.7 <= each.grip <= 0.8 for each in drawn[-2:]} == {True}
+    env.reset()
+    conditions = env.env_method("get_wrapper_attr", "conditions")
+    assert [each.grip for each in conditions] == [1.0, 1.0]
+    assert [each.choice["delay"] for each in conditions] == [0, 0]
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("choice", "message"),
+    [
+        ({"grip": 3.0}, "expected a factor from 0.5 to 2"),
+        ({"mass": "heavy"}, "expected a factor"),
+        ({"delay": 0.5}, "whole control ticks"),
+    ],
+)
+def test_bad_conditions_of_a_training_are_refused(oval, choice, message):
+    """When the callback is made; an environment says the same, and which names there are."""
+    with pytest.raises(InvalidOption, match=message):
+        ConditionsCallback(**choice)
+    env = RacingEnv(ScriptedBackend(oval))
+    with pytest.raises(InvalidOption, match=message):
+        env.set_conditions(choice)
+    with pytest.raises(
+        InvalidOption, match="unknown condition 'gripp'; allowed: delay, grip, mass"
+    ):
+        env.set_conditions({"gripp": 1.0})

@@ -17,11 +17,12 @@ from sb3_torcs.callbacks.learning import (
 from sb3_torcs.callbacks.lines import LinePicturesCallback
 from sb3_torcs.callbacks.metrics import MONITOR_KWARGS, DrivingMetricsCallback
 from sb3_torcs.callbacks.progress import RacingProgressCallback
-from sb3_torcs.callbacks.switches import RandomStartCallback, RewardCallback
+from sb3_torcs.callbacks.switches import ConditionsCallback, RandomStartCallback, RewardCallback
 
 __all__ = [
     "MONITOR_KWARGS",
     "AdaptiveLearningRateCallback",
+    "ConditionsCallback",
     "DrivingMetricsCallback",
     "GradientStepsCallback",
     "LeanUpdatesCallback",

@@ -11,6 +11,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_torcs.callbacks.metrics import callbacks_in
 from sb3_torcs.car import (
     StartName,
+    checked_delay,
+    checked_factor,
     checked_hard_starts,
     checked_start,
     checked_start_speed,
@@ -19,7 +21,7 @@ from sb3_torcs.car import (
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.rewards import Reward, RewardChoice
 
-__all__ = ["RandomStartCallback", "RewardCallback", "require_method"]
+__all__ = ["ConditionsCallback", "RandomStartCallback", "RewardCallback", "require_method"]
 
 
 class _SwitchUser(BaseCallback):
@@ -113,6 +115,39 @@ class RandomStartCallback(_SwitchUser):
         if self.hard:
             settings.append(("set_hard_starts", self.hard))
         self._switches = [_Switch(self.training_env, *setting) for setting in settings]
+
+
+class ConditionsCallback(_SwitchUser):
+    """
+    Change the conditions of training episodes; evaluations keep theirs.
+
+    An agent that learned with less grip than it will have keeps a margin. The first episode begins
+    before any callback is called, so it keeps the environment's conditions.
+
+    :param delay: control ticks until an action arrives, or a pair of them between which each
+        episode draws
+    :param grip: factor on the friction of all ground, or a pair
+    :param mass: factor on the mass of the car, or a pair
+    :param verbose: as in ``BaseCallback``
+    :raises InvalidOption: if a value is not allowed
+    """
+
+    def __init__(
+        self,
+        *,
+        delay: int | Sequence[int] = 0,
+        grip: float | Sequence[float] = 1.0,
+        mass: float | Sequence[float] = 1.0,
+        verbose: int = 0,
+    ) -> None:
+        super().__init__(verbose)
+        checked_delay(delay)  # checked here, for a message of this process and not of a worker
+        for name, choice in (("grip", grip), ("mass", mass)):
+            checked_factor(name, choice)
+        self.conditions = {"delay": delay, "grip": grip, "mass": mass}
+
+    def _on_training_start(self) -> None:
+        self._switches = [_Switch(self.training_env, "set_conditions", self.conditions)]
 
 
 def require_method(env: VecEnv, name: str) -> None:

@@ -2,63 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
-from sb3_torcs.car import Controls, is_count, is_number
+from sb3_torcs.car import Controls, checked_delay, checked_factor
 from sb3_torcs.errors import InvalidOption
 
-__all__ = ["MAX_DELAY", "Conditions", "Delay"]
+__all__ = ["Conditions", "Delay", "Part"]
 
-MAX_DELAY = 50  # control ticks: 1 s
-LEAST_FACTOR = 0.5  # of grip or mass; ice is another game
 RESTING = Controls(0.0, 0.0, 0.0)  # held until the first action arrives
 
 Part = tuple[Controls, int]
 """Controls, and the control ticks for which they are held."""
-
-
-class Range(NamedTuple):
-    """The bounds of a number that each episode draws; equal ones draw nothing."""
-
-    low: float
-    high: float
-
-
-def checked_range(name: str, choice: Any, low: float, high: float, unit: str) -> Range:
-    """
-    Check a number, or the two bounds of one that is drawn.
-
-    :param name: of the option
-    :param choice: what was given
-    :param low: the least that is allowed
-    :param high: the most that is allowed
-    :param unit: of both, in words
-    :raises InvalidOption: if it is no such number
-    """
-    pair = list(choice) if isinstance(choice, Sequence | np.ndarray) else [choice, choice]
-    numbers = not isinstance(choice, str) and len(pair) == 2 and all(map(is_number, pair))
-    if not numbers or not low <= pair[0] <= pair[1] <= high:
-        raise InvalidOption(
-            f"{name} is {choice!r}; expected {unit} from {low:g} to {high:g}, or a pair of them, "
-            "between which each episode draws"
-        )
-    return Range(*pair)
-
-
-def checked_delay(choice: Any) -> Range:
-    """
-    Check the option ``delay``.
-
-    :param choice: control ticks, or a pair of them
-    :raises InvalidOption: if it is no such number
-    """
-    bounds = checked_range("delay", choice, 0, MAX_DELAY, "whole control ticks")
-    if not all(bound == 0 or is_count(bound) for bound in bounds):
-        raise InvalidOption(f"delay is {choice!r}; expected whole control ticks of 0.02 s")
-    return bounds
 
 
 class Delay:
@@ -100,13 +57,30 @@ class Conditions:
     """
 
     def __init__(self, delay: Any, grip: Any, mass: Any) -> None:
+        self.choice = {"delay": delay, "grip": grip, "mass": mass}
         self._delays = checked_delay(delay)
         self._factors = {
-            name: checked_range(name, choice, LEAST_FACTOR, 1.0 / LEAST_FACTOR, "a factor")
-            for name, choice in (("grip", grip), ("mass", mass))
+            name: checked_factor(name, choice) for name, choice in (("grip", grip), ("mass", mass))
         }
         self._changed = [name for name, bounds in self._factors.items() if bounds != (1.0, 1.0)]
+        self._tells = bool(self._changed)
         self.grip = self.mass = 1.0
+
+    def instead(self, choice: Mapping[str, Any]) -> Conditions:
+        """
+        Make conditions in the place of these.
+
+        :param choice: those that change, by name
+        :raises InvalidOption: if a name or a value is not allowed
+        """
+        for name in choice:
+            if name not in self.choice:
+                raise InvalidOption(
+                    f"unknown condition {name!r}; allowed: {', '.join(self.choice)}"
+                )
+        changed = Conditions(**{**self.choice, **choice})
+        changed._tells |= self._tells  # a world keeps what it was told last
+        return changed
 
     def check(self, world: Any) -> None:
         """
@@ -133,7 +107,7 @@ class Conditions:
         """
         low, high = map(int, self._delays)
         ticks = low if low == high else int(rng.integers(low, high + 1))
-        if self._changed:
+        if self._tells:
             self.grip, self.mass = (
                 float(low if low == high else rng.uniform(low, high))
                 for low, high in self._factors.values()

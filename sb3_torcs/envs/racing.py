@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, Literal, TypedDict, get_args
 
@@ -263,6 +263,18 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         :return: the previous one
         """
         previous, self._starts.hard = self._starts.hard, checked_hard_starts(share)
+        return previous
+
+    def set_conditions(self, choice: Mapping[str, Any]) -> dict[str, Any]:
+        """
+        Change ``delay``, ``grip`` and ``mass`` from the next reset on.
+
+        :param choice: those that change, by name, as in the constructor
+        :return: all of them before
+        """
+        conditions = self.conditions.instead(choice)
+        conditions.check(self.backend)
+        previous, self.conditions = self.conditions.choice, conditions
         return previous
 
     def reset(
