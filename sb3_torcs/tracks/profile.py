@@ -79,6 +79,25 @@ def game_profile(road: FloatArray) -> RoadProfile:
 
 
 @njit(cache=True)
+def _place_at(sums: FloatArray, step: float, distance: float) -> tuple[int, int, float]:
+    """Find a place by its distance from the start line: laps, index, and share of the next step."""
+    places = len(sums) - 1
+    where = distance / step
+    laps = math.floor(where / places)
+    where -= laps * places
+    index = min(int(where), places - 1)
+    return laps, index, where - index
+
+
+@njit(cache=True)
+def _sum_at(sums: FloatArray, place: tuple[int, int, float], quantity: int) -> float:
+    """What a quantity has added up to since the start line, whole laps included."""
+    laps, index, share = place
+    here, there = sums[index, quantity], sums[index + 1, quantity]
+    return float(laps * sums[len(sums) - 1, quantity] + here + share * (there - here))
+
+
+@njit(cache=True)
 def look_ahead(sums: FloatArray, step: float, distance: float, means: FloatArray) -> None:
     """
     Take the means of curvature, width and slope over the intervals ahead of a car.
@@ -88,16 +107,10 @@ def look_ahead(sums: FloatArray, step: float, distance: float, means: FloatArray
     :param distance: of the car from the start line [m]
     :param means: (3, intervals) filled: curvature [1/m], width [m] and slope [m/m]
     """
-    places = len(sums) - 1
     for i in range(len(_AHEAD)):
-        where = (distance + _AHEAD[i]) / step
-        laps = math.floor(where / places)
-        where -= laps * places
-        place = min(int(where), places - 1)
-        share = where - place
+        place = _place_at(sums, step, distance + _AHEAD[i])
         for quantity in range(QUANTITIES):
-            here, there = sums[place, quantity], sums[place + 1, quantity]
-            total = laps * sums[places, quantity] + here + share * (there - here)
+            total = _sum_at(sums, place, quantity)
             if i > 0:
                 means[quantity, i - 1] += total
                 means[quantity, i - 1] /= _AHEAD[i] - _AHEAD[i - 1]
@@ -108,13 +121,7 @@ def look_ahead(sums: FloatArray, step: float, distance: float, means: FloatArray
 @njit(cache=True)
 def _turned(sums: FloatArray, step: float, distance: float) -> float:
     """How much a road has turned since the start line [rad]; ``distance`` may be beyond a lap."""
-    places = len(sums) - 1
-    where = distance / step
-    laps = math.floor(where / places)
-    where -= laps * places
-    place = min(int(where), places - 1)
-    here, there = sums[place, 0], sums[place + 1, 0]
-    return float(laps * sums[places, 0] + here + (where - place) * (there - here))
+    return _sum_at(sums, _place_at(sums, step, distance), 0)
 
 
 @njit(cache=True)
