@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import colorsys
+import contextlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -108,14 +109,13 @@ class Footage:
         from sb3_torcs.rendering.encoder import ENCODING
         from sb3_torcs.rendering.viewer import Viewer
 
-        viewer = Viewer(size=SIZE)
+        with contextlib.closing(Viewer(size=SIZE)) as viewer:
 
-        def draw(moment: Moment, car: CarState, field: Field) -> Frame:
-            controls = Controls(*moment.controls[followed])
-            return viewer.frame(self.road, car, controls, None, field)
+            def draw(moment: Moment, car: CarState, field: Field) -> Frame:
+                controls = Controls(*moment.controls[followed])
+                return viewer.frame(self.road, car, controls, None, field)
 
-        self._write(path, followed, laps, draw, ENCODING)
-        viewer.close()
+            self._write(path, followed, laps, draw, ENCODING)
 
     def _save_game_view(
         self, path: Path, followed: int, laps: int, race: RaceSetup, view: ViewName
