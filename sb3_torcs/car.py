@@ -1,4 +1,4 @@
-"""The state of a car and its controls: the two records that all worlds use.
+"""The state of a car and its controls, the two records that all worlds use, and how episodes begin.
 
 SI units and radians throughout. Left is positive for steering, lateral position and yaw.
 """

@@ -58,9 +58,10 @@ def pedals(before: CarState, after: CarState, controls: Controls) -> float:
 
 
 def safe_speed(sight: float) -> float:
-    """√(12² + 2 · 10 · sight) [m/s], from which 10 m/s² slow down to 12 m/s within so many metres.
+    """
+    Return the speed from which 10 m/s² slow down to 12 m/s within a distance [m/s].
 
-    :param sight: [m]
+    :param sight: the distance [m]
     """
     return math.sqrt(BEND_SPEED**2 + 2.0 * BRAKING * sight)
 

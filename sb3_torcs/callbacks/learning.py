@@ -1,4 +1,4 @@
-"""Callbacks that change how a training learns: more gradient steps, mirrored samples."""
+"""Callbacks that change how a training learns: its updates, its learning rate, its samples."""
 
 from __future__ import annotations
 

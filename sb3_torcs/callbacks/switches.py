@@ -1,4 +1,4 @@
-"""Callbacks that change the training environments: the reward, the start of episodes."""
+"""Callbacks that change the training environments: the reward, starts, conditions."""
 
 from __future__ import annotations
 

@@ -304,7 +304,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         except InvalidOption:
             if options or start is None:
                 raise
-            # A wall stands where a start was drawn, which happens once in some hundred thousand.
+            # A wall stands where a start was drawn: rare, but a training draws thousands.
             start = None
             self.car = self.backend.reset(self.np_random, start)
         self._controls = Controls(0.0, 0.0, 0.0)

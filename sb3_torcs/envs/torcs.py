@@ -144,7 +144,7 @@ class TorcsEnv(RacingEnv):
             )
         if self.picture == "game" and (is_several(track) or is_several(car, "car")):
             raise InvalidOption("picture 'game' is for one track and one car, not for a list")
-        guests = bool(opponents) and guests_of(opponents, find_game())
+        guests = guests_of(opponents, find_game()) if opponents else []
         if self.picture == "game" and guests:
             raise InvalidOption(
                 f"picture 'game' is for races against robots, and '{guests[0]}' is an agent; use "

@@ -1,4 +1,4 @@
-"""The policy with split heads for stock DDPG and TD3, and its parts."""
+"""Policies for stock algorithms: split heads for DDPG and TD3, bounded means for PPO and A2C."""
 
 from sb3_torcs.policies.bounded import BoundedPolicy
 from sb3_torcs.policies.export import export_actor
