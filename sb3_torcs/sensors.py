@@ -2,9 +2,9 @@
 
 Its rows stand in groups, which an environment's ``sensors`` names: ``"base"`` are sensors of the
 SCR manual (arXiv:1304.1672, table 1), ``"preview"`` is the road ahead, ``"limits"`` are the speeds
-that it allows, and ``"opponents"``, ``"rivals"`` and ``"race"`` are the other cars. The observation
-space, the encoder, the mirror image, the documentation and the policy's view of the observation are
-all derived from the table.
+that it allows, ``"line"`` is the racing line, and ``"opponents"``, ``"rivals"`` and ``"race"`` are
+the other cars. The observation space, the encoder, the mirror image, the documentation and the
+policy's view of the observation are all derived from the table.
 
 To add a group, write its rows, put them into :data:`GROUPS`, and its function into ``_WRITERS``.
 """
@@ -26,6 +26,7 @@ from numba.extending import overload
 from sb3_torcs.car import RIVALS, CarState, FloatArray
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.tracks.profile import INTERVALS, QUANTITIES, RoadProfile, look_ahead, speed_margins
+from sb3_torcs.tracks.racing_line import LINE_PLACES, look_along, racing_line
 
 __all__ = [
     "GROUPS",
@@ -48,7 +49,7 @@ __all__ = [
     "sensors_of_size",
 ]
 
-SensorsName = Literal["base", "preview", "limits", "opponents", "rivals", "race"]
+SensorsName = Literal["base", "preview", "limits", "line", "opponents", "rivals", "race"]
 Mirror = Literal["same", "opposite", "reversed", "sides"]
 
 
@@ -102,6 +103,15 @@ LIMITS = (Sensor("speed_margins_ahead", "", INTERVALS, "m/s", -40.0, 40.0, 1.0 /
 it has to brake. Bends are taken at 15 m/s² and brakes slow down by 10 m/s². A car on asphalt can do
 more, so that an agent learns how much more is possible."""
 
+LINE = (
+    Sensor("line_offsets", "", LINE_PLACES, "m", -20.0, 20.0, 1.0 / 5.0, "opposite"),
+    Sensor("line_bends", "", LINE_PLACES, "-", -1.0, 1.0, 1.0, "opposite"),
+    Sensor("line_margins", "", LINE_PLACES, "m/s", -40.0, 40.0, 1.0 / 20.0),
+)
+"""The racing line ahead: how far to the left of the car it lies, how it bends, in the terms of
+``bends_ahead``, and by how much the car may be faster now to drive it, in the terms of
+``speed_margins_ahead``, but on this surface, with its hills and banking."""
+
 OPPONENTS = (Sensor("opponents", "opponents", 36, "m", 0.0, 200.0, 1.0 / 200.0, "reversed"),)
 """Distances to the nearest car in sectors of 10°, clockwise; the first begins straight behind."""
 
@@ -131,6 +141,7 @@ GROUPS: Mapping[SensorsName, tuple[Sensor, ...]] = {
     "base": SENSORS,
     "preview": PREVIEW,
     "limits": LIMITS,
+    "line": LINE,
     "opponents": OPPONENTS,
     "rivals": RIVAL_ROWS,
     "race": RACE,
@@ -327,31 +338,8 @@ def _profile(world: Any) -> RoadProfile:
 
 
 def _write_preview(world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> None:
-    sums, step = _profile(world)
-    _scale_preview(sums, step, car.distance_from_start, numbers)
-
-
-_LIMITS_AT = _PARTS["limits"].start
-
-
-@njit(cache=True)
-def _scale_limits(
-    sums: FloatArray,
-    step: float,
-    distance: float,
-    speed: float,
-    numbers: npt.NDArray[np.float32],
-) -> None:
-    """Find the margins, scale and clip; as :func:`_scale_preview`."""
-    margins = np.empty(INTERVALS)
-    speed_margins(sums, step, distance, speed, margins)
-    for i in range(INTERVALS):
-        numbers[i] = _scaled(margins[i], _LIMITS_AT + i)
-
-
-def _write_limits(world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> None:
-    sums, step = _profile(world)
-    _scale_limits(sums, step, car.distance_from_start, car.speed_x, numbers)
+    road = _profile(world)
+    _scale_preview(road.sums, road.step, car.distance_from_start, numbers)
 
 
 @njit(cache=True)
@@ -359,6 +347,22 @@ def _scale_into(values: FloatArray, first: int, numbers: npt.NDArray[np.float32]
     """Scale and clip values of a group, whose place in the table is given."""
     for i in range(len(values)):
         numbers[i] = _scaled(values[i], first + i)
+
+
+def _write_limits(world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> None:
+    road = _profile(world)
+    margins = np.empty(INTERVALS)
+    speed_margins(road.sums, road.step, car.distance_from_start, car.speed_x, margins)
+    _scale_into(margins, _PARTS["limits"].start, numbers)
+
+
+def _write_line(world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> None:
+    table, step = racing_line(_profile(world))
+    seen = np.empty((3, LINE_PLACES))
+    place = car.distance_from_start, car.track_position
+    look_along(table, step, *place, car.speed_x, seen)
+    seen[1] /= np.abs(seen[1]) + USUAL_BEND
+    _scale_into(seen.ravel(), _PARTS["line"].start, numbers)
 
 
 def _write_opponents(world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> None:
@@ -380,6 +384,7 @@ def _write_race(world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> 
 _WRITERS: dict[str, Callable[[Any, CarState, npt.NDArray[np.float32]], None]] = {
     "preview": _write_preview,
     "limits": _write_limits,
+    "line": _write_line,
     "opponents": _write_opponents,
     "rivals": _write_rivals,
     "race": _write_race,

@@ -168,6 +168,7 @@ GENERATED = {
         "sensors": sensor_table,
         "preview": functools.partial(sensor_table, "preview"),
         "limits": functools.partial(sensor_table, "limits"),
+        "line": functools.partial(sensor_table, "line"),
         "opponents": functools.partial(sensor_table, "opponents"),
         "rivals": functools.partial(sensor_table, "rivals"),
         "race": functools.partial(sensor_table, "race"),

@@ -38,6 +38,12 @@ def env_id(request):
     return request.param
 
 
+def flat(lengths, curvatures, widths, climbs):
+    """A road of usual asphalt without banking."""
+    rows = (lengths, curvatures, widths, climbs, [1.1] * len(lengths), [0.0] * len(lengths))
+    return road_profile(*map(np.array, rows))
+
+
 def ahead(profile, distance):
     """Mean curvatures, widths and slopes."""
     means = np.empty((3, INTERVALS))
@@ -55,14 +61,14 @@ def seen(track, distance):
 def test_the_numbers_are_means_over_intervals_that_begin_at_the_car():
     """A kilometre: straight and wide, then a bend, then another one that climbs."""
     road = ([300.0, 500.0, 200.0], [0.0, 0.01, -0.02], [12.0, 8.0, 8.0], [0.0, 0.0, 10.0])
-    curvature, width, slope = ahead(road_profile(*map(np.array, road)), 235.0)
+    curvature, width, slope = ahead(flat(*road), 235.0)
     assert np.allclose(curvature[:4], 0.0, atol=1e-15)
     assert curvature[4] == pytest.approx(0.01 * 15.0 / 20.0)  # 60 to 80 m ahead: 15 m of the bend
     assert np.allclose(curvature[5:], 0.01)
     assert width[4] == pytest.approx(12.0 - 4.0 * 15.0 / 20.0)
     assert np.allclose(width[:4], 12.0)
     assert np.allclose(slope, 0.0)
-    assert np.allclose(ahead(road_profile(*map(np.array, road)), 800.0)[2, :9], 0.05)
+    assert np.allclose(ahead(flat(*road), 800.0)[2, :9], 0.05)
 
 
 def test_widths_are_told_as_differences(oval):
@@ -79,7 +85,7 @@ def test_the_view_goes_on_across_the_start_line(oval):
     """Also if the road is shorter than the view is far."""
     whole = oval.length
     assert np.allclose(ahead(oval.profile, whole - 1e-9), ahead(oval.profile, 0.0))
-    lap = road_profile(*map(np.array, ([90.0], [2.0 * np.pi / 90.0], [10.0], [0.0])))
+    lap = flat([90.0], [2.0 * np.pi / 90.0], [10.0], [0.0])
     assert np.allclose(ahead(lap, 45.0)[0], 2.0 * np.pi / 90.0)
 
 
@@ -124,7 +130,7 @@ def margins(profile, distance, speed):
 def test_a_limit_is_a_speed_that_can_be_lost_before_the_bend():
     """300 m of straight, then a bend of 40 m, which is taken at the root of 15 times 40 m/s."""
     road = ([300.0, 300.0, 200.0], [0.0, 0.025, 0.0], [10.0] * 3, [0.0] * 3)
-    profile = road_profile(*map(np.array, road))
+    profile = flat(*road)
     for distance in (150.0, 230.0, 277.0):
         free = [a < 300.0 - distance - 15.0 for a in DISTANCES[1:]]
         found = margins(profile, distance, 30.0)

@@ -25,6 +25,11 @@ double height(const Segment& segment, Vertex left, Vertex right) {
     return 0.5 * (double(segment.vertex[left].z) + segment.vertex[right].z);
 }
 
+// By how much the left edge lies higher.
+double banking(const Segment& segment, Vertex left, Vertex right) {
+    return double(segment.vertex[left].z) - segment.vertex[right].z;
+}
+
 double curvature(const Segment& segment) {
     if (segment.type == STRAIGHT) return 0.0;
     return (segment.type == LEFT_TURN ? segment.arc : -segment.arc) / segment.length;
@@ -44,7 +49,8 @@ std::vector<RoadSegment> road_of(const TrackData& track) {
              segment->surface->rolling_resistance, segment->barrier[LEFT]->surface->friction,
              segment->barrier[RIGHT]->surface->friction,
              double(segment->from_start) + segment->length,
-             height(*segment, START_LEFT, START_RIGHT), height(*segment, END_LEFT, END_RIGHT)});
+             height(*segment, START_LEFT, START_RIGHT), height(*segment, END_LEFT, END_RIGHT),
+             banking(*segment, START_LEFT, START_RIGHT), banking(*segment, END_LEFT, END_RIGHT)});
     }
     return road;
 }

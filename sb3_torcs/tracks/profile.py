@@ -7,7 +7,7 @@ distance, wherever the car is.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
@@ -39,15 +39,23 @@ FASTEST = 100.0  # [m/s] on a straight
 WINDOW = 5.0  # [m] between places where bends are measured, each over twice this length
 
 
-class RoadProfile(NamedTuple):
-    """What a road has added up to since the start line, at places at equal distances."""
+@dataclass(frozen=True, eq=False)
+class RoadProfile:
+    """A road at places at equal distances, the first and the last on the start line."""
 
-    sums: FloatArray  # (n + 1, 3) its turn [rad], area [m²] and climb [m]
+    sums: FloatArray  # (n + 1, 3) its turn [rad], area [m²] and climb [m] since the start line
     step: float  # [m] from one place to the next
+    frictions: FloatArray  # (n + 1,) of its surface [-]
+    bankings: FloatArray  # (n + 1,) by how much it rises to the left [m/m]
 
 
 def road_profile(
-    lengths: FloatArray, curvatures: FloatArray, widths: FloatArray, climbs: FloatArray
+    lengths: FloatArray,
+    curvatures: FloatArray,
+    widths: FloatArray,
+    climbs: FloatArray,
+    frictions: FloatArray,
+    bankings: FloatArray,
 ) -> RoadProfile:
     """
     Make the profile of a closed road.
@@ -56,6 +64,8 @@ def road_profile(
     :param curvatures: (n,) of the axis [1/m], left positive
     :param widths: (n,) in the mean [m]
     :param climbs: (n,) by how much their ends lie higher than their beginnings [m]
+    :param frictions: (n,) of their surface [-]
+    :param bankings: (n,) by how much they rise to the left in the mean [m/m]
     :return: the profile
     """
     ends = np.concatenate(([0.0], np.cumsum(lengths)))
@@ -63,19 +73,25 @@ def road_profile(
     places = np.linspace(0.0, ends[-1], number + 1)
     added = (curvatures * lengths, widths * lengths, climbs)
     sums = [np.interp(places, ends, np.concatenate(([0.0], np.cumsum(row)))) for row in added]
-    table = np.stack(sums, axis=1)
-    table.setflags(write=False)
-    return RoadProfile(table, float(ends[-1]) / number)
+    segment = np.minimum(np.searchsorted(ends[1:], places, side="right"), len(lengths) - 1)
+    columns = np.stack(sums, axis=1), frictions[segment], bankings[segment]
+    for column in columns:
+        column.setflags(write=False)
+    table, friction, banking = columns
+    return RoadProfile(table, float(ends[-1]) / number, friction, banking)
 
 
 def game_profile(road: FloatArray) -> RoadProfile:
     """
     Make the profile of a road as the game has laid it, with its hills.
 
-    :param road: (n_segments, 15) from the engine
+    :param road: (n_segments, 17) from the engine
     """
-    length, curvature, width, end_width, *_, height, end_height = road.T
-    return road_profile(length, curvature, 0.5 * (width + end_width), end_height - height)
+    length, curvature, start_width, end_width, _, _, _, _, friction, *_ = road.T
+    height, end_height, rise, end_rise = road.T[-4:]
+    width = 0.5 * (start_width + end_width)
+    banking = 0.5 * (rise + end_rise) / width
+    return road_profile(length, curvature, width, end_height - height, friction, banking)
 
 
 @njit(cache=True)

@@ -171,11 +171,13 @@ class Track:
 
     @functools.cached_property
     def profile(self) -> RoadProfile:
-        """The road ahead of any place. The track is a plane, so its slope is 0."""
+        """The road ahead of any place. The track is a plane, so its slope and banking are 0."""
         table = self.table
         widths = 0.5 * (table[:, WIDTH_START] + table[:, WIDTH_END])
-        level = np.zeros(len(table))
-        return road_profile(table[:, LENGTH], table[:, CURVATURE], widths, level)
+        flat = np.zeros(len(table))
+        return road_profile(
+            table[:, LENGTH], table[:, CURVATURE], widths, flat, table[:, ROAD_FRICTION], flat
+        )
 
     @functools.cached_property
     def _starts(self) -> list[float]:

@@ -54,7 +54,7 @@ COLUMNS = (  # of the engine's road
     "friction", "rolling resistance", "friction of the left wall", "friction of the right wall",
     "place of the end",
 )  # fmt: skip
-HEIGHTS = 2  # columns after these, which are not read from files
+HEIGHTS = 4  # columns after these, which are not read from files
 ROUNDING = 1e-4  # [-] the game computes in single precision; its own tracks differ by 1e-5
 
 _tried: set[Any] = set()
@@ -114,7 +114,7 @@ def check_road(path: Path, road: FloatArray) -> None:
     Compare the road that the game has made with the one that was read.
 
     :param path: of the track's file
-    :param road: (n_segments, 15) from the engine
+    :param road: (n_segments, 17) from the engine
     :raises TrackFileError: if they differ, naming where
     """
     read = _as_read(load_track(path))
@@ -157,7 +157,7 @@ def load_road(path: Path, race: dict[str, Any]) -> FloatArray:
 
     :param path: of the track's file
     :param race: from :func:`engine_arguments`
-    :return: (n_segments, 15) its road, as of the engine
+    :return: (n_segments, 17) its road, as of the engine
     :raises TrackFileError: if the game's loader crashes or hangs
     """
     race = {**race, "angles": [[0.0] * RANGE_FINDERS] * len(race["cars"])}
