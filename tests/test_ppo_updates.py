@@ -167,9 +167,27 @@ def test_within_the_target_the_learning_rate_is_the_models_own():
     assert model.lr_schedule(1.0) == 0.01
 
 
+def test_a_target_that_falls_is_missed_later():
+    """What is within the target in the beginning is far beyond it in the end."""
+    model = make()
+    model.learn(20)
+    callback = AdaptiveLearningRateCallback(kl=0.02, last_kl=0.001)
+    callback.init_callback(model)
+    callback.on_training_start({}, {})
+    factors = []
+    for remaining in (1.0, 0.5, 0.0):
+        model.logger.record("train/approx_kl", 0.015)
+        model._current_progress_remaining = remaining
+        callback.on_rollout_start()
+        factors.append(callback.factor)
+    assert factors == [1.0, 1.0, 1.0 / 1.5]
+
+
 def test_only_ppo_tells_a_divergence():
     with pytest.raises(InvalidOption, match="the model is a A2C; take it out"):
         A2C("MlpPolicy", ToyRace()).learn(5, callback=AdaptiveLearningRateCallback())
     for kl in (0.0, -1.0, "small"):
         with pytest.raises(InvalidOption, match="pass a divergence above 0"):
             AdaptiveLearningRateCallback(kl=kl)
+        with pytest.raises(InvalidOption, match=r"last_kl is .* pass a divergence above 0"):
+            AdaptiveLearningRateCallback(last_kl=kl)

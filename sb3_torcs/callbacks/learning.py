@@ -157,16 +157,23 @@ class AdaptiveLearningRateCallback(_WhileLearning):
     al., 2017, section 4, adapt a penalty in the same way). The model's own schedule goes on below;
     models that callbacks save keep it. A resumed training begins with it again.
 
+    With a target that stays, a policy never settles: what it drives well changes from update to
+    update. A target that falls lets it come to rest.
+
     :param kl: target of the divergence per update [nats]
+    :param last_kl: the same at the end of the training, to which it falls linearly [nats]; ``None``
+        is ``kl``
     :param verbose: as in ``BaseCallback``
-    :raises InvalidOption: if the target is not above 0, or the model is not PPO
+    :raises InvalidOption: if a target is not above 0, or the model is not PPO
     """
 
-    def __init__(self, *, kl: float = 0.01, verbose: int = 0) -> None:
+    def __init__(self, *, kl: float = 0.01, last_kl: float | None = None, verbose: int = 0) -> None:
         super().__init__(verbose)
-        if not is_number(kl) or kl <= 0.0:
-            raise InvalidOption(f"kl is {kl!r}; pass a divergence above 0, e.g. 0.01")
-        self.kl = kl
+        last_kl = kl if last_kl is None else last_kl
+        for name, target in (("kl", kl), ("last_kl", last_kl)):
+            if not is_number(target) or target <= 0.0:
+                raise InvalidOption(f"{name} is {target!r}; pass a divergence above 0, e.g. 0.01")
+        self.kl, self.last_kl = kl, last_kl
         self.factor = 1.0
 
     def _on_training_start(self) -> None:
@@ -179,10 +186,12 @@ class AdaptiveLearningRateCallback(_WhileLearning):
 
     def _on_rollout_start(self) -> None:
         super()._on_rollout_start()
+        remaining = self.model._current_progress_remaining
+        target = self.last_kl + remaining * (self.kl - self.last_kl)
         kl = self.logger.name_to_value.get("train/approx_kl")
-        if kl is not None and kl > 2.0 * self.kl:
+        if kl is not None and kl > 2.0 * target:
             self.factor = max(self.factor / RATE_STEP, LEAST_RATE)
-        elif kl is not None and kl < 0.5 * self.kl:
+        elif kl is not None and kl < 0.5 * target:
             self.factor = min(self.factor * RATE_STEP, MOST_RATE)
 
     def _on_rollout_end(self) -> None:
