@@ -44,7 +44,7 @@ def test_the_shipped_studies_can_be_run(path):
         ({"name": "..."}, "name is '...'; expected a word"),
         ({"final_tracks": ["aalbrg"]}, "no track 'aalbrg'; did you mean 'aalborg'?"),
         ({"final_tracks": ["aalborg", "road/aalborg"]}, "one is there twice"),
-        ({"final_tracks": 3}, "expected a list of tracks, or 'road' for all"),
+        ({"final_tracks": 3}, "expected a list of tracks, or of 'road', 'oval', 'dirt'"),
         ({"env": "Torc-v0"}, "no environment 'Torc-v0' is registered; did you mean 'Torcs-v0'?"),
         ({"algo": "dpg"}, "no hyperparameters are shipped for the algorithm 'dpg'"),
         ({"conf_file": "none.yml"}, "there is no hyperparameter file"),
@@ -153,6 +153,14 @@ def test_road_stands_for_all_road_tracks(tmp_path):
     road = {f"road/{t.name}" for t in available_tracks() if t.category == "road"}
     assert set(study.trials[0].final_tracks) == road
     assert len(road) >= 3
+
+
+def test_categories_and_tracks_stand_side_by_side(tmp_path):
+    study = read_study(written(tmp_path, final_tracks=["oval", "dirt-1"]))
+    others = {t.name for t in available_tracks() if t.category == "oval"}
+    assert {name.rpartition("/")[2] for name in study.trials[0].final_tracks} == {
+        "aalborg", "dirt-1", *others,
+    }  # fmt: skip
 
 
 def test_without_ray_it_is_said_what_to_type(tmp_path, capsys, monkeypatch):

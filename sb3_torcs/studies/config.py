@@ -14,6 +14,7 @@ import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from sb3_torcs.agents.wrapping import unrebuilt
 from sb3_torcs.errors import StudyError, near_miss, with_new_names
 from sb3_torcs.files import read_yaml
 from sb3_torcs.torcs.track_names import RANDOM_TRACK
-from sb3_torcs.tracks.catalogue import available_tracks, load_track
+from sb3_torcs.tracks.catalogue import CATEGORIES, available_tracks, load_track
 from sb3_torcs.training import zoo
 from sb3_torcs.training.zoo_data import as_data
 
@@ -38,7 +39,6 @@ SOURCE = (
 
 WORDS = ("algo", "env", "conf_file", "entry")
 KEYS = tuple(dict.fromkeys((*REQUIRED, *SOURCE, "variants", "final_tracks")))
-ROAD = "road"
 SEEDS = 2**32  # that NumPy takes
 MANY = 10_000  # a larger number of seeds is one seed, without its brackets
 
@@ -287,17 +287,24 @@ def _check_evaluable(entry: Mapping[str, Any], place: zoo.Place) -> None:
 
 
 def _tracks(value: Any, what: str) -> tuple[str, ...]:
-    """Read a list of tracks, or ``road``: all that there are of that kind."""
-    if value == ROAD:
-        return tuple(f"{s.category}/{s.name}" for s in available_tracks() if s.category == ROAD)
+    """Read a list of tracks; a category stands for all of its tracks."""
     tracks = [value] if isinstance(value, str) else value
     listed = isinstance(tracks, list) and all(isinstance(track, str) for track in tracks)
     if not listed or not tracks:
-        raise StudyError(f"{what} is {value!r}; expected a list of tracks, or '{ROAD}' for all")
+        categories = ", ".join(f"'{category}'" for category in CATEGORIES)
+        raise StudyError(f"{what} is {value!r}; expected a list of tracks, or of {categories}")
+    tracks = list(chain.from_iterable(map(_in_category, tracks)))
     names = [track_name(track) for track in tracks]
     if len(set(names)) < len(names):
         raise StudyError(f"{what}: {', '.join(names)}: one is there twice; take it out")
     return tuple(tracks)
+
+
+def _in_category(name: str) -> list[str]:
+    """Return the tracks of a category; any other name stands for itself."""
+    if name not in CATEGORIES:
+        return [name]
+    return [f"{s.category}/{s.name}" for s in available_tracks() if s.category == name]
 
 
 def _united(one: Sequence[str], other: Sequence[str]) -> tuple[str, ...]:

@@ -19,7 +19,7 @@ from sb3_torcs.tracks.generator import random_track
 from sb3_torcs.tracks.torcs_xml import read_track_xml
 from sb3_torcs.tracks.track import Track, TrackSummary, closed
 
-__all__ = ["available_tracks", "load_track"]
+__all__ = ["CATEGORIES", "available_tracks", "load_track"]
 
 
 CATEGORIES = ("road", "oval", "dirt")
