@@ -72,7 +72,7 @@ def test_a_bend_between_straights_is_driven_outside_inside_outside():
     assert before < -2.0
     assert after < -2.0
     assert apex == pytest.approx(5.0 - EDGE, abs=0.1)
-    assert line.table[:, SPEED].min() > 1.3 * 1.6 * 9.81 * 20.0
+    assert line.table[:, SPEED].min() > 1.3 * 1.4 * 9.81 * 20.0
 
 
 def test_the_mirror_image_of_a_road_has_the_mirror_image_of_its_line():
@@ -114,15 +114,15 @@ def slowest(road):
 
 
 def test_speed_goes_with_the_surface_and_the_banking():
-    """On a circle of 96.5 m; tyres hold 1.6 times the load on usual asphalt."""
+    """On a circle of 96.5 m; tyres hold 1.4 times the load on usual asphalt."""
     bend = 1.0 / 96.5
-    flat = 1.6 * 9.81 / (bend - 1.6 * 0.0015)
+    flat = 1.4 * 9.81 / (bend - 1.4 * 0.003)
     assert slowest(ring()) == pytest.approx(flat, rel=1e-3)
-    slippery = 0.8 * 9.81 / (bend - 0.8 * 0.0015)
+    slippery = 0.7 * 9.81 / (bend - 0.7 * 0.003)
     assert slowest(ring(friction=0.55)) == pytest.approx(slippery, rel=1e-3)
     falls_to_the_left = slowest(ring(banking=-0.2))
-    assert falls_to_the_left == pytest.approx(flat * 1.8 / 1.6, rel=1e-3)
-    assert slowest(ring(banking=0.2)) == pytest.approx(flat * 1.4 / 1.6, rel=1e-3)
+    assert falls_to_the_left == pytest.approx(flat * 1.6 / 1.4, rel=1e-3)
+    assert slowest(ring(banking=0.2)) == pytest.approx(flat * 1.2 / 1.4, rel=1e-3)
     assert slowest(ring(banking=0.2, side=-1.0)) == pytest.approx(falls_to_the_left, rel=1e-3)
 
 

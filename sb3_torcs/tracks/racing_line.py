@@ -39,8 +39,8 @@ GRAVITY = 9.81  # [m/s²]
 USUAL_FRICTION = 1.1  # [-] of asphalt
 # What a careful driver dares in the default car on usual asphalt. The best agents and robots take
 # bends 10 to 30 % faster.
-TYRES = 1.6  # [-] force across per load
-DOWNFORCE = 0.0015  # [1/m] load of the air per mass and speed²
+TYRES = 1.4  # [-] force across per load
+DOWNFORCE = 0.003  # [1/m] load of the air per mass and speed²
 BRAKING = 12.0  # [m/s²]
 FASTEST = 100.0  # [m/s] on a straight
 LEAST = 1.0  # [m/s²] across that every road bears
@@ -196,7 +196,7 @@ def _limits(
 
     Tyres hold a car by a share of its load, which is less on a crest, more in a dip, and more with
     the air's downforce; and gravity holds it by the banking:
-    v² · curvature = grip · 1.6 · (g + v² · (rounding + downforce)) + g · banking.
+    v² · curvature = grip · 1.4 · (g + v² · (rounding + downforce)) + g · banking.
 
     :param curvature: (n,) of the line [1/m], left positive
     :param grip: (n,) of the surface, against usual asphalt [-]

@@ -1,0 +1,128 @@
+"""Train PPO to race on one track: alone, then among copies of itself, then against robots.
+
+Each car of each race is an environment of TorcsVecEnv, so that stock PPO learns from all of them.
+"""
+
+import argparse
+from pathlib import Path
+
+import torch as th
+from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
+from torch import nn
+
+from sb3_torcs.agents.model_writing import RecordCallback, recipe
+from sb3_torcs.callbacks import (
+    AdaptiveLearningRateCallback,
+    LeanUpdatesCallback,
+    RandomStartCallback,
+)
+from sb3_torcs.policies import BoundedPolicy
+from sb3_torcs.sensors import feature_slices
+from sb3_torcs.vec_env import TorcsVecEnv
+
+CARS = 64  # that learn at once
+SENSORS = ("base", "line", "rivals")
+# The fields of robots, of which each race draws one: passing is learned from few, the first bend
+# from many.
+FIELDS = (
+    ("inferno", "bt", "olethros"),
+    ("bt", "berniw"),
+    ("tita",),
+    ("lliaw", "olethros", "inferno", "bt", "berniw", "tita"),
+)
+ALONE = {
+    "progress": 1.0, "off_line": -1.0, "leaving": -0.5, "damage": -0.02, "crash": -1.0, "scale": 0.1
+}  # fmt: skip
+RACING = {**ALONE, "damage": -0.05, "places": 10.0, "contact": -1.0, "fault": -20.0}
+
+parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+parser.add_argument("--track", default="aalborg")
+parser.add_argument("--alone", type=int, default=1_000_000, help="timesteps without other cars")
+parser.add_argument("--selfplay", type=int, default=800_000, help="timesteps among eight copies")
+parser.add_argument("--robots", type=int, default=6_000_000, help="timesteps against robots")
+parser.add_argument("--seed", type=int, default=0)
+parser.add_argument("--threads", type=int, help="default: one per core")
+parser.add_argument("--folder", type=Path, default=Path("logs/racer"))
+
+
+def callbacks(env_kwargs: dict, folder: Path, *, random_starts: bool) -> list[BaseCallback]:
+    """Save models with what `sb3-torcs race` has to know of their training."""
+    asked = recipe("ppo", "Torcs-v0", {"env_kwargs": env_kwargs})
+    starts = [RandomStartCallback(speed=65.0, hard=0.5)] if random_starts else []
+    every = CheckpointCallback(262_144 // CARS, str(folder), name_prefix="racer")
+    learning = [LeanUpdatesCallback(), AdaptiveLearningRateCallback(kl=0.015)]
+    return [RecordCallback(asked), *starts, *learning, every]
+
+
+def look_away(policy: BoundedPolicy) -> None:
+    """
+    Let a policy that has never met a car begin as if it saw none.
+
+    Alone on the road it saw the same numbers all the time: rivals 200 m ahead, which have no speed
+    and no size. The weights of all others are those that it was born with.
+    """
+    where = feature_slices(SENSORS)
+    rivals = [where[name] for name in where if name.startswith("rivals")]
+    with th.no_grad():
+        for net in (policy.mlp_extractor.policy_net, policy.mlp_extractor.value_net):
+            net[0].bias += net[0].weight[:, where["rivals_along"]].sum(dim=1)
+            for columns in rivals:
+                net[0].weight[:, columns] = 0.0
+
+
+def main() -> None:
+    args = parser.parse_args()
+    env_kwargs = {
+        "track": args.track, "sensors": list(SENSORS), "range_finders": "narrow",
+        "action": "pedal", "gearbox": "road_speed", "action_repeat": 5,
+    }  # fmt: skip
+    alone = TorcsVecEnv(
+        CARS, threads=args.threads, reward=ALONE, max_episode_steps=1000, **env_kwargs
+    )
+    model = PPO(
+        BoundedPolicy,
+        alone,
+        learning_rate=1e-3,
+        n_steps=128,
+        batch_size=1024,
+        gamma=0.98,
+        ent_coef=0.002,
+        policy_kwargs={
+            "net_arch": [128, 128],
+            "activation_fn": nn.ReLU,
+            "log_std_init": [-1.0, -0.3],  # steering, pedal
+        },
+        seed=args.seed,
+        device="cpu",
+    )
+    model.learn(args.alone, callback=callbacks(env_kwargs, args.folder, random_starts=True))
+    alone.close()
+    look_away(model.policy)
+
+    # Eight copies begin anywhere on the road. Those that leave it rejoin where the road is free.
+    # Against robots a race begins on the grid, with the copies behind: a start elsewhere would let
+    # each robot plan its line anew.
+    for timesteps, agents, opponents in ((args.selfplay, 8, ()), (args.robots, 4, FIELDS)):
+        races = TorcsVecEnv(
+            CARS // agents,
+            agents=agents,
+            threads=args.threads,
+            reward=RACING,
+            opponents=opponents,
+            max_episode_steps=600,
+            **env_kwargs,
+        )
+        model.set_env(races)
+        model.learn(
+            timesteps,
+            callback=callbacks(env_kwargs, args.folder, random_starts=not opponents),
+            reset_num_timesteps=False,
+        )
+        races.close()
+    model.save(args.folder / "model")
+    print(f"saved {args.folder}/model.zip; race it: sb3-torcs race {args.folder}/model.zip inferno")
+
+
+if __name__ == "__main__":
+    main()
