@@ -21,7 +21,6 @@ from sb3_torcs.policies import BoundedPolicy
 from sb3_torcs.sensors import feature_slices
 from sb3_torcs.vec_env import TorcsVecEnv
 
-CARS = 64  # that learn at once
 SENSORS = ("base", "line", "rivals")
 # The fields of robots, of which each race draws one: passing is learned from few, the first bend
 # from many.
@@ -41,16 +40,19 @@ parser.add_argument("--track", default="aalborg")
 parser.add_argument("--alone", type=int, default=1_000_000, help="timesteps without other cars")
 parser.add_argument("--selfplay", type=int, default=800_000, help="timesteps among eight copies")
 parser.add_argument("--robots", type=int, default=6_000_000, help="timesteps against robots")
+parser.add_argument("--cars", type=int, default=64, help="that learn at once, a multiple of 8")
 parser.add_argument("--seed", type=int, default=0)
 parser.add_argument("--threads", type=int, help="default: one per core")
 parser.add_argument("--folder", type=Path, default=Path("logs/racer"))
 
 
-def callbacks(env_kwargs: dict, folder: Path, *, random_starts: bool) -> list[BaseCallback]:
+def callbacks(
+    env_kwargs: dict, args: argparse.Namespace, *, random_starts: bool
+) -> list[BaseCallback]:
     """Save models with what `sb3-torcs race` has to know of their training."""
     asked = recipe("ppo", "Torcs-v0", {"env_kwargs": env_kwargs})
     starts = [RandomStartCallback(speed=65.0, hard=0.5)] if random_starts else []
-    every = CheckpointCallback(262_144 // CARS, str(folder), name_prefix="racer")
+    every = CheckpointCallback(262_144 // args.cars, str(args.folder), name_prefix="racer")
     learning = [LeanUpdatesCallback(), AdaptiveLearningRateCallback(kl=0.015)]
     return [RecordCallback(asked), *starts, *learning, every]
 
@@ -78,7 +80,7 @@ def main() -> None:
         "action": "pedal", "gearbox": "road_speed", "action_repeat": 5,
     }  # fmt: skip
     alone = TorcsVecEnv(
-        CARS, threads=args.threads, reward=ALONE, max_episode_steps=1000, **env_kwargs
+        args.cars, threads=args.threads, reward=ALONE, max_episode_steps=1000, **env_kwargs
     )
     model = PPO(
         BoundedPolicy,
@@ -96,7 +98,7 @@ def main() -> None:
         seed=args.seed,
         device="cpu",
     )
-    model.learn(args.alone, callback=callbacks(env_kwargs, args.folder, random_starts=True))
+    model.learn(args.alone, callback=callbacks(env_kwargs, args, random_starts=True))
     alone.close()
     look_away(model.policy)
 
@@ -105,7 +107,7 @@ def main() -> None:
     # each robot plan its line anew.
     for timesteps, agents, opponents in ((args.selfplay, 8, ()), (args.robots, 4, FIELDS)):
         races = TorcsVecEnv(
-            CARS // agents,
+            args.cars // agents,
             agents=agents,
             threads=args.threads,
             reward=RACING,
@@ -116,7 +118,7 @@ def main() -> None:
         model.set_env(races)
         model.learn(
             timesteps,
-            callback=callbacks(env_kwargs, args.folder, random_starts=not opponents),
+            callback=callbacks(env_kwargs, args, random_starts=not opponents),
             reset_num_timesteps=False,
         )
         races.close()

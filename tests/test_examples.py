@@ -16,6 +16,7 @@ from sb3_torcs.agents.models import AGENTS
 from sb3_torcs.callbacks.lines import DrivenLap, driven_laps
 from sb3_torcs.errors import OutputNotWritable
 from sb3_torcs.evaluation.protocol import World
+from sb3_torcs.races.entrants import find_entrants
 from sb3_torcs.training import zoo
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
@@ -55,6 +56,14 @@ def test_broken_tracks_are_refused_or_drive_what_is_written(monkeypatch, capsys,
     run(monkeypatch, "fuzz_tracks.py", "--tracks", "12", "--workers", "1", "--keep", str(tmp_path))
     assert re.search(r"^Torcs-v0: 12 files: ", capsys.readouterr().out, re.MULTILINE)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_racer_is_trained_in_three_stages(monkeypatch, capsys, tmp_path, game):
+    budget = [f"--{stage}=1" for stage in ("alone", "selfplay", "robots")]
+    run(monkeypatch, "train_racer.py", *budget, "--cars", "8", "--folder", str(tmp_path))
+    assert f"{tmp_path}/model.zip" in capsys.readouterr().out
+    (racer,) = find_entrants([str(tmp_path / "model.zip")], game)
+    assert racer.name == "model"
 
 
 def test_own_reward_learns_from_it(monkeypatch, capsys):
