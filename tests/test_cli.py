@@ -282,6 +282,16 @@ def test_a_track_is_drawn(capsys, tmp_path):
     assert picture.read_bytes()[:4] == PNG
 
 
+def test_a_racing_line_is_drawn_into_the_track(capsys, tmp_path):
+    plain, lined = tmp_path / "plain.png", tmp_path / "lined.png"
+    assert run(capsys, "tracks", "g-track-1", "--plot", str(plain))[0] == 0
+    assert run(capsys, "tracks", "g-track-1", "--plot", str(lined), "--racing-line")[0] == 0
+    assert lined.read_bytes() != plain.read_bytes()
+    status, _, err = run(capsys, "tracks", "g-track-1", "--racing-line")
+    assert status == 2
+    assert "--racing-line is drawn; say where: --plot FILE.png" in err
+
+
 @pytest.mark.parametrize("names", [(), ("aalborg", "alpine-1")])
 def test_one_track_at_a_time_is_drawn(capsys, names):
     status, _, err = run(capsys, "tracks", *names, "--plot", "x.png")

@@ -22,6 +22,7 @@ from sb3_torcs.tracks.racing_line import (
     SLOWING,
     SPEED,
     TURN,
+    driven,
     look_along,
     racing_line,
 )
@@ -135,6 +136,18 @@ def test_a_crest_is_slower_than_a_dip_and_brakes_do_more_uphill():
     slope = 20.0 / (np.pi * 100.0)
     assert table[middle // 2, SLOWING] == pytest.approx(12.0 + 9.81 * slope, rel=1e-6)
     assert table[middle + middle // 2, SLOWING] == pytest.approx(12.0 - 9.81 * slope, rel=1e-6)
+
+
+def test_the_line_of_a_track_is_drawn_as_fast_as_brakes_allow(oval):
+    """Never faster than a place allows, and slower only on the way to a slower one."""
+    places, speeds = driven(oval)
+    line = racing_line(oval.profile)
+    assert np.all(speeds**2 <= line.table[:, SPEED] + 1e-9)
+    slowed = np.diff(speeds**2)
+    assert slowed.min() >= -2.0 * line.table[:, SLOWING].max() * line.step - 1e-9
+    np.testing.assert_allclose(places[0], places[-1], atol=1e-6)
+    within = np.abs(line.table[:, OFFSET]) <= line.table[:, HALF_WIDTH]
+    assert within.all()
 
 
 # ---------------------------------------------------------------------------- how a car sees it

@@ -27,6 +27,11 @@ def add_parser(subparsers: Any) -> None:
     )
     parser.add_argument("--json", action="store_true", help="print a JSON list and nothing else")
     parser.add_argument("--plot", metavar="FILE.png", help="draw the named track into this file")
+    parser.add_argument(
+        "--racing-line",
+        action="store_true",
+        help="draw the racing line, too, coloured by how fast it may be driven on a level road",
+    )
     parser.set_defaults(run=run)
 
 
@@ -40,6 +45,8 @@ def run(args: argparse.Namespace) -> int:
     from sb3_torcs.errors import InvalidOption
     from sb3_torcs.tracks.catalogue import available_tracks, load_track
 
+    if args.racing_line and args.plot is None:
+        raise InvalidOption("--racing-line is drawn; say where: --plot FILE.png")
     tracks = [load_track(name, np.random.default_rng(0)) for name in args.names]
     if args.plot is not None:
         if len(tracks) != 1:
@@ -49,8 +56,10 @@ def run(args: argparse.Namespace) -> int:
             )
         path = writable_file(args.plot, (".png",))
         from sb3_torcs.tracks.plot import plot_track
+        from sb3_torcs.tracks.racing_line import driven
 
-        plot_track(tracks[0], path)
+        line = driven(tracks[0]) if args.racing_line else (None, None)
+        plot_track(tracks[0], path, *line)
     summaries = [track.summary() for track in tracks] if tracks else available_tracks()
     if args.json:
         print_json([summary._asdict() for summary in summaries])

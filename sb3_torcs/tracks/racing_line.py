@@ -19,8 +19,16 @@ from numba import njit
 
 from sb3_torcs.car import FloatArray
 from sb3_torcs.tracks.profile import RoadProfile
+from sb3_torcs.tracks.track import Track
 
-__all__ = ["LINE_DISTANCES", "LINE_PLACES", "RacingLine", "look_along", "racing_line"]
+__all__ = [
+    "LINE_DISTANCES",
+    "LINE_PLACES",
+    "RacingLine",
+    "driven",
+    "look_along",
+    "racing_line",
+]
 
 LINE_DISTANCES = (
     0, 8, 16, 24, 33, 43, 54, 66, 80, 95, 112, 132, 155, 180, 208, 240, 275, 315, 355, 400,
@@ -214,6 +222,22 @@ def _limits(
     speed = np.maximum(held, LEAST) / np.maximum(needed, LEAST / FASTEST**2)
     slowing = grip * BRAKING + GRAVITY * np.diff(climb) / step
     return np.minimum(speed, FASTEST**2), np.maximum(slowing, LEAST)
+
+
+def driven(track: Track) -> tuple[FloatArray, FloatArray]:
+    """
+    Lay the racing line of a track, and how fast it may be driven on the way to its bends.
+
+    :param track: as a plane
+    :return: (n, 2) places [m], and (n,) speeds there [m/s]
+    """
+    table, step = racing_line(track.profile)
+    speed = table[:, SPEED].copy()
+    for k in range(2 * len(table), 0, -1):  # two laps back, since the last bend slows the start
+        before, i = (k - 1) % len(table), k % len(table)
+        speed[before] = min(speed[before], speed[i] + 2.0 * table[before, SLOWING] * step)
+    places = [track.pose(i * step, offset)[:2] for i, offset in enumerate(table[:, OFFSET])]
+    return np.array(places), np.sqrt(speed)
 
 
 @njit(cache=True)
