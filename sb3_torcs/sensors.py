@@ -116,15 +116,20 @@ OPPONENTS = (Sensor("opponents", "opponents", 36, "m", 0.0, 200.0, 1.0 / 200.0, 
 """Distances to the nearest car in sectors of 10°, clockwise; the first begins straight behind."""
 
 RIVAL_ROWS = (
-    Sensor("rivals_along", "", RIVALS, "m", -200.0, 200.0, 1.0 / 200.0),
-    Sensor("rivals_across", "", RIVALS, "m", -20.0, 20.0, 1.0 / 20.0, "opposite"),
-    Sensor("rivals_speed_along", "", RIVALS, "m/s", -60.0, 60.0, 1.0 / 30.0),
-    Sensor("rivals_speed_across", "", RIVALS, "m/s", -30.0, 30.0, 1.0 / 30.0, "opposite"),
+    Sensor("rivals_along", "", RIVALS, "-", -1.0, 1.0, 1.0),
+    Sensor("rivals_across", "", RIVALS, "-", -1.0, 1.0, 1.0, "opposite"),
+    Sensor("rivals_speed_along", "", RIVALS, "m/s", -60.0, 60.0, 1.0 / 10.0),
+    Sensor("rivals_speed_across", "", RIVALS, "m/s", -30.0, 30.0, 1.0 / 10.0, "opposite"),
     Sensor("rivals_length", "", RIVALS, "m", 0.0, 10.0, 1.0 / 10.0),
     Sensor("rivals_width", "", RIVALS, "m", 0.0, 5.0, 1.0 / 5.0),
 )
 """The cars that are nearest along the road, the nearest first: where they are against this one, how
-much faster, and how large. Who is not there is 200 m ahead and has no size."""
+much faster, and how large. Who is not there is 200 m ahead and has no size.
+
+A distance d along the road is shown as d / (10 m + |d|), one across as d / (3 m + |d|), so that a
+metre counts most where cars are close.
+"""
+NEAR = np.repeat([10.0, 3.0], RIVALS)  # [m] seen as 0.5
 
 RACE = (
     Sensor("race_position", "racePos", 1, "-", 1.0, 20.0, 1.0 / 20.0),
@@ -372,7 +377,10 @@ def _write_opponents(world: Any, car: CarState, numbers: npt.NDArray[np.float32]
 
 def _write_rivals(world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> None:
     del world
-    _scale_into(car.race[-len(numbers) :], _PARTS["rivals"].start, numbers)
+    values = car.race[-len(numbers) :].copy()
+    places = values[: len(NEAR)]
+    places /= NEAR + np.abs(places)
+    _scale_into(values, _PARTS["rivals"].start, numbers)
 
 
 def _write_race(world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> None:

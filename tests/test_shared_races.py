@@ -516,9 +516,10 @@ class TestSensorsOfARace:
         for _ in range(30):
             for row, car in zip(seen, envs.get_attr("car"), strict=True):
                 assert row[where["opponents"]] == pytest.approx(car.opponents / 200.0)
-                assert row[where["rivals_along"]] == pytest.approx(
-                    np.clip(car.race[5:9], -200.0, 200.0) / 200.0, abs=1e-6
-                )
+                for name, part, near in (("along", 5, 10.0), ("across", 5 + RIVALS, 3.0)):
+                    distances = car.race[part : part + RIVALS]
+                    shown = distances / (near + np.abs(distances))
+                    assert row[where[f"rivals_{name}"]] == pytest.approx(shown, abs=1e-6)
                 assert row[where["race_position"]] == pytest.approx(car.race_position / 20.0)
             assert envs.observation_space.contains(seen[0])
             seen = envs.step(np.array([GAS] * 3, np.float32))[0]
