@@ -293,3 +293,14 @@ def test_bad_conditions_of_a_training_are_refused(oval, choice, message):
         InvalidOption, match="unknown condition 'gripp'; allowed: delay, grip, mass"
     ):
         env.set_conditions({"gripp": 1.0})
+
+
+def test_a_road_is_told_as_its_file_says_whatever_the_grip(game):
+    """What an agent sees of a road goes by its profile, which all races on it share."""
+    del game
+    env = gym.make("Torcs-v0", track="g-track-1", grip=0.5).unwrapped
+    before = env.backend.engine.road()
+    env.reset(seed=0)
+    np.testing.assert_array_equal(env.backend.engine.road(), before)
+    assert env.backend.profile.frictions.min() > 1.1
+    env.close()

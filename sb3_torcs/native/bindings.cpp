@@ -11,7 +11,6 @@
 #include "engine.h"
 #include "errors.h"
 #include "fleet.h"
-#include "road.h"
 #include "rollouts.h"
 #include "scr/messages.h"
 
@@ -392,7 +391,7 @@ PYBIND11_MODULE(_engine, module) {
              })
         .def("road",
              [](Engine& engine) {
-                 const std::vector<RoadSegment> road = road_of(Engine::Access(engine)->track());
+                 const std::vector<RoadSegment> road = Engine::Access(engine)->road();
                  py::array_t<double> rows({road.size(), std::size_t{ROAD_COLUMNS}});
                  std::memcpy(rows.mutable_data(), road.data(), road.size() * sizeof road[0]);
                  return rows;

@@ -14,6 +14,7 @@
 #include "arena.h"
 #include "game.h"
 #include "layout.h"
+#include "road.h"
 #include "library.h"
 #include "placing.h"
 
@@ -128,6 +129,7 @@ public:
 
     // Read what follows between two calls; `index` counts the starting list.
     const TrackData& track() const { return *track_; }
+    std::vector<RoadSegment> road() const { return road_of(*track_, friction_); }
     const Situation& situation() const { return world_->situation; }
     const CarElement& car(int index) const { return world_->cars[index]; }
     CarElement* const* cars() const { return world_->order; }

@@ -37,7 +37,8 @@ double curvature(const Segment& segment) {
 
 }  // namespace
 
-std::vector<RoadSegment> road_of(const TrackData& track) {
+std::vector<RoadSegment> road_of(const TrackData& track,
+                                 const std::map<Surface*, float>& friction) {
     std::vector<RoadSegment> road;
     const Segment* segment = track.last;
     for (int i = 0; i < track.segments_number; i++) {
@@ -45,7 +46,7 @@ std::vector<RoadSegment> road_of(const TrackData& track) {
         const Widths left = ground(*segment, LEFT), right = ground(*segment, RIGHT);
         road.push_back(
             {segment->length, curvature(*segment), segment->start_width, segment->end_width,
-             left.start, left.end, right.start, right.end, segment->surface->friction,
+             left.start, left.end, right.start, right.end, friction.at(segment->surface),
              segment->surface->rolling_resistance, segment->barrier[LEFT]->surface->friction,
              segment->barrier[RIGHT]->surface->friction,
              double(segment->from_start) + segment->length,

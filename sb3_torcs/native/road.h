@@ -2,6 +2,7 @@
 #pragma once
 
 #include <array>
+#include <map>
 #include <vector>
 
 #include "layout.h"
@@ -16,7 +17,8 @@ namespace torcs {
 constexpr int ROAD_COLUMNS = 17;
 using RoadSegment = std::array<double, ROAD_COLUMNS>;
 
-// Segments begin at the start line. The track has passed `check_track`.
-std::vector<RoadSegment> road_of(const TrackData& track);
+// Segments begin at the start line. The track has passed `check_track`. The friction of the road is
+// that of its file, which a race with another grip has changed in the track.
+std::vector<RoadSegment> road_of(const TrackData& track, const std::map<Surface*, float>& friction);
 
 }  // namespace torcs
