@@ -14,9 +14,9 @@
 #include "arena.h"
 #include "game.h"
 #include "layout.h"
-#include "road.h"
 #include "library.h"
 #include "placing.h"
+#include "road.h"
 
 namespace torcs {
 
