@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from itertools import groupby
 from pathlib import Path
 
 import nbformat
@@ -16,9 +17,14 @@ PATIENCE = 600  # [s] for a cell, on a busy machine
 
 
 def outputs(notebook):
-    """What each cell has put out: kinds of data, and the lap times."""
+    """What each cell has put out, by kind; a slow machine puts text out in several pieces."""
     return [
-        [(output.output_type, sorted(output.get("data", {}))) for output in cell.outputs]
+        [
+            kind
+            for kind, _ in groupby(
+                (output.output_type, sorted(output.get("data", {}))) for output in cell.outputs
+            )
+        ]
         for cell in notebook.cells
         if cell.cell_type == "code"
     ]
