@@ -16,11 +16,13 @@ from sb3_torcs.car import FloatArray
 
 __all__ = [
     "DISTANCES",
+    "FASTEST",
     "INTERVALS",
     "QUANTITIES",
     "RoadProfile",
     "game_profile",
     "look_ahead",
+    "place_at",
     "road_profile",
     "speed_margins",
 ]
@@ -95,9 +97,16 @@ def game_profile(road: FloatArray) -> RoadProfile:
 
 
 @njit(cache=True)
-def _place_at(sums: FloatArray, step: float, distance: float) -> tuple[int, int, float]:
-    """Find a place by its distance from the start line: laps, index, and share of the next step."""
-    places = len(sums) - 1
+def place_at(table: FloatArray, step: float, distance: float) -> tuple[int, int, float]:
+    """
+    Find a place by its distance from the start line.
+
+    :param table: (n + 1, k) rows at equal distances, the first and the last on the start line
+    :param step: from one row to the next [m]
+    :param distance: beyond a lap, too [m]
+    :return: whole laps, the row before the place, and its share of the step to the next one
+    """
+    places = len(table) - 1
     where = distance / step
     laps = math.floor(where / places)
     where -= laps * places
@@ -124,7 +133,7 @@ def look_ahead(sums: FloatArray, step: float, distance: float, means: FloatArray
     :param means: (3, intervals) filled: curvature [1/m], width [m] and slope [m/m]
     """
     for i in range(len(_AHEAD)):
-        place = _place_at(sums, step, distance + _AHEAD[i])
+        place = place_at(sums, step, distance + _AHEAD[i])
         for quantity in range(QUANTITIES):
             total = _sum_at(sums, place, quantity)
             if i > 0:
@@ -137,7 +146,7 @@ def look_ahead(sums: FloatArray, step: float, distance: float, means: FloatArray
 @njit(cache=True)
 def _turned(sums: FloatArray, step: float, distance: float) -> float:
     """How much a road has turned since the start line [rad]; ``distance`` may be beyond a lap."""
-    return _sum_at(sums, _place_at(sums, step, distance), 0)
+    return _sum_at(sums, place_at(sums, step, distance), 0)
 
 
 @njit(cache=True)

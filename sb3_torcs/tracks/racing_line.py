@@ -18,7 +18,7 @@ import numpy.typing as npt
 from numba import njit
 
 from sb3_torcs.car import FloatArray
-from sb3_torcs.tracks.profile import RoadProfile
+from sb3_torcs.tracks.profile import FASTEST, RoadProfile, place_at
 from sb3_torcs.tracks.track import Track
 
 __all__ = [
@@ -50,7 +50,6 @@ USUAL_FRICTION = 1.1  # [-] of asphalt
 TYRES = 1.4  # [-] force across per load
 DOWNFORCE = 0.003  # [1/m] load of the air per mass and speed²
 BRAKING = 12.0  # [m/s²]
-FASTEST = 100.0  # [m/s] on a straight
 LEAST = 1.0  # [m/s²] across that every road bears
 HILLS = 20.0  # [m] before and after a place, over which the road's rise and fall are measured
 
@@ -263,14 +262,14 @@ def look_along(
     """
     n = len(table) - 1
     offset = track_position * _at(table, step, distance, HALF_WIDTH)
+    turned = _at(table, step, distance + _AHEAD[0], TURN)
     for i in range(numbers.shape[1]):
         here, there = distance + _AHEAD[i], distance + _AHEAD[i + 1]
         numbers[0, i] = _at(table, step, here, OFFSET) - offset
-        turned = _at(table, step, there, TURN) - _at(table, step, here, TURN)
-        numbers[1, i] = turned / (there - here)
-        first, last = math.floor(here / step), math.floor(there / step)
+        before, turned = turned, _at(table, step, there, TURN)
+        numbers[1, i] = (turned - before) / (there - here)
         least = FASTEST**2
-        for k in range(first, last):
+        for k in range(math.floor(here / step), math.floor(there / step)):
             ahead = max(k * step - distance, 0.0)
             j = k % n
             least = min(least, table[j, SPEED] + 2.0 * table[j, SLOWING] * ahead)
@@ -280,13 +279,8 @@ def look_along(
 @njit(cache=True)
 def _at(table: FloatArray, step: float, distance: float, column: int) -> float:
     """A column of the table, between two places; a turn goes on from lap to lap."""
-    n = len(table) - 1
-    where = distance / step
-    laps = math.floor(where / n)
-    where -= laps * n
-    index = min(int(where), n - 1)
-    share = where - index
+    laps, index, share = place_at(table, step, distance)
     value = table[index, column] + share * (table[index + 1, column] - table[index, column])
     if column == TURN:
-        value += laps * (table[n, TURN] - table[0, TURN])
+        value += laps * (table[len(table) - 1, TURN] - table[0, TURN])
     return float(value)
