@@ -11,13 +11,14 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Literal
 
-from sb3_torcs.car import CAR_WIDTH, CarState, Controls, is_number
+from sb3_torcs.car import CAR_WIDTH, RIVALS, CarState, Controls, is_number
 from sb3_torcs.errors import InvalidOption, UnknownRewardTerm, near_miss
 
 __all__ = ["CRASHES", "PRESETS", "TERMS", "Reward", "RewardChoice", "RewardName", "safe_speed"]
 
 BRAKING = 10.0  # [m/s²] a car on asphalt can do twice that, but not while it turns in
 BEND_SPEED = 12.0  # [m/s] in a bend behind which nothing is seen; the tightest hairpins need it
+ROOM = 0.5  # [m] that a car keeps to others
 
 Term = Callable[[CarState, CarState, Controls], float]
 
@@ -97,6 +98,21 @@ def fault(before: CarState, after: CarState, controls: Controls) -> float:
     return (after.faults - before.faults) / (after.time - before.time)
 
 
+def closing(before: CarState, after: CarState, controls: Controls) -> float:
+    """Speed beyond that from which 10 m/s² avoid the car ahead, if that goes on as it does [m/s].
+
+    Cars that it would pass are not in the way. Of several in the way the worst counts.
+    """
+    worst = 0.0
+    for i in range(RIVALS):
+        along, across, faster = after.race[5 + i], after.race[9 + i], after.race[13 + i]
+        length, width = after.race[21 + i], after.race[25 + i]
+        if along > 0.0 and abs(across) < width + ROOM:
+            room = max(along - length - ROOM, 0.0)
+            worst = max(worst, -faster - math.sqrt(2.0 * BRAKING * room))
+    return worst
+
+
 def off_line(before: CarState, after: CarState, controls: Controls) -> float:
     """Speed × how far the car's outer side is over the edge of the road [m²/s]."""
     over = abs(after.distance_from_axis) + 0.5 * (CAR_WIDTH - after.track_width)
@@ -115,7 +131,7 @@ TERMS: dict[str, Term] = {
     term.__name__: term
     for term in (
         speed_along, speed_across, speed_off_axis, progress, time, damage, pedals, overspeed,
-        places, gap, contact, fault, off_line, leaving,
+        places, gap, contact, fault, closing, off_line, leaving,
     )
 }  # fmt: skip
 

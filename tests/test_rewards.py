@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from conftest import car_state
 
-from sb3_torcs.car import Controls
+from sb3_torcs.car import NO_RACE, RIVALS, Controls
 from sb3_torcs.errors import InvalidOption, UnknownRewardTerm
 from sb3_torcs.rewards import PRESETS, TERMS, Reward
 
@@ -85,6 +85,25 @@ def test_off_line_is_how_far_the_side_is_over_the_edge(offset, over):
     """Of a car of 1.94 m on a road of 10 m."""
     car = AFTER._replace(distance_from_axis=offset, speed_x=20.0, track_width=10.0)
     assert TERMS["off_line"](BEFORE, car, GAS) == pytest.approx(20.0 * over)
+
+
+@pytest.mark.parametrize(
+    ("along", "across", "faster", "over"),
+    [
+        (30.0, 0.0, -10.0, 0.0),  # far enough away to brake
+        (10.0, 1.0, -20.0, 10.0),
+        (10.0, -3.0, -20.0, 0.0),  # beside the way
+        (-10.0, 0.0, -20.0, 0.0),  # behind
+        (4.0, 0.0, -3.0, 3.0),  # too close already
+        (4.0, 0.0, 3.0, 0.0),  # drives away
+    ],
+)
+def test_closing_is_the_speed_that_cannot_be_lost_before_a_car(along, across, faster, over):
+    """It is 4.5 m long and 2 m wide, and half a metre is kept: 5 m are braked from 10 m/s."""
+    race = NO_RACE.copy()
+    for place, value in enumerate((along, across, faster, 0.0, 4.5, 2.0)):
+        race[5 + RIVALS * place + 1] = value
+    assert TERMS["closing"](BEFORE, AFTER._replace(race=race), GAS) == pytest.approx(over)
 
 
 def test_a_weight_multiplies_duration_and_scale():
