@@ -41,6 +41,7 @@ __all__ = [
     "checked_factor",
     "checked_hard_starts",
     "checked_laps",
+    "checked_runoff",
     "checked_start",
     "checked_start_speed",
     "is_count",
@@ -66,6 +67,9 @@ CONTROL_TICK = 0.02
 
 MANY_LAPS = 1 << 30
 """[-] More laps than anyone drives, for a race without an end; the game can count to twice that."""
+
+WIDEST_RUNOFF = 100.0
+"""[m] Wider than any ground beside a road of the game."""
 
 MAX_DAMAGE = 10000.0
 """[points] At which TORCS takes a car out of the race; its drag has doubled by then."""
@@ -125,6 +129,21 @@ def checked_laps(laps: int | None) -> int | None:
             f"laps is {laps!r}; expected a whole number from 1 to {MANY_LAPS}, or None"
         )
     return int(laps)
+
+
+def checked_runoff(runoff: float) -> float:
+    """
+    Check how far a car may be beside the road before its episode ends.
+
+    :param runoff: [m]
+    :return: the same
+    :raises InvalidOption: if it is no such length
+    """
+    if not is_number(runoff) or not 0.0 <= runoff <= WIDEST_RUNOFF:
+        raise InvalidOption(
+            f"runoff is {runoff!r}; expected a number of metres from 0 to {WIDEST_RUNOFF:g}"
+        )
+    return float(runoff)
 
 
 def checked_start(start: StartName) -> StartName:

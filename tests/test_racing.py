@@ -54,6 +54,14 @@ def test_the_edge_of_the_road_is_still_on_it(oval):
     assert not info["off_track"]
 
 
+@pytest.mark.parametrize(("axis", "end"), [(7.0, ""), (-7.0, ""), (7.01, "off_track")])
+def test_a_car_may_be_beside_the_road_where_there_is_runoff(oval, axis, end):
+    """Of 2 m, on a road of 10 m."""
+    _, _, terminated, _, info = run(oval, {"distance_from_axis": axis}, runoff=2.0)
+    assert (terminated, info["end"]) == (end != "", end)
+    assert info["off_track"]
+
+
 def test_a_standing_car_is_stuck_after_the_grace_of_the_start(oval):
     env = RacingEnv(ScriptedBackend(oval, *[{"speed_x": 0.0}] * 40))
     env.reset(seed=0)
@@ -220,6 +228,8 @@ def test_without_hard_starts_mishaps_change_no_start(oval):
         ({"action_repeat": 1 << 31}, "action_repeat is 2147483648"),
         ({"laps": 0}, "laps is 0"),
         ({"laps": True}, "laps is True"),
+        ({"runoff": -1.0}, "runoff is -1.0; expected a number of metres from 0 to 100"),
+        ({"runoff": "wide"}, "runoff is 'wide'"),
         ({"start": "pits"}, "start is 'pits'; expected 'grid' or 'random'"),
         ({"render_mode": "ansi"}, "render_mode is 'ansi'"),
     ],

@@ -140,6 +140,7 @@ class Batch:
         self._worlds = self._first.astype(np.int64)
         self._cars = np.zeros((number, CAR_NUMBERS))
         self._laps = np.full(number, np.inf)
+        self._runoff = np.zeros(number)
         self._ticks, self._patience, self._standing = np.ones((3, number), np.int64)
         self._driven: list[list[list[Held]]] = [[] for _ in self.envs]
         self._controls = np.zeros((number, len(Controls._fields)))
@@ -172,6 +173,7 @@ class Batch:
         self._worlds[race] = self._first[race] + world_index(env.backend)
         self._cars[race] = np.hstack(env.car)
         self._laps[race] = np.inf if env.laps is None else env.laps
+        self._runoff[race] = env.runoff
         self._ticks[race] = env.action_repeat
         self._patience[race], self._standing[race] = env.patience, env.standing
         self._driven[race] = []
@@ -224,6 +226,7 @@ class Batch:
             self._choices,
             self._weights,
             self._laps,
+            self._runoff,
             self._ticks,
             self._patience,
             self._standing,

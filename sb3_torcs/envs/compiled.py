@@ -116,6 +116,7 @@ def value_timesteps(
     choices: Counts,
     weights: FloatArray,
     laps: FloatArray,
+    runoff: FloatArray,
     ticks: Counts,
     patience: Counts,
     standing: Counts,
@@ -132,6 +133,7 @@ def value_timesteps(
     :param choices: (n, k) indices in :data:`COMPILED`, negative for none
     :param weights: (n, k) of the terms
     :param laps: (n,) after which an episode ends
+    :param runoff: (n,) how far a car may be beside the road [m]
     :param ticks: (n,) control ticks of a timestep
     :param patience: (n,) control ticks for which cars may stand, changed
     :param standing: (n,) control ticks for which they have been standing, changed
@@ -148,7 +150,7 @@ def value_timesteps(
             if choices[race, i] >= 0 and seconds != 0.0:
                 value = _term(choices[race, i], was, car, controls[race])
                 terms[race, i] = weights[race, i] * seconds * value
-        ended[race] = end_of(car, laps[race]) != 0
+        ended[race] = end_of(car, laps[race], runoff[race]) != 0
         if not ended[race]:
             if stands(car):
                 standing[race] += ticks[race]

@@ -24,6 +24,7 @@ from sb3_torcs.car import (
     StartName,
     checked_hard_starts,
     checked_laps,
+    checked_runoff,
     checked_start,
     checked_start_speed,
     is_count,
@@ -94,17 +95,18 @@ ENDS = ("", "laps", "off_track", "backwards", "damage")
 """Why an episode ends because of the state of the car, by the index that :func:`end_of` returns."""
 
 
-def end_of(car: CarState, laps: float) -> int:
+def end_of(car: CarState, laps: float, runoff: float) -> int:
     """
     Check whether the state of the car ends the episode. Compiled code calls it, too.
 
     :param car: at the end of a timestep
     :param laps: whole laps after which the episode ends
+    :param runoff: how far the car may be beside the road [m]
     :return: the index of the reason in :data:`ENDS`, 0 if the episode goes on
     """
     if car.laps >= laps:
         return 1
-    if car.off_track:
+    if abs(car.distance_from_axis) > 0.5 * car.track_width + runoff:
         return 2
     if abs(car.heading_error) > BACKWARDS_ANGLE:
         return 3
@@ -141,6 +143,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
     :param action_repeat: control ticks of 0.02 s per timestep
     :param start: ``"grid"``, or ``"random"``: anywhere on the track, moving
     :param laps: whole laps after which the episode is truncated; ``None`` drives on
+    :param runoff: how far the mass centre may be beside the road before the episode ends [m]
     :param delay: control ticks by which controls arrive late; or a pair, between which each
         episode draws
     :param grip: factor on the friction of all ground; or a pair, as for the delay
@@ -161,6 +164,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         action_repeat: int = 5,
         start: StartName = "grid",
         laps: int | None = None,
+        runoff: float = 0.0,
         delay: int | Sequence[int] = 0,
         grip: float | Sequence[float] = 1.0,
         mass: float | Sequence[float] = 1.0,
@@ -178,6 +182,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         self._draw_track = getattr(backend, "draw_track", None)
         self.action_repeat = int(action_repeat)
         self.laps = checked_laps(laps)
+        self.runoff = checked_runoff(runoff)
         self.render_mode = render_mode
         self.metadata = {
             **self.metadata,
@@ -447,7 +452,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
 
     def _end(self, car: CarState) -> str | None:
         """Return why the episode ends, or ``None`` if it goes on."""
-        reason = end_of(car, math.inf if self.laps is None else self.laps)
+        reason = end_of(car, math.inf if self.laps is None else self.laps, self.runoff)
         if reason:
             return ENDS[reason]
         if not stands(car):

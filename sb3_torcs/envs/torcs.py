@@ -68,6 +68,7 @@ class TorcsEnv(RacingEnv):
         the wheels spin, and slips the clutch to set off
     :param start: ``"grid"`` or ``"random"``
     :param laps: whole laps after which the episode is truncated; ``None`` drives on
+    :param runoff: how far the mass centre may be beside the road before the episode ends [m]
     :param delay: control ticks of 0.02 s from an observation until the controls that answer it
         arrive; or a pair, e.g. ``(0, 5)``, between which each episode draws
     :param grip: factor on the friction of all ground; or a pair, e.g. ``(0.8, 1.1)``, between which
@@ -113,6 +114,7 @@ class TorcsEnv(RacingEnv):
         gearbox: GearboxName = "automatic",
         start: StartName = "grid",
         laps: int | None = None,
+        runoff: float = 0.0,
         delay: int | Sequence[int] = 0,
         grip: float | Sequence[float] = 1.0,
         mass: float | Sequence[float] = 1.0,
@@ -175,6 +177,7 @@ class TorcsEnv(RacingEnv):
             action_repeat=action_repeat,
             start=start,
             laps=laps,
+            runoff=runoff,
             delay=delay,
             grip=grip,
             mass=mass,

@@ -56,10 +56,10 @@ class TorcsLiteEnv(RacingEnv):
         ``reset(options={"distance": 100.0, "speed": 20.0})`` starts at a given point.
 
     Episode end
-        Terminated: ``"off_track"`` (the mass centre leaves the road), ``"backwards"`` (more than
-        90 degrees off its direction), ``"stuck"`` (1.5 s below 5 km/h), ``"damage"`` (10,000
-        points). Truncated: ``"laps"`` driven, or the time limit of the registration.
-        ``info["end"]`` says which.
+        Terminated: ``"off_track"`` (the mass centre is more than ``runoff`` beside the road),
+        ``"backwards"`` (more than 90 degrees off its direction), ``"stuck"`` (1.5 s below 5 km/h),
+        ``"damage"`` (10,000 points). Truncated: ``"laps"`` driven, or the time limit of the
+        registration. ``info["end"]`` says which.
 
     Units are SI and radians; left is positive.
 
@@ -79,6 +79,7 @@ class TorcsLiteEnv(RacingEnv):
         the wheels spin, and slips the clutch to set off
     :param start: ``"grid"`` or ``"random"``
     :param laps: whole laps after which the episode is truncated; ``None`` drives on
+    :param runoff: how far the mass centre may be beside the road before the episode ends [m]
     :param delay: control ticks of 0.02 s from an observation until the controls that answer it
         arrive; or a pair, e.g. ``(0, 5)``, between which each episode draws
     :param grip: factor on the friction of all ground; or a pair, e.g. ``(0.8, 1.1)``, between which
@@ -101,6 +102,7 @@ class TorcsLiteEnv(RacingEnv):
         gearbox: GearboxName = "automatic",
         start: StartName = "grid",
         laps: int | None = None,
+        runoff: float = 0.0,
         delay: int | Sequence[int] = 0,
         grip: float | Sequence[float] = 1.0,
         render_mode: RenderMode | None = None,
@@ -130,6 +132,7 @@ class TorcsLiteEnv(RacingEnv):
             action_repeat=action_repeat,
             start=start,
             laps=laps,
+            runoff=runoff,
             delay=delay,
             grip=grip,
             render_mode=render_mode,
