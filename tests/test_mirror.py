@@ -20,6 +20,7 @@ from sb3_torcs.errors import InvalidOption
 from sb3_torcs.policies.mirror import mirror_actions, mirror_half, mirror_observations
 from sb3_torcs.policies.replay import sample_mirrored
 from sb3_torcs.sensors import encode, feature_slices
+from sb3_torcs.vec_env import MirrorVecEnv, TorcsVecEnv
 
 STRAIGHT = 4050.0  # [m] of forza, where nearly a kilometre of straight road begins
 
@@ -213,3 +214,45 @@ def test_what_has_no_mirror_image_is_told_at_once():
     ):
         with pytest.raises(InvalidOption, match=message):
             model.learn(10, callback=MirrorCallback())
+
+
+# ---------------------------------------------------------------------------- every other car
+
+
+def test_every_other_car_drives_in_the_mirror():
+    """Held to cars that are not mirrored and get the steering that is meant, to the bit."""
+    options = {"env_id": "TorcsLite-v0", "start": "random", "range_finders": "narrow"}
+    ours, theirs = MirrorVecEnv(TorcsVecEnv(4, **options)), TorcsVecEnv(4, **options)
+    ours.seed(0), theirs.seed(0)
+    rng, ends = np.random.default_rng(0), 0
+
+    def image(observations):
+        seen = observations.copy()
+        for i in (1, 3):
+            seen[i] = mirrored(observations[i])
+        return seen
+
+    assert np.array_equal(ours.reset(), image(theirs.reset()))
+    for _ in range(100):
+        asked = rng.uniform(-1.0, 1.0, (4, 3)).astype(np.float32)
+        meant = asked * np.array([[1, 1, 1], [-1, 1, 1]] * 2, np.float32)
+        given = asked.copy()
+        seen, rewards, dones, infos = ours.step(given)
+        others = theirs.step(meant)
+        assert np.array_equal(given, asked)  # the caller's
+        assert np.array_equal(seen, image(others[0]))
+        assert np.array_equal(rewards, others[1])
+        assert np.array_equal(dones, others[2])
+        for i in np.flatnonzero(dones):
+            last = others[3][i]["terminal_observation"]
+            expected = mirrored(last) if i % 2 else last
+            assert np.array_equal(infos[i]["terminal_observation"], expected)
+            ends += i % 2
+    assert ends
+
+
+def test_cars_with_beams_to_one_side_have_no_mirror_image():
+    envs = TorcsVecEnv(2, env_id="TorcsLite-v0", range_finders=list(range(-90, 5, 5)))
+    with pytest.raises(InvalidOption, match=r"MirrorVecEnv needs range finders .* pass 'scr'"):
+        MirrorVecEnv(envs)
+    envs.close()

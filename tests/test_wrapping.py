@@ -191,9 +191,12 @@ def test_a_model_that_would_see_something_else_is_refused(tmp_path, entry, says)
             load_driver(tmp_path / "m.zip", env)
 
 
-def test_a_vector_wrapper_that_passes_on_is_no_obstacle(tmp_path):
+@pytest.mark.parametrize(
+    "path", ["stable_baselines3.common.vec_env.VecCheckNan", "sb3_torcs.vec_env.MirrorVecEnv"]
+)
+def test_a_vector_wrapper_that_passes_on_is_no_obstacle(tmp_path, path):
     with lite() as env:
         PPO("MlpPolicy", env, device="cpu").save(tmp_path / "m.zip")
-        entry = {"vec_env_wrapper": "stable_baselines3.common.vec_env.VecCheckNan"}
+        entry = {"vec_env_wrapper": path}
         (tmp_path / "config.yml").write_text(yaml.safe_dump(entry))
         assert isinstance(load_driver(tmp_path / "m.zip", env), ModelDriver)

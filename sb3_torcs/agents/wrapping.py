@@ -25,8 +25,10 @@ TRUSTED_PACKAGES = ("sb3_torcs", "gymnasium", "stable_baselines3", "sb3_contrib"
 LEFT_OUT = {"TimeLimit", "Monitor", "RecordVideo", "RecordEpisodeStatistics", "UninterruptedWorker"}
 """Wrappers that end or write down a training, and change nothing that is seen or done."""
 
-PASSING_ON = {"VecMonitor", "VecCheckNan", "VecNormalize", "VecVideoRecorder"}
-"""Wrappers of vectors that give on what they get, or whose statistics are kept with the model."""
+PASSING_ON = {"MirrorVecEnv", "VecMonitor", "VecCheckNan", "VecNormalize", "VecVideoRecorder"}
+"""Wrappers of vectors that leave a single car as it is, or whose statistics are kept with the
+model, of these packages."""
+VECTORS = ("sb3_torcs.vec_env", "stable_baselines3.common.vec_env")
 
 
 def wrapped(
@@ -99,7 +101,7 @@ def unrebuilt(hyperparameters: Mapping[str, Any]) -> str | None:
     """
     for path, _ in _items(hyperparameters, "vec_env_wrapper"):
         package, _, name = path.rpartition(".")
-        if name not in PASSING_ON or not package.startswith("stable_baselines3.common.vec_env"):
+        if name not in PASSING_ON or not package.startswith(VECTORS):
             return (
                 f"vec_env_wrapper {path} changes vectors of environments, and cannot be put around "
                 "the one car of an evaluation; use an env_wrapper, or frame_stack"
