@@ -40,13 +40,13 @@ __all__ = [
     "SensorsName",
     "View",
     "checked_sensors",
+    "choices_of_size",
     "encode",
     "encode_record",
     "feature_slices",
     "look_both_ways",
     "range_finder_angles",
     "sensor_table",
-    "sensors_of_size",
 ]
 
 SensorsName = Literal["base", "preview", "limits", "line", "opponents", "rivals", "race"]
@@ -205,20 +205,16 @@ def feature_slices(sensors: Sequence[SensorsName] = ("base",)) -> dict[str, slic
 
 
 @lru_cache
-def sensors_of_size(size: int) -> tuple[Sensor, ...]:
+def choices_of_size(size: int) -> tuple[tuple[Sensor, ...], ...]:
     """
-    Find the sensors of observations by their size: no two choices of groups have the same.
+    Find the choices of groups whose observations have a size. Few sizes have more than one.
 
     :param size: of an observation
-    :return: its rows of the table; empty if there is no such choice
+    :return: the rows of the table in each such choice
     """
-    more = [rows for name, rows in GROUPS.items() if name != "base"]
-    for number in range(len(more) + 1):
-        for chosen in combinations(more, number):
-            rows = tuple(chain(SENSORS, *chosen))
-            if sum(sensor.size for sensor in rows) == size:
-                return rows
-    return ()
+    chosen = chain(*(combinations(list(GROUPS.values())[1:], n) for n in range(len(GROUPS))))
+    rows = (tuple(chain(SENSORS, *groups)) for groups in chosen)
+    return tuple(choice for choice in rows if sum(sensor.size for sensor in choice) == size)
 
 
 _measure = attrgetter(*(sensor.name for sensor in SENSORS))

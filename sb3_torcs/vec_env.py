@@ -319,7 +319,7 @@ class MirrorVecEnv(VecEnvWrapper):
                     "MirrorVecEnv needs range finders that look equally far to both sides, not "
                     f"{np.degrees(angles).round(3).tolist()}; pass 'scr' or 'narrow'"
                 )
-        order, signs = mirror_image(*venv.observation_space.shape)
+        order, signs = mirror_image(venv.observation_space)
         self._order, self._signs = order.numpy(), signs.numpy()
 
     def reset(self) -> VecEnvObs:

@@ -17,16 +17,22 @@ from toy import ToyRace
 
 from sb3_torcs.callbacks import MirrorCallback
 from sb3_torcs.errors import InvalidOption
-from sb3_torcs.policies.mirror import mirror_actions, mirror_half, mirror_observations
+from sb3_torcs.policies.mirror import (
+    mirror_actions,
+    mirror_half,
+    mirror_image,
+    mirror_observations,
+)
 from sb3_torcs.policies.replay import sample_mirrored
-from sb3_torcs.sensors import encode, feature_slices
+from sb3_torcs.sensors import View, encode, feature_slices
 from sb3_torcs.vec_env import MirrorVecEnv, TorcsVecEnv
 
 STRAIGHT = 4050.0  # [m] of forza, where nearly a kilometre of straight road begins
+IMAGE = mirror_image(View())
 
 
 def mirrored(observation):
-    return mirror_observations(th.from_numpy(observation)[None])[0].numpy()
+    return mirror_observations(th.from_numpy(observation)[None], IMAGE)[0].numpy()
 
 
 # ------------------------------------------------------------------------------ what is mirrored
@@ -35,8 +41,9 @@ def mirrored(observation):
 def test_twice_mirrored_is_as_before():
     """So each number has its place, and each place one number."""
     observations = th.arange(58.0).reshape(2, 29)
-    assert mirror_observations(mirror_observations(observations)).equal(observations)
-    assert not mirror_observations(observations).equal(observations)
+    image = mirror_observations(observations, IMAGE)
+    assert mirror_observations(image, IMAGE).equal(observations)
+    assert not image.equal(observations)
 
 
 def test_a_car_on_the_right_becomes_one_on_the_left():
@@ -133,7 +140,7 @@ def test_half_of_what_is_learned_from_is_mirrored(algorithm, options):
     half = size // 2
     assert batches.learned
     for batch in batches.learned:
-        assert known(mirror_observations(batch[:half]), buffer) == [True] * half
+        assert known(mirror_observations(batch[:half], IMAGE), buffer) == [True] * half
         assert known(batch, buffer) == [False] * half + [True] * (size - half)
     for batch in batches.drawn:
         assert all(known(batch, buffer))
@@ -149,7 +156,8 @@ def test_all_of_a_transition_is_mirrored():
     model.set_random_seed(0)
     batch = sample_mirrored(model.replay_buffer, 8)
     assert batch.actions[:4].equal(mirror_actions(stock.actions[:4]))
-    assert batch.next_observations[:4].equal(mirror_observations(stock.next_observations[:4]))
+    image = mirror_observations(stock.next_observations[:4], IMAGE)
+    assert batch.next_observations[:4].equal(image)
     for name in ("observations", "actions", "next_observations"):
         assert getattr(batch, name)[4:].equal(getattr(stock, name)[4:])
     for name in ("dones", "rewards", "discounts"):
@@ -176,7 +184,7 @@ def test_batches_are_those_of_sb3_with_half_mirrored(n_steps, kind):
         )
         for seed in range(3 if added % 7 == 0 or buffer.full else 0):
             set_random_seed(seed)
-            expected = mirror_half(buffer.sample(9))
+            expected = mirror_half(buffer.sample(9), IMAGE)
             set_random_seed(seed)
             for one, two in zip(sample_mirrored(buffer, 9), expected, strict=True):
                 assert (one is None and two is None) or one.equal(two)

@@ -22,9 +22,10 @@ from sb3_torcs.bench.policy import PlainSplitHeadPolicy, measure, updater
 from sb3_torcs.callbacks import LeanUpdatesCallback
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.policies import SplitHeadPolicy, fast_matmul
-from sb3_torcs.policies.mirror import mirror_actions, mirror_observations
+from sb3_torcs.policies.mirror import mirror_actions, mirror_image, mirror_observations
 from sb3_torcs.policies.optimizers import LeanAdam
 from sb3_torcs.policies.updates import LeanUpdates
+from sb3_torcs.sensors import View
 
 SMALL = [16, 24]
 OBSERVATIONS = np.random.default_rng(0).uniform(-1, 1, (5, 29)).astype(np.float32)
@@ -410,7 +411,7 @@ def test_a_symmetric_driver_drives_both_ways_alike(ema_decay):
         make_model(init_std=0.5, ema_decay=ema_decay, symmetric=own) for own in (True, False)
     )
     seen = th.as_tensor(OBSERVATIONS)
-    image = mirror_observations(seen)
+    image = mirror_observations(seen, mirror_image(View()))
     for _ in range(2):
         driver, one_sided = model.policy.exact_driver(), plain.policy.exact_driver()
         assert th.equal(driver(image), mirror_actions(driver(seen)))

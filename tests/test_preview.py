@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch as th
 from conftest import ScriptedBackend, car_state
+from gymnasium.spaces import Box
 from stable_baselines3 import DDPG
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -21,8 +22,8 @@ from sb3_torcs.envs.batch import Batch
 from sb3_torcs.envs.racing import RacingEnv
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.evaluation.protocol import race_environment
-from sb3_torcs.policies.mirror import mirror_observations
-from sb3_torcs.sensors import GROUPS, View, feature_slices, sensors_of_size
+from sb3_torcs.policies.mirror import mirror_image, mirror_observations, sensors_of
+from sb3_torcs.sensors import GROUPS, View, choices_of_size, feature_slices
 from sb3_torcs.tracks.profile import DISTANCES, INTERVALS, look_ahead, road_profile, speed_margins
 from sb3_torcs.tracks.track import Segment, Track
 from sb3_torcs.vec_env import TorcsVecEnv
@@ -252,14 +253,15 @@ def test_the_order_of_names_does_not_matter(oval):
     assert env.sensors == BOTH
 
 
-def test_each_choice_of_groups_has_a_size_of_its_own():
-    """So a policy knows from the size of an observation how to mirror it."""
-    more = [rows for name, rows in GROUPS.items() if name != "base"]
-    choices = chain.from_iterable(combinations(more, n) for n in range(len(more) + 1))
-    sizes = [sum(s.size for s in chain(GROUPS["base"], *chosen)) for chosen in choices]
-    assert len(set(sizes)) == len(sizes)
-    assert all(sum(s.size for s in sensors_of_size(size)) == size for size in sizes)
-    assert sensors_of_size(30) == ()
+def test_each_choice_of_groups_has_a_space_of_its_own():
+    """So a policy knows from the space of observations how to mirror them."""
+    more = [name for name in GROUPS if name != "base"]
+    for chosen in chain.from_iterable(combinations(more, n) for n in range(len(more) + 1)):
+        view = View(("base", *chosen))
+        assert sensors_of(view) == tuple(chain(*(GROUPS[name] for name in view.sensors)))
+    assert choices_of_size(30) == ()
+    assert sensors_of(Box(-1.0, 1.0, (30,))) == ()
+    assert sensors_of(Box(-1.0, 1.0, (2, 29))) == ()
 
 
 def test_the_road_ahead_of_a_mirrored_track_is_the_mirror_image(oval):
@@ -271,7 +273,7 @@ def test_the_road_ahead_of_a_mirrored_track_is_the_mirror_image(oval):
     image = Track("image", "oval", tuple(map(turned, oval.segments)), grid=oval.grid)
     assert isinstance(image.segments[0], Segment)
     there, here = (th.from_numpy(seen(track, 250.0)[None]) for track in (image, oval))
-    assert mirror_observations(here)[0, 29:].equal(there[0, 29:])
+    assert mirror_observations(here, mirror_image(View(BOTH)))[0, 29:].equal(there[0, 29:])
     assert not here[0, BENDS].equal(there[0, BENDS])
 
 
@@ -283,7 +285,8 @@ def test_a_symmetric_policy_learns_from_mirrored_batches():
         model.learn(60, callback=MirrorCallback())
         observation = env.reset(seed=0)[0]
         action, _ = model.predict(observation, deterministic=True)
-        image = mirror_observations(th.from_numpy(observation[None])).numpy()[0]
+        image = mirror_image(env.observation_space)
+        image = mirror_observations(th.from_numpy(observation[None]), image).numpy()[0]
         other, _ = model.predict(image, deterministic=True)
     np.testing.assert_allclose(other * [-1.0, 1.0, 1.0], action, atol=1e-6)
 

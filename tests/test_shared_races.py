@@ -19,8 +19,8 @@ from sb3_torcs.car import CAR_RECORD, CONTROL_TICK, RIVALS
 from sb3_torcs.envs.torcs_race import make_grid, make_race
 from sb3_torcs.errors import CarLost, InvalidAction, InvalidOption
 from sb3_torcs.evaluation.ticks import log_drives
-from sb3_torcs.policies.mirror import mirror_observations
-from sb3_torcs.sensors import feature_slices
+from sb3_torcs.policies.mirror import mirror_image, mirror_observations
+from sb3_torcs.sensors import View, feature_slices
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.vec_env import TorcsVecEnv
 
@@ -534,7 +534,7 @@ class TestSensorsOfARace:
         sensors = ("base", "opponents", "rivals")
         where = feature_slices(sensors)
         row = th.arange(29.0 + 36 + 6 * RIVALS)[None]
-        image = mirror_observations(row)[0]
+        image = mirror_observations(row, mirror_image(View(sensors)))[0]
         assert image[where["opponents"]].tolist() == row[0][where["opponents"]].tolist()[::-1]
         for name, sign in (("rivals_along", 1.0), ("rivals_across", -1.0)):
             assert (image[where[name]] == sign * row[0][where[name]]).all()

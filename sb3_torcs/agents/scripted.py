@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sb3_torcs.errors import InvalidOption
-from sb3_torcs.sensors import RANGE_FINDERS, SENSORS, feature_slices, sensors_of_size
+from sb3_torcs.sensors import RANGE_FINDERS, SENSORS, choices_of_size, feature_slices
 
 __all__ = ["SCRIPTED", "ScriptedDriver"]
 
@@ -78,7 +78,7 @@ class ScriptedDriver:
         """
         del state, episode_start, deterministic
         rows = np.asarray(observation, dtype=np.float64)
-        if rows.ndim not in (1, 2) or not sensors_of_size(rows.shape[-1]):
+        if rows.ndim not in (1, 2) or not choices_of_size(rows.shape[-1]):
             raise InvalidOption(f"observation has shape {rows.shape}; expected (29,) or (n, 29)")
         if rows.ndim == 1:
             return self._drive(rows), None

@@ -7,17 +7,21 @@ road. Learning from both gives twice the experience, with every bend in both dir
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch as th
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
-from sb3_torcs.sensors import Sensor, sensors_of_size
+from sb3_torcs.sensors import Sensor, choices_of_size
 
 __all__ = [
+    "MirrorImage",
     "mirror_actions",
     "mirror_half",
     "mirror_image",
     "mirror_observations",
+    "sensors_of",
 ]
 
 OTHER_WHEEL = (1, 0, 3, 2)
@@ -32,30 +36,68 @@ def _order(sensor: Sensor) -> list[int]:
     return list(OTHER_WHEEL) if sensor.mirror == "sides" else order
 
 
+class MirrorImage(NamedTuple):
+    """What becomes of an observation if left and right change places."""
+
+    order: th.Tensor  # (size,) the index in an observation of each number of the image
+    signs: th.Tensor  # (size,) of each number there
+
+
+def sensors_of(space: Any) -> tuple[Sensor, ...]:
+    """
+    Find the sensors of observations by their space.
+
+    Most choices of groups have a size of their own; the bounds tell the others apart.
+
+    :param space: of the observations, a ``Box``; or a :class:`~sb3_torcs.sensors.View`
+    :return: rows of the sensor table; empty if the space is of no choice of groups
+    """
+    low = np.asarray(getattr(space, "low", ()), np.float32)
+    choices = choices_of_size(low.size) if low.ndim == 1 else ()
+    if len(choices) > 1:
+        bounds = low.tolist(), np.asarray(space.high, np.float32).tolist()
+        choices = tuple(rows for rows in choices if _bounds(rows) == bounds)
+    return choices[0] if choices else ()
+
+
 @lru_cache
-def mirror_image(size: int) -> tuple[th.Tensor, th.Tensor]:
+def _bounds(rows: tuple[Sensor, ...]) -> tuple[list[float], list[float]]:
+    """Return the least and the greatest observation of some sensors."""
+    sizes = [sensor.size for sensor in rows]
+    low = np.repeat([sensor.low * sensor.scale for sensor in rows], sizes)
+    high = np.repeat([sensor.high * sensor.scale for sensor in rows], sizes)
+    return low.astype(np.float32).tolist(), high.astype(np.float32).tolist()
+
+
+def mirror_image(space: Any) -> MirrorImage:
     """
     Describe the mirror image of observations.
 
-    :param size: of one, by which its sensors are known
-    :return: the index in an observation of each number of the image, and its sign there
+    :param space: of the observations, by which their sensors are known; see :func:`sensors_of`
+    :return: order and signs
     """
+    return _image(sensors_of(space))
+
+
+@lru_cache
+def _image(rows: tuple[Sensor, ...]) -> MirrorImage:
     order: list[int] = []
     signs: list[float] = []
-    for sensor in sensors_of_size(size):
+    for sensor in rows:
         order += [len(order) + index for index in _order(sensor)]
         signs += [-1.0 if sensor.mirror == "opposite" else 1.0] * sensor.size
-    return th.tensor(order), th.tensor(signs, dtype=th.float32)
+    return MirrorImage(th.tensor(order), th.tensor(signs, dtype=th.float32))
 
 
-def mirror_observations(observations: th.Tensor) -> th.Tensor:
+def mirror_observations(observations: th.Tensor, image: MirrorImage) -> th.Tensor:
     """
     Mirror observations. Mirroring twice gives the same observations.
 
     :param observations: (n, size) with range finders that look equally far to both sides
+    :param image: of their space
     :return: (n, size)
     """
-    order, signs = (part.to(observations.device) for part in mirror_image(observations.shape[1]))
+    order, signs = (part.to(observations.device) for part in image)
     return observations[:, order] * signs
 
 
@@ -69,22 +111,21 @@ def mirror_actions(actions: th.Tensor) -> th.Tensor:
     return th.cat((-actions[..., :1], actions[..., 1:]), dim=-1)
 
 
-def mirror_half(batch: ReplayBufferSamples) -> ReplayBufferSamples:
+def mirror_half(batch: ReplayBufferSamples, image: MirrorImage) -> ReplayBufferSamples:
     """
     Mirror the first half of a batch, whose order is random.
 
     :param batch: of a replay buffer; left as it is
+    :param image: of the space of its observations
     :return: as many transitions
     """
     half = len(batch.actions) // 2
 
-    def joined(images: th.Tensor, whole: th.Tensor) -> th.Tensor:
-        return th.cat((images, whole[half:]))
+    def seen(whole: th.Tensor) -> th.Tensor:
+        return th.cat((mirror_observations(whole[:half], image), whole[half:]))
 
     return batch._replace(
-        observations=joined(mirror_observations(batch.observations[:half]), batch.observations),
-        actions=joined(mirror_actions(batch.actions[:half]), batch.actions),
-        next_observations=joined(
-            mirror_observations(batch.next_observations[:half]), batch.next_observations
-        ),
+        observations=seen(batch.observations),
+        actions=th.cat((mirror_actions(batch.actions[:half]), batch.actions[half:])),
+        next_observations=seen(batch.next_observations),
     )

@@ -21,7 +21,7 @@ from torch.optim.swa_utils import AveragedModel
 
 from sb3_torcs.policies import fused
 from sb3_torcs.policies.flat import FlatParameters
-from sb3_torcs.policies.mirror import mirror_actions, mirror_observations
+from sb3_torcs.policies.mirror import mirror_actions, mirror_image, mirror_observations
 
 __all__ = [
     "HEAD_GAINS",
@@ -241,6 +241,7 @@ class ExactDriver(nn.Module):
         heads = actor.mu.plain() if isinstance(actor.mu, FlatHeads) else copy.deepcopy(actor.mu)
         self.mu = heads.double()
         self.symmetric = symmetric
+        self._image = mirror_image(self.observation_space)
 
     def forward(self, observation: th.Tensor) -> th.Tensor:
         """
@@ -254,8 +255,8 @@ class ExactDriver(nn.Module):
         )
         actions = self._drive(seen)
         if self.symmetric:
-            image = mirror_actions(self._drive(mirror_observations(seen)))
-            actions = 0.5 * (actions + image)
+            image = mirror_observations(seen, self._image)
+            actions = 0.5 * (actions + mirror_actions(self._drive(image)))
         return actions.float()
 
     def _drive(self, seen: th.Tensor) -> th.Tensor:

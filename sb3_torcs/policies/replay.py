@@ -15,8 +15,7 @@ from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_torcs.policies.mirror import mirror_half, mirror_image
-from sb3_torcs.sensors import sensors_of_size
+from sb3_torcs.policies.mirror import mirror_half, mirror_image, sensors_of
 
 __all__ = ["sample_mirrored"]
 
@@ -32,14 +31,15 @@ def sample_mirrored(
     :param env: as in ``ReplayBuffer.sample``
     :return: the batch
     """
+    image = mirror_image(buffer.observation_space)
     if env is not None or not _is_stock(buffer):
-        return mirror_half(type(buffer).sample(buffer, batch_size, env))
+        return mirror_half(type(buffer).sample(buffer, batch_size, env), image)
     of_steps = buffer if isinstance(buffer, NStepReplayBuffer) else None
     n_steps, gamma = (1, 1.0) if of_steps is None else (of_steps.n_steps, of_steps.gamma)
     upper = buffer.buffer_size if buffer.full else buffer.pos
     rows = np.random.randint(0, upper, size=batch_size)  # noqa: NPY002  as SB3 draws
     columns = np.random.randint(0, buffer.n_envs, size=batch_size)  # noqa: NPY002
-    order, signs = (part.numpy() for part in mirror_image(*buffer.obs_shape))
+    order, signs = (part.numpy() for part in image)
     widths = (order.size, buffer.action_dim, order.size, 1, 1, 1)
     batch = tuple(np.empty((batch_size, width), np.float32) for width in widths)
     _fill(
@@ -62,8 +62,7 @@ def _is_stock(buffer: ReplayBuffer) -> bool:
         and not buffer.optimize_memory_usage
         and th.device(buffer.device).type == "cpu"
         and buffer.observations.dtype == buffer.actions.dtype == np.float32
-        and len(buffer.obs_shape) == 1
-        and sensors_of_size(*buffer.obs_shape) != ()
+        and sensors_of(buffer.observation_space) != ()
     )
 
 

@@ -27,6 +27,7 @@ from sb3_torcs.errors import InvalidOption
 from sb3_torcs.policies import fast_matmul as matmul
 from sb3_torcs.policies.export import export_actor
 from sb3_torcs.policies.flat import FlatParameters, keep_plain_state
+from sb3_torcs.policies.mirror import sensors_of
 from sb3_torcs.policies.networks import (
     HEAD_GAINS,
     ActorAverage,
@@ -35,7 +36,6 @@ from sb3_torcs.policies.networks import (
     SplitHeadActor,
 )
 from sb3_torcs.policies.optimizers import LeanAdam, with_lr_scale
-from sb3_torcs.sensors import sensors_of_size
 
 __all__ = ["SplitHeadPolicy", "export_actor"]
 
@@ -271,9 +271,7 @@ def _check_symmetric(
 ) -> None:
     if not isinstance(symmetric, bool):
         raise InvalidOption(f"symmetric={symmetric!r}: pass True or False")
-    shape = observation_space.shape or ()
-    known = len(shape) == 1 and sensors_of_size(*shape)
-    ours = known and layout_of_width(get_action_dim(action_space))
+    ours = sensors_of(observation_space) and layout_of_width(get_action_dim(action_space))
     if symmetric and not ours:
         raise InvalidOption(
             "symmetric=True mirrors the sensors and actuators of Torcs-v0 and TorcsLite-v0, not "
