@@ -2,9 +2,9 @@
 
 Its rows stand in groups, which an environment's ``sensors`` names: ``"base"`` are sensors of the
 SCR manual (arXiv:1304.1672, table 1), ``"preview"`` is the road ahead, ``"limits"`` are the speeds
-that it allows, ``"line"`` is the racing line, and ``"opponents"``, ``"rivals"`` and ``"race"`` are
-the other cars. The observation space, the encoder, the mirror image, the documentation and the
-policy's view of the observation are all derived from the table.
+that it allows, ``"line"`` is the racing line, ``"opponents"``, ``"rivals"`` and ``"race"`` are the
+other cars, and ``"car"`` is the car that is driven. The observation space, the encoder, the mirror
+image, the documentation and the policy's view of the observation are all derived from the table.
 
 To add a group, write its rows, put them into :data:`GROUPS`, and its function into ``_WRITERS``.
 """
@@ -30,6 +30,7 @@ from sb3_torcs.tracks.racing_line import LINE_PLACES, look_along, racing_line
 
 __all__ = [
     "GROUPS",
+    "NEEDS_CAR",
     "NEEDS_RACE",
     "OBSERVATION_HIGH",
     "OBSERVATION_LOW",
@@ -49,7 +50,7 @@ __all__ = [
     "sensor_table",
 ]
 
-SensorsName = Literal["base", "preview", "limits", "line", "opponents", "rivals", "race"]
+SensorsName = Literal["base", "preview", "limits", "line", "opponents", "rivals", "race", "car"]
 Mirror = Literal["same", "opposite", "reversed", "sides"]
 
 
@@ -142,6 +143,21 @@ RACE = (
 NEEDS_RACE = frozenset({"rivals", "race"})
 """Groups that only a world with a race can tell."""
 
+CAR = (
+    Sensor("car_grip", "", 1, "-", 0.0, 3.0, 1.0 / 1.5),
+    Sensor("car_downforce", "", 1, "1/m", 0.0, 0.01, 500.0),
+    Sensor("car_power", "", 1, "W/kg", 0.0, 1500.0, 1.0 / 300.0),
+    Sensor("car_drag", "", 1, "1/m", 0.0, 0.0025, 2000.0),
+    Sensor("car_mass", "", 1, "kg", 0.0, 4000.0, 1.0 / 1000.0),
+    Sensor("car_steer", "", 1, "rad", 0.0, 1.5, 1.0 / 0.4),
+)
+"""The car that is driven, by its file, so that one agent can drive many: the fields of
+:class:`~sb3_torcs.torcs.car_file.CarFacts`. They stay the same all through an episode: the factors
+``mass`` and ``grip`` of an episode's conditions are not in them, nor fuel that is burnt."""
+
+NEEDS_CAR = frozenset({"car"})
+"""Groups that only a world that knows its car's file can tell."""
+
 GROUPS: Mapping[SensorsName, tuple[Sensor, ...]] = {
     "base": SENSORS,
     "preview": PREVIEW,
@@ -150,6 +166,7 @@ GROUPS: Mapping[SensorsName, tuple[Sensor, ...]] = {
     "opponents": OPPONENTS,
     "rivals": RIVAL_ROWS,
     "race": RACE,
+    "car": CAR,
 }
 """The whole table. An observation has the groups that are named, in this order."""
 
@@ -360,29 +377,28 @@ def _write_limits(world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -
 def _write_line(world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> None:
     table, step = racing_line(_profile(world))
     seen = np.empty((3, LINE_PLACES))
-    place = car.distance_from_start, car.track_position
-    look_along(table, step, *place, car.speed_x, seen)
+    look_along(table, step, car.distance_from_start, car.track_position, car.speed_x, seen)
     seen[1] /= np.abs(seen[1]) + USUAL_BEND
     _scale_into(seen.ravel(), _PARTS["line"].start, numbers)
 
 
-def _write_opponents(world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> None:
-    del world
+def _write_opponents(_world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> None:
     _scale_into(car.opponents, _PARTS["opponents"].start, numbers)
 
 
-def _write_rivals(world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> None:
-    del world
+def _write_rivals(_world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> None:
     values = car.race[-len(numbers) :].copy()
-    places = values[: len(NEAR)]
-    places /= NEAR + np.abs(places)
+    values[: len(NEAR)] /= NEAR + np.abs(values[: len(NEAR)])
     _scale_into(values, _PARTS["rivals"].start, numbers)
 
 
-def _write_race(world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> None:
-    del world
+def _write_race(_world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> None:
     values = np.array([car.race_position, car.gap_ahead, car.gap_behind, car.laps_left], np.float64)
     _scale_into(values, _PARTS["race"].start, numbers)
+
+
+def _write_car(world: Any, _car: CarState, numbers: npt.NDArray[np.float32]) -> None:
+    _scale_into(np.array(world.facts), _PARTS["car"].start, numbers)
 
 
 _WRITERS: dict[str, Callable[[Any, CarState, npt.NDArray[np.float32]], None]] = {
@@ -392,6 +408,7 @@ _WRITERS: dict[str, Callable[[Any, CarState, npt.NDArray[np.float32]], None]] = 
     "opponents": _write_opponents,
     "rivals": _write_rivals,
     "race": _write_race,
+    "car": _write_car,
 }
 """Of each group but ``"base"``: fills its numbers, from the world and the state of the car."""
 
@@ -460,11 +477,11 @@ def sensor_table(name: SensorsName = "base") -> str:
     for sensor in GROUPS[name]:
         first, end = where[sensor.name].start, where[sensor.name].stop
         number = f"{first}" if sensor.size == 1 else f"{first}-{end - 1}"
-        low, high = sensor.low * sensor.scale, sensor.high * sensor.scale
         key = f"`{sensor.key}`" if sensor.key else ""
         lines.append(
             f"| {number} | `{sensor.name}` | {key} | {sensor.unit} | {sensor.low:.5g} | "
-            f"{sensor.high:.5g} | {sensor.scale:.5g} | {low:.5g} | {high:.5g} |"
+            f"{sensor.high:.5g} | {sensor.scale:.5g} | {sensor.low * sensor.scale:.5g} | "
+            f"{sensor.high * sensor.scale:.5g} |"
         )
     return "\n".join(lines)
 

@@ -28,7 +28,8 @@ class Backend(Protocol):
     :class:`~sb3_torcs.tracks.profile.RoadProfile`. One that can drive under other conditions has a
     method ``set_conditions(grip, mass)``, factors that hold from the next reset on, and in
     ``conditions`` the names of those that it can change. One that fills ``CarState.race`` has an
-    attribute ``tells_race``, which is true.
+    attribute ``tells_race``, which is true. One that knows its car's file has an attribute
+    ``facts``, a :class:`~sb3_torcs.torcs.car_file.CarFacts` of the present episode's car.
     """
 
     track: Track

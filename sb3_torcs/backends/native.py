@@ -25,6 +25,7 @@ from sb3_torcs.car import (
 from sb3_torcs.errors import BackendUnavailable, InvalidOption, TrackFileError
 from sb3_torcs.sensors import RangeFinderName, range_finder_angles
 from sb3_torcs.torcs.building import build_command
+from sb3_torcs.torcs.car_file import CarFacts, car_facts
 from sb3_torcs.torcs.installation import Game, find_game
 from sb3_torcs.torcs.race_setup import SCR_SERVER, SESSIONS, RaceSetup, Session, session_for
 from sb3_torcs.torcs.starting_list import AGENT, starting_list
@@ -236,6 +237,11 @@ class NativeBackend:
     def profile(self) -> RoadProfile:
         """The road with its hills; see :class:`~sb3_torcs.backends.base.Backend`."""
         return profile_of(self.engine, self.track)
+
+    @cached_property
+    def facts(self) -> CarFacts:
+        """What the car's file says; see :class:`~sb3_torcs.backends.base.Backend`."""
+        return car_facts(find_game().find_car(self.car))
 
     def race_setup(self) -> RaceSetup:
         """

@@ -11,6 +11,8 @@ import numpy as np
 
 from sb3_torcs.car import CarState, Controls, FloatArray, Start
 from sb3_torcs.errors import InvalidOption
+from sb3_torcs.torcs.car_file import CarFacts, car_facts
+from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.tracks.profile import RoadProfile, game_profile
 from sb3_torcs.tracks.track import Track
 
@@ -84,6 +86,11 @@ class SeatWorld:
     def profile(self) -> RoadProfile:
         """The road with its hills; see :class:`~sb3_torcs.backends.base.Backend`."""
         return profile_of(self.engine, self.track)
+
+    @cached_property
+    def facts(self) -> CarFacts:
+        """What the car's file says; see :class:`~sb3_torcs.backends.base.Backend`."""
+        return car_facts(find_game().find_car(self.car))
 
     def arrive(self, controls: Controls, ticks: int, state: CarState) -> None:
         """Take the result of a step, of which nothing has to be remembered."""
@@ -264,6 +271,11 @@ class Seat:
     def car(self) -> str:
         """The agent's car in the present race."""
         return self.worlds[self.index].car
+
+    @property
+    def facts(self) -> CarFacts:
+        """What the file of the agent's car in the present race says."""
+        return self.worlds[self.index].facts
 
     def draw_track(self, rng: np.random.Generator) -> None:
         """Choose the next race, if it begins now; see ``Backend``."""

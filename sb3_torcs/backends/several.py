@@ -11,6 +11,7 @@ from sb3_torcs.actions import GEARS
 from sb3_torcs.backends.base import Backend
 from sb3_torcs.car import CarState, Controls, Start
 from sb3_torcs.errors import InvalidOption
+from sb3_torcs.torcs.car_file import CarFacts
 from sb3_torcs.tracks.profile import RoadProfile
 from sb3_torcs.tracks.track import Track
 
@@ -66,6 +67,11 @@ class SeveralWorlds:
     def profile(self) -> RoadProfile | None:
         """The road of the present episode, if it has hills."""
         return getattr(self._world, "profile", None)
+
+    @property
+    def facts(self) -> CarFacts | None:
+        """What the file of the present episode's car says, if its world knows."""
+        return getattr(self._world, "facts", None)
 
     def _enter(self, index: int) -> None:
         self.index = index

@@ -33,7 +33,7 @@ from sb3_torcs.envs.conditions import Conditions, Delay, Part
 from sb3_torcs.envs.starts import Starts, read_start
 from sb3_torcs.errors import CarLost, EnvClosed, InvalidOption
 from sb3_torcs.rewards import CRASHES, Reward, RewardChoice
-from sb3_torcs.sensors import NEEDS_RACE, SensorsName, View
+from sb3_torcs.sensors import NEEDS_CAR, NEEDS_RACE, SensorsName, View
 from sb3_torcs.tracks.track import Track
 
 __all__ = ["RacingEnv", "RacingInfo", "RenderMode"]
@@ -123,12 +123,17 @@ def stands(car: CarState) -> bool:
 
 
 def _check_tells(world: Backend, view: View) -> None:
-    """Refuse sensors of a race in a world that has none to tell of."""
+    """Refuse sensors of a race, or of a car's file, in a world that does not know of it."""
     lacking = NEEDS_RACE.intersection(view.sensors)
     if lacking and not getattr(world, "tells_race", False):
         raise InvalidOption(
             f"sensors {', '.join(map(repr, sorted(lacking)))} are of races, of which this world "
             "does not tell; leave them out, or use backend 'native' of Torcs-v0"
+        )
+    if NEEDS_CAR.intersection(view.sensors) and getattr(world, "facts", None) is None:
+        raise InvalidOption(
+            "sensors 'car' are of the car's file in the game, which this world does not read; "
+            "leave them out, or use backend 'native' of Torcs-v0"
         )
 
 

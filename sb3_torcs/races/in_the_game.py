@@ -16,7 +16,7 @@ from sb3_torcs.errors import GameFailed, InvalidOption, ModelMismatch, ServerLos
 from sb3_torcs.races.entrants import Entrant
 from sb3_torcs.races.protocol import Race, Standing
 from sb3_torcs.scr.server import open_ports, start_server
-from sb3_torcs.sensors import NEEDS_RACE
+from sb3_torcs.sensors import NEEDS_CAR, NEEDS_RACE
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.race_results import RobotResult
 from sb3_torcs.torcs.race_setup import SCR_DRIVERS, SCR_SERVER, RaceSetup, session_for
@@ -127,7 +127,7 @@ def _client(entrant: Entrant, race: RaceSetup, port: int, trust: bool) -> Agent:
     """Load an agent with what it sees and drives as in its training."""
     pilot = entrant.agent
     assert pilot is not None, "robots are the game's"
-    untold = NEEDS_RACE.intersection(pilot.record.env_kwargs.get("sensors", ()))
+    untold = (NEEDS_RACE | NEEDS_CAR).intersection(pilot.record.env_kwargs.get("sensors", ()))
     if untold:
         raise ModelMismatch(
             f"'{entrant.name}' was trained with sensors {', '.join(map(repr, sorted(untold)))}, of "
