@@ -172,6 +172,7 @@ GENERATED = {
         "opponents": functools.partial(sensor_table, "opponents"),
         "rivals": functools.partial(sensor_table, "rivals"),
         "race": functools.partial(sensor_table, "race"),
+        "car": functools.partial(sensor_table, "car"),
         "range-finders": range_finders_table,
         "terms": terms_table,
         "presets": presets_table,

@@ -264,6 +264,13 @@ def test_each_choice_of_groups_has_a_space_of_its_own():
     assert sensors_of(Box(-1.0, 1.0, (2, 29))) == ()
 
 
+def test_only_its_bounds_tell_a_choice_from_another_of_its_size():
+    """Where they are lost, none is guessed."""
+    size = View(("base", "line", "car")).size
+    assert len(choices_of_size(size)) > 1
+    assert sensors_of(Box(-10.0, 10.0, (size,))) == ()
+
+
 def test_the_road_ahead_of_a_mirrored_track_is_the_mirror_image(oval):
     """Bends change sides, widths and slopes stay."""
 

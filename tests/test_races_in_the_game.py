@@ -90,9 +90,11 @@ def test_more_agents_than_seats_are_refused(game, alone):
 
 def test_an_agent_that_sees_more_than_the_server_tells_is_refused(game, alone):
     order = find_entrants(["bt", "scripted"], game)
-    order[1].agent.record = TrainingRecord(env_kwargs={"sensors": ["base", "rivals", "race"]})
+    order[1].agent.record = TrainingRecord(
+        env_kwargs={"sensors": ["base", "rivals", "race", "car"]}
+    )
     with pytest.raises(
-        ModelMismatch, match=r"sensors 'race', 'rivals', of which.*leave out --game"
+        ModelMismatch, match=r"sensors 'car', 'race', 'rivals', of which.*leave out --game"
     ):
         run_game_race(order, TRACK, laps=1)
     assert list(alone.iterdir()) == []
