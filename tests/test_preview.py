@@ -268,7 +268,10 @@ def test_only_its_bounds_tell_a_choice_from_another_of_its_size():
     """Where they are lost, none is guessed."""
     size = View(("base", "line", "car")).size
     assert len(choices_of_size(size)) > 1
-    assert sensors_of(Box(-10.0, 10.0, (size,))) == ()
+    lost = Box(-10.0, 10.0, (size,))
+    assert sensors_of(lost) == ()
+    with pytest.raises(InvalidOption, match=r"Box.*changes their bounds or size"):
+        mirror_image(lost)
 
 
 def test_the_road_ahead_of_a_mirrored_track_is_the_mirror_image(oval):

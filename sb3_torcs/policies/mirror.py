@@ -13,6 +13,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
+from sb3_torcs.errors import InvalidOption
 from sb3_torcs.sensors import Sensor, choices_of_size
 
 __all__ = [
@@ -75,8 +76,15 @@ def mirror_image(space: Any) -> MirrorImage:
 
     :param space: of the observations, by which their sensors are known; see :func:`sensors_of`
     :return: order and signs
+    :raises InvalidOption: if the sensors cannot be known
     """
-    return _image(sensors_of(space))
+    rows = sensors_of(space)
+    if not rows:
+        raise InvalidOption(
+            f"{space} is not of the observations of Torcs-v0 or TorcsLite-v0, whose mirror image "
+            "is known; take out what changes their bounds or size, as VecNormalize does"
+        )
+    return _image(rows)
 
 
 @lru_cache

@@ -240,8 +240,7 @@ class ExactDriver(nn.Module):
         self.features_extractor = copy.deepcopy(actor.features_extractor)
         heads = actor.mu.plain() if isinstance(actor.mu, FlatHeads) else copy.deepcopy(actor.mu)
         self.mu = heads.double()
-        self.symmetric = symmetric
-        self._image = mirror_image(self.observation_space)
+        self._image = mirror_image(self.observation_space) if symmetric else None
 
     def forward(self, observation: th.Tensor) -> th.Tensor:
         """
@@ -254,7 +253,7 @@ class ExactDriver(nn.Module):
             th.Tensor, preprocess_obs(observation, self.observation_space, self.normalize_images)
         )
         actions = self._drive(seen)
-        if self.symmetric:
+        if self._image is not None:
             image = mirror_observations(seen, self._image)
             actions = 0.5 * (actions + mirror_actions(self._drive(image)))
         return actions.float()
