@@ -20,8 +20,7 @@ from sb3_torcs.envs.batch import Batch, Timestep
 from sb3_torcs.envs.racing import RacingEnv, RacingInfo
 from sb3_torcs.envs.torcs_race import make_race
 from sb3_torcs.errors import EnvClosed, InvalidOption
-from sb3_torcs.policies.mirror import mirror_image
-from sb3_torcs.sensors import look_both_ways
+from sb3_torcs.policies.mirror import check_angles, mirror_image
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.starting_list import guests_of
 
@@ -314,11 +313,7 @@ class MirrorVecEnv(VecEnvWrapper):
     def __init__(self, venv: VecEnv) -> None:
         super().__init__(venv)
         for angles in venv.get_attr("range_finder_angles"):
-            if not look_both_ways(angles):
-                raise InvalidOption(
-                    "MirrorVecEnv needs range finders that look equally far to both sides, not "
-                    f"{np.degrees(angles).round(3).tolist()}; pass 'scr' or 'narrow'"
-                )
+            check_angles(angles, "MirrorVecEnv")
         order, signs = mirror_image(venv.observation_space)
         self._order, self._signs = order.numpy(), signs.numpy()
 

@@ -6,7 +6,6 @@ from abc import abstractmethod
 from functools import partial
 from typing import Any
 
-import numpy as np
 from stable_baselines3 import PPO, TD3
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
@@ -18,11 +17,11 @@ from sb3_torcs.callbacks.switches import require_method
 from sb3_torcs.car import is_count, is_number
 from sb3_torcs.errors import InvalidOption, renamed
 from sb3_torcs.policies import ppo, updates
+from sb3_torcs.policies.mirror import check_angles
 from sb3_torcs.policies.ppo import LeanPPO
 from sb3_torcs.policies.replay import sample_mirrored
 from sb3_torcs.policies.split_head import SplitHeadPolicy
 from sb3_torcs.policies.updates import LeanUpdates
-from sb3_torcs.sensors import look_both_ways
 
 __all__ = [
     "AdaptiveLearningRateCallback",
@@ -230,11 +229,7 @@ class MirrorCallback(_WhileLearning):
             )
         require_method(self.training_env, "range_finder_angles")
         for angles in self.training_env.get_attr("range_finder_angles"):
-            if not look_both_ways(angles):
-                raise InvalidOption(
-                    f"{type(self).__name__} needs range finders that look equally far to both "
-                    f"sides, not {np.degrees(angles).round(3).tolist()}; pass 'scr' or 'narrow'"
-                )
+            check_angles(angles, type(self).__name__)
         self._buffer = buffer
 
     def _on_rollout_end(self) -> None:

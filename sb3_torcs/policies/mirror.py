@@ -14,10 +14,11 @@ import torch as th
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_torcs.errors import InvalidOption
-from sb3_torcs.sensors import Sensor, choices_of_size
+from sb3_torcs.sensors import Sensor, choices_of_size, look_both_ways
 
 __all__ = [
     "MirrorImage",
+    "check_angles",
     "mirror_actions",
     "mirror_half",
     "mirror_image",
@@ -35,6 +36,21 @@ def _order(sensor: Sensor) -> list[int]:
     if sensor.mirror == "reversed":
         return order[::-1]
     return list(OTHER_WHEEL) if sensor.mirror == "sides" else order
+
+
+def check_angles(angles: Any, what: str) -> None:
+    """
+    Make sure that observations have a mirror image.
+
+    :param angles: (19,) of the range finders [rad]
+    :param what: needs it
+    :raises InvalidOption: if they do not look equally far to both sides
+    """
+    if not look_both_ways(angles):
+        raise InvalidOption(
+            f"{what} needs range finders that look equally far to both sides, not "
+            f"{np.degrees(angles).round(3).tolist()}; pass 'scr' or 'narrow'"
+        )
 
 
 class MirrorImage(NamedTuple):
