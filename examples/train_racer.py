@@ -1,4 +1,4 @@
-"""Train PPO to race on one track: alone, then among copies of itself, then against robots.
+"""Train PPO to race on one track: first alone, then four copies of it against robots.
 
 Each car of each race is an environment of TorcsVecEnv, so that stock PPO learns from all of them.
 """
@@ -22,25 +22,25 @@ from sb3_torcs.sensors import feature_slices
 from sb3_torcs.vec_env import TorcsVecEnv
 
 SENSORS = ("base", "line", "rivals")
-# The fields of robots, of which each race draws one: passing is learned from few, the first bend
-# from many.
+# The fields of robots, of which each race draws one.
 FIELDS = (
-    ("inferno", "bt", "olethros"),
-    ("bt", "berniw"),
-    ("tita",),
     ("lliaw", "olethros", "inferno", "bt", "berniw", "tita"),
+    ("inferno:4", "bt:3", "tita:4", "lliaw:4", "berniw:3", "olethros:2"),
+    ("tita:3", "bt:2", "berniw:2"),
 )
 ALONE = {
     "progress": 1.0, "off_line": -1.0, "leaving": -0.5, "damage": -0.02, "crash": -1.0, "scale": 0.1
 }  # fmt: skip
-RACING = {**ALONE, "damage": -0.05, "places": 10.0, "contact": -1.0, "fault": -20.0}
+RACING = {
+    "progress": 1.0, "off_line": -0.3, "leaving": -0.1, "damage": -0.1, "closing": -2.0,
+    "places": 10.0, "contact": -1.0, "fault": -20.0, "crash": -1.0, "scale": 0.1,
+}  # fmt: skip
 
 parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
 parser.add_argument("--track", default="aalborg")
 parser.add_argument("--alone", type=int, default=1_000_000, help="timesteps without other cars")
-parser.add_argument("--selfplay", type=int, default=800_000, help="timesteps among eight copies")
-parser.add_argument("--robots", type=int, default=6_000_000, help="timesteps against robots")
-parser.add_argument("--cars", type=int, default=64, help="that learn at once, a multiple of 8")
+parser.add_argument("--robots", type=int, default=10_000_000, help="timesteps against robots")
+parser.add_argument("--cars", type=int, default=64, help="that learn at once, a multiple of 16")
 parser.add_argument("--seed", type=int, default=0)
 parser.add_argument("--threads", type=int, help="default: one per core")
 parser.add_argument("--folder", type=Path, default=Path("logs/racer"))
@@ -53,7 +53,7 @@ def callbacks(
     asked = recipe("ppo", "Torcs-v0", {"env_kwargs": env_kwargs})
     starts = [RandomStartCallback(speed=65.0, hard=0.5)] if random_starts else []
     every = CheckpointCallback(262_144 // args.cars, str(args.folder), name_prefix="racer")
-    learning = [LeanUpdatesCallback(), AdaptiveLearningRateCallback(kl=0.015)]
+    learning = [LeanUpdatesCallback(), AdaptiveLearningRateCallback(kl=0.012, last_kl=0.003)]
     return [RecordCallback(asked), *starts, *learning, every]
 
 
@@ -87,9 +87,9 @@ def main() -> None:
         alone,
         learning_rate=1e-3,
         n_steps=128,
-        batch_size=1024,
-        gamma=0.98,
-        ent_coef=0.002,
+        batch_size=2048,
+        gamma=0.985,
+        ent_coef=0.001,
         policy_kwargs={
             "net_arch": [128, 128],
             "activation_fn": nn.ReLU,
@@ -101,27 +101,29 @@ def main() -> None:
     model.learn(args.alone, callback=callbacks(env_kwargs, args, random_starts=True))
     alone.close()
     look_away(model.policy)
+    # Alone it has become sure of what to do. Among others it has to try again.
+    with th.no_grad():
+        model.policy.log_std.copy_(th.tensor([-1.9, -1.1]))
 
-    # Eight copies begin anywhere on the road. Those that leave it rejoin where the road is free.
-    # Against robots a race begins on the grid, with the copies behind: a start elsewhere would let
-    # each robot plan its line anew.
-    for timesteps, agents, opponents in ((args.selfplay, 8, ()), (args.robots, 4, FIELDS)):
-        races = TorcsVecEnv(
-            args.cars // agents,
-            agents=agents,
-            threads=args.threads,
-            reward=RACING,
-            opponents=opponents,
-            max_episode_steps=600,
-            **env_kwargs,
-        )
-        model.set_env(races)
-        model.learn(
-            timesteps,
-            callback=callbacks(env_kwargs, args, random_starts=not opponents),
-            reset_num_timesteps=False,
-        )
-        races.close()
+    # A race begins on the grid, with the copies behind: a start elsewhere would let each robot plan
+    # its line anew. A car that is pushed off the road learns to come back to it.
+    races = TorcsVecEnv(
+        args.cars // 4,
+        agents=4,
+        threads=args.threads,
+        reward=RACING,
+        opponents=FIELDS,
+        runoff=8.0,
+        max_episode_steps=1000,
+        **env_kwargs,
+    )
+    model.set_env(races)
+    model.learn(
+        args.robots,
+        callback=callbacks(env_kwargs, args, random_starts=False),
+        reset_num_timesteps=False,
+    )
+    races.close()
     model.save(args.folder / "model")
     print(f"saved {args.folder}/model.zip; race it: sb3-torcs race {args.folder}/model.zip inferno")
 
