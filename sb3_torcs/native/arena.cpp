@@ -32,7 +32,8 @@ std::size_t class_size(std::size_t size_class) {
 // variables. In the game the heap lies below the libraries, so arenas are reserved there, too.
 constexpr std::uintptr_t FIRST_ARENA = 0x200000000000;
 
-constexpr int MOST_ARENAS = 4096;
+// Two for each race. With as many, the kernel runs out of mappings (vm.max_map_count), too.
+constexpr int MOST_ARENAS = 16384;
 
 struct Range {
     const char* begin;
