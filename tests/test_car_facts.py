@@ -8,15 +8,13 @@ import math
 import gymnasium as gym
 import numpy as np
 import pytest
-from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv
+from vectors import assert_they_see_the_same
 
 import sb3_torcs  # noqa: F401  # registers the ids
 from sb3_torcs.envs.torcs_race import make_race
 from sb3_torcs.errors import CarFileError, InvalidOption
 from sb3_torcs.sensors import CAR, feature_slices
 from sb3_torcs.torcs.car_file import CarFacts, car_facts
-from sb3_torcs.vec_env import TorcsVecEnv
 
 SENSORS = ("base", "car")
 CARS = ["car1-trb1", "car1-ow1", "p406"]
@@ -178,22 +176,7 @@ def test_each_episode_shows_the_car_that_it_draws(game):
 def test_races_driven_at_once_see_what_single_ones_see():
     """To the bit, across the ends of episodes, each with a car of its own."""
     options = {"car": CARS, "start": "random", "max_episode_steps": 12, "sensors": SENSORS}
-    ours = TorcsVecEnv(3, env_id="Torcs-v0", **options)
-    theirs = DummyVecEnv([lambda: Monitor(gym.make("Torcs-v0", **options))] * 3)
-    for envs in (ours, theirs):
-        envs.seed(1)
-        envs.action_space.seed(1)
-    assert ours.reset().tobytes() == theirs.reset().tobytes()
-    for step in range(40):
-        actions = np.array([theirs.action_space.sample() for _ in range(3)])
-        (one, *_, infos), (other, *_, others) = ours.step(actions), theirs.step(actions)
-        assert one.tobytes() == other.tobytes(), step
-        for info, same in zip(infos, others, strict=True):
-            last, expected = info.get("terminal_observation"), same.get("terminal_observation")
-            assert (last is None) == (expected is None)
-            assert last is None or last.tobytes() == expected.tobytes()
-    ours.close()
-    theirs.close()
+    assert_they_see_the_same("Torcs-v0", **options)
 
 
 def test_agents_of_one_race_see_their_car(game):

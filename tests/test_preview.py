@@ -12,8 +12,7 @@ import torch as th
 from conftest import ScriptedBackend, car_state
 from gymnasium.spaces import Box
 from stable_baselines3 import DDPG
-from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv
+from vectors import assert_they_see_the_same
 
 import sb3_torcs  # noqa: F401  # registers the ids
 from sb3_torcs.agents.scripted import ScriptedDriver
@@ -26,7 +25,6 @@ from sb3_torcs.policies.mirror import mirror_image, mirror_observations, sensors
 from sb3_torcs.sensors import GROUPS, View, choices_of_size, feature_slices
 from sb3_torcs.tracks.profile import DISTANCES, INTERVALS, look_ahead, road_profile, speed_margins
 from sb3_torcs.tracks.track import Segment, Track
-from sb3_torcs.vec_env import TorcsVecEnv
 
 BOTH = ("base", "preview")
 BENDS, WIDTHS, SLOPES = list(feature_slices(BOTH).values())[-3:]
@@ -180,22 +178,7 @@ def test_races_driven_at_once_see_what_single_ones_see(env_id, track):
     if env_id == "Torcs-v0" and track == "random":
         track = ["wheel-1", "e-track-5"]
     options = {"track": track, "start": "random", "max_episode_steps": 12, "sensors": BOTH}
-    ours = TorcsVecEnv(3, env_id=env_id, **options)
-    theirs = DummyVecEnv([lambda: Monitor(gym.make(env_id, **options))] * 3)
-    for envs in (ours, theirs):
-        envs.seed(1)
-        envs.action_space.seed(1)
-    assert ours.reset().tobytes() == theirs.reset().tobytes()
-    for step in range(40):
-        actions = np.array([theirs.action_space.sample() for _ in range(3)])
-        (one, *_, infos), (other, *_, others) = ours.step(actions), theirs.step(actions)
-        assert one.tobytes() == other.tobytes(), step
-        for info, same in zip(infos, others, strict=True):
-            last, expected = info.get("terminal_observation"), same.get("terminal_observation")
-            assert (last is None) == (expected is None)
-            assert last is None or last.tobytes() == expected.tobytes()
-    ours.close()
-    theirs.close()
+    assert_they_see_the_same(env_id, **options)
 
 
 @pytest.mark.usefixtures("game")
