@@ -22,6 +22,7 @@ __all__ = [
     "CAR_WIDTH",
     "CONTROL_TICK",
     "DEFAULT_CAR",
+    "FIRST_RIVAL",
     "LIMITER_RPM",
     "MANY_LAPS",
     "MAX_DAMAGE",
@@ -131,6 +132,13 @@ def checked_laps(laps: int | None) -> int | None:
     return int(laps)
 
 
+def _checked_from_zero(name: str, value: Any, high: float, allowed: str) -> float:
+    """Check a number from 0 to ``high``; the error says in words what is ``allowed``."""
+    if not is_number(value) or not 0.0 <= value <= high:
+        raise InvalidOption(f"{name} is {value!r}; expected {allowed}")
+    return float(value)
+
+
 def checked_runoff(runoff: float) -> float:
     """
     Check how far a car may be beside the road before its episode ends.
@@ -139,11 +147,8 @@ def checked_runoff(runoff: float) -> float:
     :return: the same
     :raises InvalidOption: if it is no such length
     """
-    if not is_number(runoff) or not 0.0 <= runoff <= WIDEST_RUNOFF:
-        raise InvalidOption(
-            f"runoff is {runoff!r}; expected a number of metres from 0 to {WIDEST_RUNOFF:g}"
-        )
-    return float(runoff)
+    allowed = f"a number of metres from 0 to {WIDEST_RUNOFF:g}"
+    return _checked_from_zero("runoff", runoff, WIDEST_RUNOFF, allowed)
 
 
 def checked_start(start: StartName) -> StartName:
@@ -167,11 +172,8 @@ def checked_start_speed(speed: float) -> float:
     :return: the same
     :raises InvalidOption: if no car can start so
     """
-    if not is_number(speed) or not 0.0 <= speed <= MAX_START_SPEED:
-        raise InvalidOption(
-            f"speed of random starts is {speed!r}; expected 0 to {MAX_START_SPEED:g} m/s"
-        )
-    return float(speed)
+    allowed = f"0 to {MAX_START_SPEED:g} m/s"
+    return _checked_from_zero("speed of random starts", speed, MAX_START_SPEED, allowed)
 
 
 def checked_hard_starts(share: float) -> float:
@@ -182,9 +184,7 @@ def checked_hard_starts(share: float) -> float:
     :return: the same
     :raises InvalidOption: for anything else
     """
-    if not is_number(share) or not 0.0 <= share <= 1.0:
-        raise InvalidOption(f"the share of hard starts is {share!r}; expected 0 to 1")
-    return float(share)
+    return _checked_from_zero("the share of hard starts", share, 1.0, "0 to 1")
 
 
 MAX_DELAY = 50  # control ticks: 1 s
@@ -245,6 +245,8 @@ def checked_factor(name: str, choice: Any) -> Range:
 
 RIVALS = 4
 """How many cars around it a car knows."""
+FIRST_RIVAL = 5
+"""Where in ``CarState.race`` their numbers begin: of all of them along the road, across it, ..."""
 
 NO_RACE = np.array([200.0, 200.0, 0.0, 0.0, 0.0, *[200.0] * RIVALS, *[0.0] * 5 * RIVALS])
 """``CarState.race`` of a car that knows of no other, or in a world that does not tell."""

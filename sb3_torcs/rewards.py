@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Literal
 
-from sb3_torcs.car import CAR_WIDTH, RIVALS, CarState, Controls, is_number
+from sb3_torcs.car import CAR_WIDTH, FIRST_RIVAL, RIVALS, CarState, Controls, is_number
 from sb3_torcs.errors import InvalidOption, UnknownRewardTerm, near_miss
 
 __all__ = ["CRASHES", "PRESETS", "TERMS", "Reward", "RewardChoice", "RewardName", "safe_speed"]
@@ -104,10 +104,12 @@ def closing(before: CarState, after: CarState, controls: Controls) -> float:
     Cars that it would pass are not in the way. Of several in the way the worst counts.
     """
     worst = 0.0
+    rivals = after.race[FIRST_RIVAL:]
     for i in range(RIVALS):
-        along, across, faster = after.race[5 + i], after.race[9 + i], after.race[13 + i]
-        length, width = after.race[21 + i], after.race[25 + i]
+        along, across, faster = rivals[i], rivals[RIVALS + i], rivals[2 * RIVALS + i]
+        length, width = rivals[4 * RIVALS + i], rivals[5 * RIVALS + i]
         if along > 0.0 and abs(across) < width + ROOM:
+            # Between their centres lies half of each car; its own length is taken as the other's.
             room = max(along - length - ROOM, 0.0)
             worst = max(worst, -faster - math.sqrt(2.0 * BRAKING * room))
     return worst
