@@ -222,16 +222,16 @@ def feature_slices(sensors: Sequence[SensorsName] = ("base",)) -> dict[str, slic
 
 
 @lru_cache
-def choices_of_size(size: int) -> tuple[tuple[Sensor, ...], ...]:
+def choices_of_size(size: int) -> tuple[View, ...]:
     """
     Find the choices of groups whose observations have a size. Few sizes have more than one.
 
     :param size: of an observation
-    :return: the rows of the table in each such choice
+    :return: each such choice
     """
-    chosen = chain(*(combinations(list(GROUPS.values())[1:], n) for n in range(len(GROUPS))))
-    rows = (tuple(chain(SENSORS, *groups)) for groups in chosen)
-    return tuple(choice for choice in rows if sum(sensor.size for sensor in choice) == size)
+    more = chain(*(combinations(list(GROUPS)[1:], n) for n in range(len(GROUPS))))
+    views = (View(("base", *groups)) for groups in more)
+    return tuple(view for view in views if view.size == size)
 
 
 _measure = attrgetter(*(sensor.name for sensor in SENSORS))

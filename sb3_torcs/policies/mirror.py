@@ -7,6 +7,7 @@ road. Learning from both gives twice the experience, with every bend in both dir
 from __future__ import annotations
 
 from functools import lru_cache
+from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,7 +15,7 @@ import torch as th
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_torcs.errors import InvalidOption
-from sb3_torcs.sensors import Sensor, choices_of_size, look_both_ways
+from sb3_torcs.sensors import GROUPS, Sensor, choices_of_size, look_both_ways
 
 __all__ = [
     "MirrorImage",
@@ -70,20 +71,15 @@ def sensors_of(space: Any) -> tuple[Sensor, ...]:
     :return: rows of the sensor table; empty if the space is of no choice of groups
     """
     low = np.asarray(getattr(space, "low", ()), np.float32)
-    choices = choices_of_size(low.size) if low.ndim == 1 else ()
-    if len(choices) > 1:
-        bounds = low.tolist(), np.asarray(space.high, np.float32).tolist()
-        choices = tuple(rows for rows in choices if _bounds(rows) == bounds)
-    return choices[0] if choices else ()
-
-
-@lru_cache
-def _bounds(rows: tuple[Sensor, ...]) -> tuple[list[float], list[float]]:
-    """Return the least and the greatest observation of some sensors."""
-    sizes = [sensor.size for sensor in rows]
-    low = np.repeat([sensor.low * sensor.scale for sensor in rows], sizes)
-    high = np.repeat([sensor.high * sensor.scale for sensor in rows], sizes)
-    return low.astype(np.float32).tolist(), high.astype(np.float32).tolist()
+    views = choices_of_size(low.size) if low.ndim == 1 else ()
+    if len(views) > 1:
+        high = np.asarray(space.high, np.float32)
+        views = tuple(
+            view
+            for view in views
+            if np.array_equal(view.low, low) and np.array_equal(view.high, high)
+        )
+    return tuple(chain(*(GROUPS[name] for name in views[0].sensors))) if views else ()
 
 
 def mirror_image(space: Any) -> MirrorImage:
