@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sb3_torcs.actions import checked_gearbox
-from sb3_torcs.backends.seats import SeatWorld, align, profile_of
+from sb3_torcs.backends.seats import SeatWorld, align, facts_of, profile_of
 from sb3_torcs.car import (
     DEFAULT_CAR,
     MANY_LAPS,
@@ -25,7 +25,7 @@ from sb3_torcs.car import (
 from sb3_torcs.errors import BackendUnavailable, InvalidOption, TrackFileError
 from sb3_torcs.sensors import RangeFinderName, range_finder_angles
 from sb3_torcs.torcs.building import build_command
-from sb3_torcs.torcs.car_file import CarFacts, car_facts
+from sb3_torcs.torcs.car_file import CarFacts
 from sb3_torcs.torcs.installation import Game, find_game
 from sb3_torcs.torcs.race_setup import SCR_SERVER, SESSIONS, RaceSetup, Session, session_for
 from sb3_torcs.torcs.starting_list import AGENT, starting_list
@@ -241,7 +241,7 @@ class NativeBackend:
     @cached_property
     def facts(self) -> CarFacts:
         """What the car's file says; see :class:`~sb3_torcs.backends.base.Backend`."""
-        return car_facts(find_game().find_car(self.car))
+        return facts_of(self.car)
 
     def race_setup(self) -> RaceSetup:
         """

@@ -27,6 +27,7 @@ __all__ = [
     "SeatWorld",
     "SharedRace",
     "align",
+    "facts_of",
     "profile_of",
 ]
 
@@ -66,6 +67,15 @@ def profile_of(engine: Engine, track: Track) -> RoadProfile:
     return _profiles[track]
 
 
+def facts_of(car: str) -> CarFacts:
+    """
+    Return what a car's file says.
+
+    :param car: its name in the game
+    """
+    return car_facts(find_game().find_car(car))
+
+
 class SeatWorld:
     """
     The car of an agent in a race that is loaded.
@@ -90,7 +100,7 @@ class SeatWorld:
     @cached_property
     def facts(self) -> CarFacts:
         """What the car's file says; see :class:`~sb3_torcs.backends.base.Backend`."""
-        return car_facts(find_game().find_car(self.car))
+        return facts_of(self.car)
 
     def arrive(self, controls: Controls, ticks: int, state: CarState) -> None:
         """Take the result of a step, of which nothing has to be remembered."""
