@@ -301,8 +301,8 @@ class MirrorVecEnv(VecEnvWrapper):
     Every other car sees the mirror image of its road, and steers in it.
 
     So an agent meets each bend in both directions, and learns twice as many roads. What the cars do
-    is as real as ever: a mirrored steering angle is turned back before the car gets it. ``info`` is
-    told as the cars see it, but for ``terminal_observation``.
+    is as real as ever: a mirrored steering angle is turned back before the car gets it. ``info``
+    describes the real road; only its ``terminal_observation`` is mirrored.
 
     In a file of hyperparameters: ``vec_env_wrapper: sb3_torcs.vec_env.MirrorVecEnv``.
 

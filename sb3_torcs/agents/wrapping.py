@@ -27,8 +27,9 @@ LEFT_OUT = {"TimeLimit", "Monitor", "RecordVideo", "RecordEpisodeStatistics", "U
 
 PASSING_ON = {"MirrorVecEnv", "VecMonitor", "VecCheckNan", "VecNormalize", "VecVideoRecorder"}
 """Wrappers of vectors that leave a single car as it is, or whose statistics are kept with the
-model, of these packages."""
+model."""
 VECTORS = ("sb3_torcs.vec_env", "stable_baselines3.common.vec_env")
+"""Where they are defined."""
 
 
 def wrapped(
