@@ -42,6 +42,7 @@ __all__ = [
     "checked_factor",
     "checked_hard_starts",
     "checked_laps",
+    "checked_recovery",
     "checked_runoff",
     "checked_start",
     "checked_start_speed",
@@ -68,6 +69,9 @@ CONTROL_TICK = 0.02
 
 MANY_LAPS = 1 << 30
 """[-] More laps than anyone drives, for a race without an end; the game can count to twice that."""
+
+LONGEST_RECOVERY = 60.0
+"""[s] Longer than any car needs that comes back at all."""
 
 WIDEST_RUNOFF = 100.0
 """[m] Wider than any ground beside a road of the game."""
@@ -149,6 +153,18 @@ def checked_runoff(runoff: float) -> float:
     """
     allowed = f"a number of metres from 0 to {WIDEST_RUNOFF:g}"
     return _checked_from_zero("runoff", runoff, WIDEST_RUNOFF, allowed)
+
+
+def checked_recovery(recovery: float) -> float:
+    """
+    Check how long a car may be without headway before its episode ends.
+
+    :param recovery: [s]
+    :return: the same
+    :raises InvalidOption: if it is no such time
+    """
+    allowed = f"a number of seconds from 0 to {LONGEST_RECOVERY:g}"
+    return _checked_from_zero("recovery", recovery, LONGEST_RECOVERY, allowed)
 
 
 def checked_start(start: StartName) -> StartName:

@@ -62,6 +62,27 @@ def test_a_car_may_be_beside_the_road_where_there_is_runoff(oval, axis, end):
     assert info["off_track"]
 
 
+BACK = 3.0  # [rad]
+
+
+@pytest.mark.parametrize("state", [{"heading_error": BACK}, {"speed_x": 1.0}])
+def test_a_car_has_time_to_recover_where_it_is_given(oval, state):
+    """Of 4 s, to turn round or to set off, from the last timestep with headway on."""
+    env = RacingEnv(ScriptedBackend(oval, {"speed_x": 20.0}, *[state] * 50), recovery=4.0)
+    env.reset(seed=0)
+    steps = [env.step(GAS) for _ in range(42)]
+    assert [step[2] for step in steps] == [False] * 41 + [True]
+    assert steps[-1][4]["end"] == "stuck"
+
+
+def test_who_backs_out_of_a_spin_makes_no_headway(oval):
+    """A car that reverses the right way along the road may not do so for ever."""
+    back = {"heading_error": math.pi, "speed_x": -10.0}
+    env = RacingEnv(ScriptedBackend(oval, *[back] * 50), recovery=4.0)
+    env.reset(seed=0)
+    assert [env.step(GAS)[2] for _ in range(41)] == [False] * 40 + [True]
+
+
 def test_a_standing_car_is_stuck_after_the_grace_of_the_start(oval):
     env = RacingEnv(ScriptedBackend(oval, *[{"speed_x": 0.0}] * 40))
     env.reset(seed=0)
@@ -230,6 +251,8 @@ def test_without_hard_starts_mishaps_change_no_start(oval):
         ({"laps": True}, "laps is True"),
         ({"runoff": -1.0}, "runoff is -1.0; expected a number of metres from 0 to 100"),
         ({"runoff": "wide"}, "runoff is 'wide'"),
+        ({"recovery": -1.0}, "recovery is -1.0; expected a number of seconds from 0 to 60"),
+        ({"recovery": "long"}, "recovery is 'long'"),
         ({"start": "pits"}, "start is 'pits'; expected 'grid' or 'random'"),
         ({"render_mode": "ansi"}, "render_mode is 'ansi'"),
     ],

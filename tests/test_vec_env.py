@@ -112,6 +112,7 @@ OPTIONS = [
     {"start": "random", "reward": "blog", "max_episode_steps": 20, "action_repeat": 2},
     {"start": "random", "reward": {**EVERY_TERM, "crash": -3.0}, "laps": 1},
     {"start": "random", "runoff": 3.0},
+    {"start": "random", "runoff": 3.0, "recovery": 3.0, "unstick": True, "action": "pedal"},
     {"reward": "apex", "action": "manual", "gearbox": "automatic"},
     {"action": "pedal", "gearbox": "road_speed", "max_episode_steps": -1},
     {"start": "random", "track": ["aalborg", "g-track-1", "e-track-5"], "max_episode_steps": 15},

@@ -19,7 +19,7 @@ from sb3_torcs.torcs.installation import find_game
 
 __all__ = ["CarOfAnAgent", "Crew", "Pilots"]
 
-SEEN = ("action_repeat", "sensors", "action")
+SEEN = ("action_repeat", "sensors", "action", "unstick")
 """What an agent drives with as in its training, besides its car, gearbox and range finders."""
 
 
@@ -101,10 +101,11 @@ class Pilots:
 
     def _ask(self, driver: str, team: list[int], begins: Any) -> None:
         worlds = [self._race.world(number) for number in team]
-        seen = [
-            self._envs[number].view.encode(world.engine.read(world.seat), self._race.seats[number])
-            for number, world in zip(team, worlds, strict=True)
-        ]
+        seen = []
+        for number, world in zip(team, worlds, strict=True):
+            env = self._envs[number]
+            env.car = world.engine.read(world.seat)
+            seen.append(env.view.encode(env.car, self._race.seats[number]))
         actions, self._states[driver] = self._drivers[driver].predict(
             np.stack(seen), self._states.get(driver), begins, deterministic=True
         )

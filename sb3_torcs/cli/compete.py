@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 __all__ = ["add_parser", "run"]
 
-KEPT = ("track", "car", "action_repeat", "range_finders", "sensors", "action", "gearbox")
+KEPT = ("track", "car", "action_repeat", "range_finders", "sensors", "action", "gearbox", "unstick")
 """Settings that are taken from the training, unless they are given on the command line."""
 
 DESCRIPTION = """\

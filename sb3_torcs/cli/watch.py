@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 __all__ = ["add_parser", "run"]
 
-KEPT = ("car", "action_repeat", "range_finders", "sensors", "action", "gearbox")
+KEPT = ("car", "action_repeat", "range_finders", "sensors", "action", "gearbox", "unstick")
 """What an agent drives with as in its training, unless the command line says otherwise."""
 
 DESCRIPTION = """\

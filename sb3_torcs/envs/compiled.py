@@ -17,9 +17,10 @@ from numba.extending import overload_attribute, register_jitable
 from sb3_torcs import actions, rewards
 from sb3_torcs.car import CarState, FloatArray
 from sb3_torcs.envs.racing import STUCK_TICKS, end_of, stands
+from sb3_torcs.envs.unstick import freeing_controls, needs_freeing
 from sb3_torcs.sensors import encode_record
 
-__all__ = ["COMPILED", "read_actions", "value_timesteps"]
+__all__ = ["COMPILED", "free_cars", "read_actions", "value_timesteps"]
 
 Counts = npt.NDArray[np.int64]
 
@@ -46,7 +47,7 @@ def _derived(name: str) -> None:
 for _name in ("track_position", "off_track", "gap_ahead", "gap_behind", "contacts", "faults"):
     _derived(_name)
 _readers = (actions.action_layout(name).read for name in actions.ACTIONS)
-for _function in (end_of, stands, rewards.safe_speed, *_readers):
+for _function in (end_of, stands, needs_freeing, freeing_controls, rewards.safe_speed, *_readers):
     register_jitable(_function)
 _read_pedals, _read_pedal, _read_manual = (
     actions.action_layout(name).read for name in ("pedals", "pedal", "manual")
@@ -91,6 +92,23 @@ def read_actions(asked: Any, low: FloatArray, high: FloatArray, controls: FloatA
     return True
 
 
+@njit(cache=True)
+def free_cars(cars: Any, unstick: npt.NDArray[np.bool_], controls: FloatArray) -> None:
+    """
+    Free the cars that are stuck, as ``RacingEnv.begin_step`` does.
+
+    :param cars: (n,) at the begin of a timestep
+    :param unstick: (n,) which cars may free themselves
+    :param controls: (n, 5) that were asked for, changed
+    """
+    for row in range(len(cars)):
+        if unstick[row] and needs_freeing(cars[row]):
+            steering, throttle, brake, gear = freeing_controls(cars[row])
+            fields = (steering, throttle, brake, float(gear), 0.0)
+            for i in range(5):
+                controls[row, i] = fields[i]
+
+
 def _one_of(terms: Sequence[rewards.Term]) -> Any:
     """Compile a function that returns the value of one of several terms, by its index."""
     first = njit(terms[0])
@@ -117,6 +135,7 @@ def value_timesteps(
     weights: FloatArray,
     laps: FloatArray,
     runoff: FloatArray,
+    recovery: Counts,
     ticks: Counts,
     patience: Counts,
     standing: Counts,
@@ -134,6 +153,7 @@ def value_timesteps(
     :param weights: (n, k) of the terms
     :param laps: (n,) after which an episode ends
     :param runoff: (n,) how far a car may be beside the road [m]
+    :param recovery: (n,) control ticks for which cars may be without headway, 0 for none backwards
     :param ticks: (n,) control ticks of a timestep
     :param patience: (n,) control ticks for which cars may stand, changed
     :param standing: (n,) control ticks for which they have been standing, changed
@@ -150,10 +170,10 @@ def value_timesteps(
             if choices[race, i] >= 0 and seconds != 0.0:
                 value = _term(choices[race, i], was, car, controls[race])
                 terms[race, i] = weights[race, i] * seconds * value
-        ended[race] = end_of(car, laps[race], runoff[race]) != 0
+        ended[race] = end_of(car, laps[race], runoff[race], recovery[race]) != 0
         if not ended[race]:
             if stands(car):
                 standing[race] += ticks[race]
                 ended[race] = standing[race] > patience[race]
             else:
-                standing[race], patience[race] = 0, STUCK_TICKS
+                standing[race], patience[race] = 0, max(STUCK_TICKS, recovery[race])

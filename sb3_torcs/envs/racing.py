@@ -24,6 +24,7 @@ from sb3_torcs.car import (
     StartName,
     checked_hard_starts,
     checked_laps,
+    checked_recovery,
     checked_runoff,
     checked_start,
     checked_start_speed,
@@ -31,6 +32,7 @@ from sb3_torcs.car import (
 )
 from sb3_torcs.envs.conditions import Conditions, Delay, Part
 from sb3_torcs.envs.starts import Starts, read_start
+from sb3_torcs.envs.unstick import freeing_controls, needs_freeing
 from sb3_torcs.errors import CarLost, EnvClosed, InvalidOption
 from sb3_torcs.rewards import CRASHES, Reward, RewardChoice
 from sb3_torcs.sensors import NEEDS_CAR, NEEDS_RACE, SensorsName, View
@@ -95,31 +97,36 @@ ENDS = ("", "laps", "off_track", "backwards", "damage")
 """Why an episode ends because of the state of the car, by the index that :func:`end_of` returns."""
 
 
-def end_of(car: CarState, laps: float, runoff: float) -> int:
+def end_of(car: CarState, laps: float, runoff: float, recovery: float) -> int:
     """
     Check whether the state of the car ends the episode. Compiled code calls it, too.
 
     :param car: at the end of a timestep
     :param laps: whole laps after which the episode ends
     :param runoff: how far the car may be beside the road [m]
+    :param recovery: how long a car may be without headway [control ticks]; 0 ends the episode of
+        one that faces backwards at once
     :return: the index of the reason in :data:`ENDS`, 0 if the episode goes on
     """
     if car.laps >= laps:
         return 1
     if abs(car.distance_from_axis) > 0.5 * car.track_width + runoff:
         return 2
-    if abs(car.heading_error) > BACKWARDS_ANGLE:
+    if recovery == 0 and abs(car.heading_error) > BACKWARDS_ANGLE:
         return 3
     return 4 if car.damage >= MAX_DAMAGE else 0
 
 
 def stands(car: CarState) -> bool:
     """
-    Check whether a car is slower along the road than walking. Compiled code calls it, too.
+    Check whether a car makes no headway: is slower along the road than walking, or faces backwards.
+
+    Compiled code calls it, too.
 
     :param car: at the end of a timestep
     """
-    return car.speed_x * math.cos(car.heading_error) < STUCK_SPEED
+    along = math.cos(car.heading_error)
+    return along < 0.0 or car.speed_x * along < STUCK_SPEED
 
 
 def _check_tells(world: Backend, view: View) -> None:
@@ -149,6 +156,10 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
     :param start: ``"grid"``, or ``"random"``: anywhere on the track, moving
     :param laps: whole laps after which the episode is truncated; ``None`` drives on
     :param runoff: how far the mass centre may be beside the road before the episode ends [m]
+    :param recovery: how long a car may stand, or face backwards, before the episode ends [s]; 0
+        ends it after 1.5 s of standing, and at once if it faces backwards
+    :param unstick: whether a car that is stuck across the road frees itself; actions count for
+        nothing meanwhile
     :param delay: control ticks by which controls arrive late; or a pair, between which each
         episode draws
     :param grip: factor on the friction of all ground; or a pair, as for the delay
@@ -170,6 +181,8 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         start: StartName = "grid",
         laps: int | None = None,
         runoff: float = 0.0,
+        recovery: float = 0.0,
+        unstick: bool = False,
         delay: int | Sequence[int] = 0,
         grip: float | Sequence[float] = 1.0,
         mass: float | Sequence[float] = 1.0,
@@ -188,6 +201,10 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         self.action_repeat = int(action_repeat)
         self.laps = checked_laps(laps)
         self.runoff = checked_runoff(runoff)
+        self.recovery = round(checked_recovery(recovery) / CONTROL_TICK)
+        if not isinstance(unstick, bool):
+            raise InvalidOption(f"unstick is {unstick!r}; expected True or False")
+        self.unstick = unstick
         self.render_mode = render_mode
         self.metadata = {
             **self.metadata,
@@ -212,10 +229,8 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         self._closed = self._race_is_over = False
 
     def __getstate__(self) -> dict[str, Any]:
-        return {
-            **self.__dict__,
-            "_viewer": None,
-        }  # pygame's surfaces cannot be pickled; a copy makes its own
+        # pygame's surfaces cannot be pickled; a copy makes its own.
+        return {**self.__dict__, "_viewer": None}
 
     @property
     def track(self) -> Track:
@@ -318,7 +333,8 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
             start = None
             self.car = self.backend.reset(self.np_random, start)
         self._controls = Controls(0.0, 0.0, 0.0)
-        self.patience = STUCK_TICKS if start is not None and start.speed > 0.0 else GRACE_TICKS
+        grace = STUCK_TICKS if start is not None and start.speed > 0.0 else GRACE_TICKS
+        self.patience = max(grace, self.recovery)
         self.standing = 0
         self._race_is_over = False
         if self.render_mode == "human":
@@ -356,6 +372,8 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         """
         self.check_ready()
         self._controls = controls_from_action(action, self.layout)
+        if self.unstick and self.car is not None and needs_freeing(self.car):
+            self._controls = Controls(*freeing_controls(self.car))
         at_once = (self._controls, self.action_repeat)
         return self.delay.hold(self._controls) if self.delay.ticks else [at_once]
 
@@ -419,9 +437,8 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         if self.car is None:
             raise EnvClosed("render before reset; call reset first")
         if self._viewer is None:
-            from sb3_torcs.rendering.viewer import (
-                Viewer,
-            )  # imported here because graphics take long to load
+            # Imported here because graphics take long to load.
+            from sb3_torcs.rendering.viewer import Viewer
 
             self._viewer = Viewer(mode=self.render_mode, fps=self.metadata["render_fps"])
         angles = self.backend.range_finder_angles
@@ -449,7 +466,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         """
         self.car, self._controls, self.standing = car, controls, standing
         if standing == 0:
-            self.patience = STUCK_TICKS
+            self.patience = max(STUCK_TICKS, self.recovery)
 
     def end_race(self) -> None:
         """Truncate the episode with the next timestep: the race that others share is over."""
@@ -457,11 +474,12 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
 
     def _end(self, car: CarState) -> str | None:
         """Return why the episode ends, or ``None`` if it goes on."""
-        reason = end_of(car, math.inf if self.laps is None else self.laps, self.runoff)
+        laps = math.inf if self.laps is None else self.laps
+        reason = end_of(car, laps, self.runoff, self.recovery)
         if reason:
             return ENDS[reason]
         if not stands(car):
-            self.standing, self.patience = 0, STUCK_TICKS
+            self.standing, self.patience = 0, max(STUCK_TICKS, self.recovery)
             return self._end_of_race()
         self.standing += self.action_repeat
         return "stuck" if self.standing > self.patience else self._end_of_race()
