@@ -455,6 +455,26 @@ def test_a_model_of_several_tracks_has_to_be_told_one():
     assert evaluate.environment_kwargs(args, record)["track"] == "forza"
 
 
+def test_a_model_of_several_cars_has_to_be_told_one():
+    record = models.TrainingRecord(env_kwargs={"car": ["baja-bug", "p406"]})
+    args = types.SimpleNamespace(laps=3, car=None)
+    with pytest.raises(InvalidOption, match=r"2 cars, baja-bug, p406; .* --car baja-bug"):
+        evaluate.environment_kwargs(args, record)
+    args.car = "p406"
+    assert evaluate.environment_kwargs(args, record)["car"] == "p406"
+
+
+@pytest.mark.parametrize(
+    "words", [("evaluate",), ("watch", "--video", "film.mp4"), ("compete",), ("optimize-lap",)]
+)
+def test_nobody_draws_the_car_of_an_agent_that_knows_many(capsys, tmp_path, monkeypatch, words):
+    monkeypatch.chdir(tmp_path)
+    status, _, err = run(capsys, words[0], "ppo-cars", "--track", "aalborg", *words[1:])
+    assert status == 2
+    assert "say which one it shall drive: --car " in err
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_the_time_limit_cuts_no_lap_of_a_car_that_does_not_count_as_standing():
     """Three laps of 2587.5 m at 5 km/h take 5589 s, and a timestep takes 0.1 s."""
     kwargs = {"track": "aalborg", "laps": 3}

@@ -48,6 +48,7 @@ __all__ = [
     "driver_record",
     "find_model",
     "load_driver",
+    "one_car",
     "one_track",
     "saved_spaces",
     "saved_timesteps",
@@ -238,6 +239,22 @@ def one_track(track: Any) -> Any:
             f"shall drive on: --track {track[0]}"
         )
     return track
+
+
+def one_car(car: Any) -> Any:
+    """
+    Make sure that there is one car, as :func:`one_track` does of the track.
+
+    :param car: of the record, or what was given instead
+    :return: the same
+    :raises InvalidOption: if it is a list
+    """
+    if isinstance(car, list):
+        raise InvalidOption(
+            f"the model was trained in {len(car)} cars, {', '.join(car)}; say which one it shall "
+            f"drive: --car {car[0]}"
+        )
+    return car
 
 
 def saved_timesteps(model: Path) -> int:

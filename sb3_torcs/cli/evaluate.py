@@ -195,7 +195,7 @@ def environment_kwargs(args: argparse.Namespace, record: TrainingRecord) -> dict
     :param record: of the training
     :return: keyword arguments of the environment
     """
-    from sb3_torcs.agents.models import one_track
+    from sb3_torcs.agents.models import one_car, one_track
     from sb3_torcs.evaluation.protocol import KEPT
 
     kwargs = record.kept(KEPT)
@@ -203,6 +203,7 @@ def environment_kwargs(args: argparse.Namespace, record: TrainingRecord) -> dict
     kwargs.update({name: value for name, value in given.items() if value is not None})
     kwargs.update(getattr(args, "env_kwargs", ()))
     one_track(kwargs.get("track"))
+    one_car(kwargs.get("car"))
     return {**kwargs, "laps": args.laps}
 
 
