@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
-from gymnasium.wrappers import OrderEnforcing, TimeLimit
+from gymnasium.wrappers import OrderEnforcing
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
@@ -17,16 +17,12 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepR
 from sb3_torcs.backends.seats import Seat, SharedRace
 from sb3_torcs.car import is_count
 from sb3_torcs.envs.batch import Batch, Timestep
+from sb3_torcs.envs.making import EnvMaker, env_makers
 from sb3_torcs.envs.racing import RacingEnv, RacingInfo
-from sb3_torcs.envs.torcs_race import make_race
 from sb3_torcs.errors import EnvClosed, InvalidOption
 from sb3_torcs.policies.mirror import check_angles, mirror_image
-from sb3_torcs.torcs.installation import find_game
-from sb3_torcs.torcs.starting_list import guests_of
 
 __all__ = ["MirrorVecEnv", "RaceInfo", "TorcsVecEnv", "glance"]
-
-EnvMaker = Callable[[], gym.Env[Any, Any]]
 
 TRUNCATED = "TimeLimit.truncated"
 NO_LIMIT = 1 << 62
@@ -125,7 +121,8 @@ class TorcsVecEnv(DummyVecEnv):
         most
     :param env_id: ``"Torcs-v0"`` or ``"TorcsLite-v0"``
     :param env_kwargs: as of ``gym.make``, the same for all races; with several agents those of
-        :func:`~sb3_torcs.envs.torcs_race.make_race`
+        :func:`~sb3_torcs.envs.torcs_race.make_race`. ``max_episode_steps`` may be a list, which
+        goes round the races: ``[450, 1400]`` lets every other race practise the start
     :raises InvalidOption: if an option has a value that is not allowed
     """
 
@@ -153,10 +150,9 @@ class TorcsVecEnv(DummyVecEnv):
                     "number of races"
                 )
             makers = list(races)
-        elif is_count(races) and (agents > 1 or _has_guests(env_id, env_kwargs)):
-            makers = _made(races, agents, env_id, env_kwargs)  # type: ignore[arg-type]
         elif is_count(races):
-            makers = [partial(_monitored, env_id, env_kwargs)] * int(races)  # type: ignore[arg-type]
+            made = env_makers(int(races), agents, env_id, env_kwargs)  # type: ignore[arg-type]
+            makers = [partial(_monitored, make) for make in made]
         else:
             raise InvalidOption(f"races is {races!r}; expected a whole number >= 1")
         super().__init__(makers)
@@ -433,30 +429,6 @@ class _Race:
         self._noted = elapsed
 
 
-def _has_guests(env_id: str, env_kwargs: dict[str, Any]) -> bool:
-    """Whether agents are among the opponents, whom only a shared race can ask."""
-    opponents = env_kwargs.get("opponents", ())
-    several = any(not isinstance(name, str) for name in opponents)
-    return env_id == "Torcs-v0" and (several or bool(guests_of(opponents, find_game())))
-
-
-def _made(races: int, agents: int, env_id: str, env_kwargs: dict[str, Any]) -> list[EnvMaker]:
-    """Make races of several agents; return a function for each environment."""
-    if env_id != "Torcs-v0":
-        raise InvalidOption(
-            f"agents is {agents}, and {env_id} has one car in each race; races are of Torcs-v0"
-        )
-    options = dict(env_kwargs)
-    steps = options.pop("max_episode_steps", gym.spec(env_id).max_episode_steps)
-    envs = [env for _ in range(races) for env in make_race(agents, **options)]
-    return [partial(_limited, env, steps) for env in envs]
-
-
-def _limited(env: RacingEnv, steps: int | None) -> gym.Env[Any, Any]:
-    limited: gym.Env[Any, Any] = env if steps in (None, -1) else TimeLimit(env, steps)
-    return Monitor(limited)
-
-
 def _shared_races(envs: Sequence[RacingEnv]) -> dict[SharedRace, list[int]]:
     """Return the races of several agents, and the indices of their environments."""
     members: dict[SharedRace, list[int]] = {}
@@ -467,5 +439,5 @@ def _shared_races(envs: Sequence[RacingEnv]) -> dict[SharedRace, list[int]]:
     return members
 
 
-def _monitored(env_id: str, env_kwargs: dict[str, Any]) -> gym.Env[Any, Any]:
-    return Monitor(gym.make(env_id, **env_kwargs))
+def _monitored(make: EnvMaker) -> gym.Env[Any, Any]:
+    return Monitor(make())

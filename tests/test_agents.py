@@ -19,6 +19,7 @@ MAX_SIZE = 400_000  # [bytes]
 SECTIONS = ("## How it was made", "## What it drives", "## Limits")
 AGENTS = models.shipped_agents()
 DRIVE = re.compile(r"\n(sb3-torcs evaluate .*)\n```\n\nLaps: ([\d., ]*) s\.")  # in a card
+RACE = re.compile(r"\n(sb3-torcs race .*) --races \d+\n```\n\nPlaces: ([\d, ]*)\.")
 LINE = re.compile(  # of the leaderboard: driver, flying lap, standing lap, how it was made
     r"^\| \[?([\w-]+).*? \| ([\d.]+) \| ([\d.]+) \|.*`(sb3-torcs .*? --track (\S+).*)` \|$", re.M
 )
@@ -70,11 +71,27 @@ def test_it_holds_only_what_drives_and_says_so(name, capsys):
 def test_it_drives_what_its_card_says(name, capsys):
     """To the digit, whatever the machine: every command of the card with the laps beneath it."""
     drives = DRIVE.findall(card_of(name))
-    assert drives
+    assert drives or RACE.search(card_of(name))
     for command, said in drives:
         assert main([*command.split()[1:], "--json"]) == 0
         (episode,) = json.loads(capsys.readouterr().out)["episodes"]
         assert said == ", ".join(f"{seconds:.3f}" for seconds in episode["lap_times"]), command
+
+
+@pytest.mark.usefixtures("game")
+@pytest.mark.parametrize("name", [name for name in AGENTS if RACE.search(card_of(name))])
+def test_it_races_as_its_card_says(name, capsys):
+    """The first two races of each command."""
+    for command, said in RACE.findall(card_of(name)):
+        assert main([*command.split()[1:], "--races", "2", "--json"]) == 0
+        races = json.loads(capsys.readouterr().out)["races"]
+        places = [
+            standing["place"]
+            for race in races
+            for standing in race["standings"]
+            if standing["driver"] == name
+        ]
+        assert places == [int(place) for place in said.split(", ")[:2]], command
 
 
 def test_the_leaderboard_says_what_cards_and_reference_laps_say():

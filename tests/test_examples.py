@@ -60,7 +60,7 @@ def test_broken_tracks_are_refused_or_drive_what_is_written(monkeypatch, capsys,
 
 def test_a_racer_is_trained_alone_and_against_robots(monkeypatch, capsys, tmp_path, game):
     budget = [f"--{stage}=1" for stage in ("alone", "robots")]
-    run(monkeypatch, "train_racer.py", *budget, "--cars", "16", "--folder", str(tmp_path))
+    run(monkeypatch, "train_racer.py", *budget, "--races", "2", "--folder", str(tmp_path))
     assert f"{tmp_path}/model.zip" in capsys.readouterr().out
     (racer,) = find_entrants([str(tmp_path / "model.zip")], game)
     assert racer.name == "model"

@@ -387,6 +387,7 @@ class Own(TorcsLiteEnv):
             "wrapped in RecordEpisodeStatistics.* use DummyVecEnv",
         ),
         ({"races": [Own]}, "Own has a step of its own"),
+        ({"races": 2, "max_episode_steps": []}, "max_episode_steps is an empty list"),
         (
             {"races": [partial(gym.make, LITE), partial(gym.make, LITE, action="pedal")]},
             "read actions in 2 ways",
@@ -396,6 +397,16 @@ class Own(TorcsLiteEnv):
 def test_a_wrong_option_is_told(options, message):
     with pytest.raises(InvalidOption, match=message):
         TorcsVecEnv(**{"env_id": LITE, **options})
+
+
+@pytest.mark.parametrize("agents", [1, 2])
+def test_a_list_of_time_limits_goes_round_the_races(make, game, agents):
+    envs = make(3, agents=agents, max_episode_steps=[2, 4])
+    envs.reset()
+    ends = [envs.step(np.stack([GAS] * envs.num_envs))[2] for _ in range(4)]
+    first, second, third = ([bool(end[race * agents]) for end in ends] for race in range(3))
+    assert first == third == [False, True, False, True]
+    assert second == [False, False, False, True]
 
 
 @pytest.mark.usefixtures("game")

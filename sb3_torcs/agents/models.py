@@ -48,8 +48,7 @@ __all__ = [
     "driver_record",
     "find_model",
     "load_driver",
-    "one_car",
-    "one_track",
+    "one_of",
     "saved_spaces",
     "saved_timesteps",
     "shipped_agents",
@@ -225,36 +224,21 @@ def driver_name(driver: str | Path) -> str:
     return given.absolute().name.removesuffix(".zip").removesuffix(".npz")
 
 
-def one_track(track: Any) -> Any:
+def one_of(option: str, choice: Any) -> Any:
     """
-    Make sure that there is one track: a training may have had several.
+    Make sure that there is one track, or one car: a training may have had several.
 
-    :param track: of the record, or what was given instead
+    :param option: ``"track"`` or ``"car"``
+    :param choice: of the record, or what was given instead
     :return: the same
     :raises InvalidOption: if it is a list
     """
-    if isinstance(track, list):
+    if isinstance(choice, list):
         raise InvalidOption(
-            f"the model was trained on {len(track)} tracks, {', '.join(track)}; say which one it "
-            f"shall drive on: --track {track[0]}"
+            f"the model was trained with {len(choice)} {option}s, {', '.join(choice)}; say which "
+            f"one it shall drive: --{option} {choice[0]}"
         )
-    return track
-
-
-def one_car(car: Any) -> Any:
-    """
-    Make sure that there is one car, as :func:`one_track` does of the track.
-
-    :param car: of the record, or what was given instead
-    :return: the same
-    :raises InvalidOption: if it is a list
-    """
-    if isinstance(car, list):
-        raise InvalidOption(
-            f"the model was trained in {len(car)} cars, {', '.join(car)}; say which one it shall "
-            f"drive: --car {car[0]}"
-        )
-    return car
+    return choice
 
 
 def saved_timesteps(model: Path) -> int:

@@ -67,15 +67,15 @@ def run(args: argparse.Namespace) -> int:
     with quiet_output(args.json):  # said first, because loading takes seconds
         print(f"{args.model} is being loaded for the race at {where}", flush=True)
 
-    from sb3_torcs.agents.models import driver_name, one_car, one_track
+    from sb3_torcs.agents.models import driver_name, one_of
     from sb3_torcs.agents.remote import Agent
 
     record = told_record(args.model)
     settings = record.kept(KEPT)
     given = {"track": args.track, "car": args.car, "host": args.host, "port": args.port}
     settings |= {name: value for name, value in given.items() if value is not None}
-    one_track(settings.get("track"))
-    one_car(settings.get("car"))
+    one_of("track", settings.get("track"))
+    one_of("car", settings.get("car"))
     with quiet_output(args.json):
         name = args.name or driver_name(args.model)
         agent = Agent(args.model, settings, args.algo, args.trust, name)

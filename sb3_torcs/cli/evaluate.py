@@ -195,15 +195,15 @@ def environment_kwargs(args: argparse.Namespace, record: TrainingRecord) -> dict
     :param record: of the training
     :return: keyword arguments of the environment
     """
-    from sb3_torcs.agents.models import one_car, one_track
+    from sb3_torcs.agents.models import one_of
     from sb3_torcs.evaluation.protocol import KEPT
 
     kwargs = record.kept(KEPT)
     given = {name: getattr(args, name, None) for name in KEPT}
     kwargs.update({name: value for name, value in given.items() if value is not None})
     kwargs.update(getattr(args, "env_kwargs", ()))
-    one_track(kwargs.get("track"))
-    one_car(kwargs.get("car"))
+    one_of("track", kwargs.get("track"))
+    one_of("car", kwargs.get("car"))
     return {**kwargs, "laps": args.laps}
 
 

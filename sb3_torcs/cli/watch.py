@@ -130,7 +130,7 @@ def _shows(game: Game, names: Sequence[str], args: argparse.Namespace) -> list[S
     :param names: of models or robots
     :param args: from the command line
     """
-    from sb3_torcs.agents.models import TrainingRecord, one_car, one_track
+    from sb3_torcs.agents.models import TrainingRecord, one_of
     from sb3_torcs.errors import InvalidOption
     from sb3_torcs.evaluation.watching import Show
 
@@ -145,13 +145,13 @@ def _shows(game: Game, names: Sequence[str], args: argparse.Namespace) -> list[S
         for name, robot in zip(names, robots, strict=True)
     ]
     trained = [r.env_kwargs["track"] for r in records if "track" in r.env_kwargs]
-    track = one_track(args.track or next(iter(trained), "aalborg"))
+    track = one_of("track", args.track or next(iter(trained), "aalborg"))
     words = args.robots.split(",") if args.robots else []
     opponents = [game.parse_robot(word) for word in words]
     own = {} if args.car is None else {"car": args.car}
     settings = [{**record.kept(KEPT), **own} for record in records]
     for kept in settings:
-        one_car(kept.get("car"))
+        one_of("car", kept.get("car"))
     return [
         Show(game, track, robot, name, kept, opponents, args.laps, args.trust)
         for name, robot, kept in zip(names, robots, settings, strict=True)

@@ -11,7 +11,7 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sb3_torcs.agents.models import agent_record, driver_name, load_driver, one_track
+from sb3_torcs.agents.models import agent_record, driver_name, load_driver, one_of
 from sb3_torcs.agents.robots import drive_log
 from sb3_torcs.agents.rollout import drive
 from sb3_torcs.car import checked_laps
@@ -170,7 +170,7 @@ def _trained_on(drivers: Sequence[str | Path]) -> str:
         if _robot(str(driver)) is None:
             track = agent_record(driver, _game()).env_kwargs.get("track")
             if track is not None:
-                return str(one_track(track))
+                return str(one_of("track", track))
     return DEFAULT_TRACK
 
 

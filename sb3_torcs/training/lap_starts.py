@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 
-from sb3_torcs.agents.models import driver_record, load_driver, one_car, one_track
+from sb3_torcs.agents.models import driver_record, load_driver, one_of
 from sb3_torcs.agents.rollout import drive
 from sb3_torcs.agents.scripted import SCRIPTED
 from sb3_torcs.agents.wrapping import wrapped
@@ -50,8 +50,8 @@ def ghost_environment(agent: str, track: str | None, car: str | None) -> dict[st
     kwargs = {**usual, **driver_record(agent).kept(KEPT), "laps": RACE_LAPS}
     given = {"track": track, "car": car}
     kwargs.update({name: value for name, value in given.items() if value is not None})
-    one_track(kwargs["track"])
-    one_car(kwargs["car"])
+    one_of("track", kwargs["track"])
+    one_of("car", kwargs["car"])
     if kwargs["action"] == "manual":  # the search leaves the gears to the gearbox
         kwargs["action"] = "pedals"
     return kwargs

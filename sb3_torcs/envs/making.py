@@ -1,0 +1,69 @@
+"""How the races of a vector environment are made."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+from gymnasium.wrappers import TimeLimit
+
+from sb3_torcs.envs.racing import RacingEnv
+from sb3_torcs.envs.torcs_race import make_race
+from sb3_torcs.errors import InvalidOption
+from sb3_torcs.torcs.installation import find_game
+from sb3_torcs.torcs.starting_list import guests_of
+
+__all__ = ["EnvMaker", "env_makers"]
+
+EnvMaker = Callable[[], gym.Env[Any, Any]]
+
+
+def env_makers(races: int, agents: int, env_id: str, env_kwargs: dict[str, Any]) -> list[EnvMaker]:
+    """
+    Return functions that make the environments of some races, one for each agent.
+
+    :param races: their number
+    :param agents: in each
+    :param env_id: ``"Torcs-v0"`` or ``"TorcsLite-v0"``
+    :param env_kwargs: of all races; ``max_episode_steps`` may be a list, which goes round
+    :raises InvalidOption: if there are no such races
+    """
+    if agents > 1 or _has_guests(env_id, env_kwargs):
+        return _shared(races, agents, env_id, env_kwargs)
+    limits = _limits(env_kwargs.get("max_episode_steps"), races)
+    kwargs = [{**env_kwargs, "max_episode_steps": limit} for limit in limits]
+    return [partial(gym.make, env_id, **each) for each in kwargs]
+
+
+def _has_guests(env_id: str, env_kwargs: dict[str, Any]) -> bool:
+    """Whether agents are among the opponents, whom only a shared race can ask."""
+    opponents = env_kwargs.get("opponents", ())
+    several = any(not isinstance(name, str) for name in opponents)
+    return env_id == "Torcs-v0" and (several or bool(guests_of(opponents, find_game())))
+
+
+def _shared(races: int, agents: int, env_id: str, env_kwargs: dict[str, Any]) -> list[EnvMaker]:
+    """Make races of several agents; return a function for each environment."""
+    if env_id != "Torcs-v0":
+        raise InvalidOption(
+            f"agents is {agents}, and {env_id} has one car in each race; races are of Torcs-v0"
+        )
+    options = dict(env_kwargs)
+    steps = options.pop("max_episode_steps", gym.spec(env_id).max_episode_steps)
+    limits = _limits(steps, races)
+    envs = [(env, limit) for limit in limits for env in make_race(agents, **options)]
+    return [partial(_limited, env, limit) for env, limit in envs]
+
+
+def _limits(steps: Any, races: int) -> list[Any]:
+    """Return the time limit of each race."""
+    several = steps if isinstance(steps, (list, tuple)) else [steps]
+    if not several:
+        raise InvalidOption("max_episode_steps is an empty list; give a number, or some of them")
+    return [several[race % len(several)] for race in range(races)]
+
+
+def _limited(env: RacingEnv, steps: int | None) -> gym.Env[Any, Any]:
+    return env if steps in (None, -1) else TimeLimit(env, steps)
