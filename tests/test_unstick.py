@@ -53,6 +53,15 @@ def test_a_stuck_car_goes_where_its_nose_or_its_tail_has_room(oval, state, steer
     assert controls.throttle > 0.0
 
 
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_car_that_stands_beside_the_road_comes_back_to_it(oval, side):
+    """Which is 10 m wide: it turns to the axis, and no further than it needs."""
+    along = held(oval, speed_x=0.0, distance_from_axis=side * 7.0)
+    assert along == Controls(-side * 0.7, 0.6, 0.0, 1)
+    slanting = held(oval, speed_x=0.0, distance_from_axis=side * 7.0, heading_error=side * 0.35)
+    assert slanting.steering == 0.0
+
+
 @pytest.mark.parametrize(
     "state",
     [

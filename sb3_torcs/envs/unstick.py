@@ -1,4 +1,4 @@
-"""How a car comes free that stands across the road, as the game's robots do it."""
+"""How a stuck car comes free, as the game's robots do it."""
 
 from __future__ import annotations
 
@@ -6,41 +6,48 @@ import math
 
 from sb3_torcs.car import CarState
 
-__all__ = ["TURNED", "freeing_controls", "needs_freeing"]
+__all__ = ["freeing_controls", "needs_freeing"]
 
 TURNED = math.pi / 6.0  # [rad] to the road from which a car stands across it
-SLOW = 5.0  # [m/s] below which a car that does is stuck
+SLOW = 5.0  # [m/s] below which a car is stuck that stands across the road, or beside it
 CREEP = 4.0  # [m/s] at most, forward and backward
 CREEP_THROTTLE, STOP_BRAKE = 0.6, 0.8
 # How far beyond the axis a car goes on in its direction, so that it does not change it all the
 # time: share of half the road.
 OVER_AXIS = 0.2
+BACK = 0.35  # [rad] at which a car comes back from beside the road
+BACK_STEERING = 2.0  # [-] per radian
 
 
 def needs_freeing(car: CarState) -> bool:
     """
-    Check whether a car is stuck: slow, or in reverse, and across the road.
+    Check whether a car is stuck: slow, or in reverse, and across the road or beside it.
 
     Compiled code calls it, too.
 
     :param car: at the begin of a timestep
     """
-    if abs(car.heading_error) < TURNED:
+    if abs(car.heading_error) < TURNED and abs(car.track_position) <= 1.0:
         return False
     return car.gear < 0 or math.hypot(car.speed_x, car.speed_y) < SLOW
 
 
 def freeing_controls(car: CarState) -> tuple[float, float, float, int]:
     """
-    Turn a car towards the road, forward while its nose points to the axis and else backward.
+    Turn a car towards the road, forward while its nose points to the axis and else backward; from
+    beside the road drive back to it.
 
-    It is the rule of the driver that comes with the Simulated Car Racing championship's software
-    (Loiacono, Cardamone and Lanzi, "Simulated Car Racing Championship: Competition Software
-    Manual", 2013, arXiv:1304.1672), but slow. Compiled code calls it, too.
+    The first is the rule of the driver that comes with the Simulated Car Racing championship's
+    software (Loiacono, Cardamone and Lanzi, "Simulated Car Racing Championship: Competition
+    Software Manual", 2013, arXiv:1304.1672), but slow. Compiled code calls it, too.
 
     :param car: that :func:`needs_freeing`
     :return: steering, throttle, brake and gear as of :class:`~sb3_torcs.car.Controls`
     """
+    if abs(car.heading_error) < TURNED:
+        wanted = BACK if car.track_position > 0.0 else -BACK
+        steering = BACK_STEERING * (car.heading_error - wanted)
+        return min(max(steering, -1.0), 1.0), CREEP_THROTTLE, 0.0, 1
     side = 1.0 if car.heading_error > 0.0 else -1.0
     forward = side * car.track_position > (OVER_AXIS if car.gear < 0 else -OVER_AXIS)
     way = 1.0 if forward else -1.0
