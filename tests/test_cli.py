@@ -465,7 +465,7 @@ def test_a_model_of_several_cars_has_to_be_told_one():
 
 
 @pytest.mark.parametrize(
-    "words", [("evaluate",), ("watch", "--video", "film.mp4"), ("compete",), ("optimize-lap",)]
+    "words", [("evaluate",), ("watch", "--video", "lap.mp4"), ("compete",), ("optimize-lap",)]
 )
 def test_nobody_draws_the_car_of_an_agent_that_knows_many(capsys, tmp_path, monkeypatch, words):
     monkeypatch.chdir(tmp_path)
