@@ -8,7 +8,7 @@ import math
 import gymnasium as gym
 import numpy as np
 import pytest
-from vectors import assert_they_see_the_same
+from vectors import assert_they_see_the_same, both_kinds
 
 import sb3_torcs  # noqa: F401  # registers the ids
 from sb3_torcs.envs.torcs_race import make_race
@@ -176,7 +176,8 @@ def test_each_episode_shows_the_car_that_it_draws(game):
 def test_races_driven_at_once_see_what_single_ones_see():
     """To the bit, across the ends of episodes, each with a car of its own."""
     options = {"car": CARS, "start": "random", "max_episode_steps": 12, "sensors": SENSORS}
-    assert_they_see_the_same("Torcs-v0", **options)
+    with both_kinds("Torcs-v0", **options) as (ours, theirs):
+        assert_they_see_the_same(ours, theirs)
 
 
 def test_agents_of_one_race_see_their_car(game):

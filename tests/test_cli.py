@@ -446,22 +446,17 @@ def test_the_environment_is_that_of_the_training_unless_the_words_say_otherwise(
     assert evaluate.environment_kwargs(args, record) == {**kept, "track": "aalborg", "laps": 3}
 
 
-def test_a_model_of_several_tracks_has_to_be_told_one():
-    record = models.TrainingRecord(env_kwargs={"track": ["alpine-1", "forza"]})
-    args = types.SimpleNamespace(laps=3, track=None)
-    with pytest.raises(InvalidOption, match=r"2 tracks, alpine-1, forza; .* --track alpine-1"):
+@pytest.mark.parametrize(
+    ("option", "several"), [("track", ["alpine-1", "forza"]), ("car", ["baja-bug", "p406"])]
+)
+def test_a_model_of_several_tracks_or_cars_has_to_be_told_one(option, several):
+    record = models.TrainingRecord(env_kwargs={option: several})
+    args = types.SimpleNamespace(laps=3)
+    told = rf"2 {option}s, {', '.join(several)}; .* --{option} {several[0]}"
+    with pytest.raises(InvalidOption, match=told):
         evaluate.environment_kwargs(args, record)
-    args.track = "forza"
-    assert evaluate.environment_kwargs(args, record)["track"] == "forza"
-
-
-def test_a_model_of_several_cars_has_to_be_told_one():
-    record = models.TrainingRecord(env_kwargs={"car": ["baja-bug", "p406"]})
-    args = types.SimpleNamespace(laps=3, car=None)
-    with pytest.raises(InvalidOption, match=r"2 cars, baja-bug, p406; .* --car baja-bug"):
-        evaluate.environment_kwargs(args, record)
-    args.car = "p406"
-    assert evaluate.environment_kwargs(args, record)["car"] == "p406"
+    setattr(args, option, several[1])
+    assert evaluate.environment_kwargs(args, record)[option] == several[1]
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
+from vectors import assert_they_see_the_same, both_kinds
 
 import sb3_torcs  # noqa: F401  # registers the ids
 from sb3_torcs.callbacks import ConditionsCallback
@@ -222,19 +223,9 @@ def test_a_copy_and_a_restored_race_have_the_conditions_of_their_episode():
 def test_races_driven_at_once_have_their_own_grip(env_id):
     options = {"grip": [0.6, 1.2], "start": "random", "max_episode_steps": 9}
     options["track"] = ["aalborg", "g-track-1"]
-    ours = TorcsVecEnv(3, env_id=env_id, **options)
-    theirs = DummyVecEnv([lambda: Monitor(gym.make(env_id, **options))] * 3)
-    for envs in (ours, theirs):
-        envs.seed(2)
-    theirs.action_space.seed(2)
-    assert ours.reset().tobytes() == theirs.reset().tobytes()
-    for step in range(30):
-        actions = np.array([theirs.action_space.sample() for _ in range(3)])
-        for one, other in zip(ours.step(actions)[:3], theirs.step(actions)[:3], strict=True):
-            assert one.tobytes() == other.tobytes(), step
-    assert len({drawn.grip for drawn in ours.get_attr("conditions")}) == 3
-    ours.close()
-    theirs.close()
+    with both_kinds(env_id, seed=2, **options) as (ours, theirs):
+        assert_they_see_the_same(ours, theirs, steps=30)
+        assert len({drawn.grip for drawn in ours.get_attr("conditions")}) == 3
 
 
 @pytest.mark.parametrize("choice", [0, 0.4, 2.1, "1", (1.1, 0.9), (1.0,), None])

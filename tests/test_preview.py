@@ -12,7 +12,7 @@ import torch as th
 from conftest import ScriptedBackend, car_state
 from gymnasium.spaces import Box
 from stable_baselines3 import DDPG
-from vectors import assert_they_see_the_same
+from vectors import assert_they_see_the_same, both_kinds
 
 import sb3_torcs  # noqa: F401  # registers the ids
 from sb3_torcs.agents.scripted import ScriptedDriver
@@ -178,7 +178,8 @@ def test_races_driven_at_once_see_what_single_ones_see(env_id, track):
     if env_id == "Torcs-v0" and track == "random":
         track = ["wheel-1", "e-track-5"]
     options = {"track": track, "start": "random", "max_episode_steps": 12, "sensors": BOTH}
-    assert_they_see_the_same(env_id, **options)
+    with both_kinds(env_id, **options) as (ours, theirs):
+        assert_they_see_the_same(ours, theirs)
 
 
 @pytest.mark.usefixtures("game")

@@ -62,10 +62,7 @@ def test_a_car_may_be_beside_the_road_where_there_is_runoff(oval, axis, end):
     assert info["off_track"]
 
 
-BACK = 3.0  # [rad]
-
-
-@pytest.mark.parametrize("state", [{"heading_error": BACK}, {"speed_x": 1.0}])
+@pytest.mark.parametrize("state", [{"heading_error": 3.0}, {"speed_x": 1.0}])
 def test_a_car_has_time_to_recover_where_it_is_given(oval, state):
     """Of 4 s, to turn round or to set off, from the last timestep with headway on."""
     env = RacingEnv(ScriptedBackend(oval, {"speed_x": 20.0}, *[state] * 50), recovery=4.0)

@@ -1,4 +1,4 @@
-"""Cars that are stuck across the road free themselves, in every way to drive them."""
+"""Cars that are stuck across the road or beside it free themselves, however they are driven."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from conftest import ScriptedBackend
+from vectors import assert_they_see_the_same, both_kinds
 
 from sb3_torcs.car import Controls
 from sb3_torcs.envs.racing import RacingEnv
@@ -29,7 +30,7 @@ def make(request):
 
 def held(oval, **state):
     """What a car holds in the timestep after the one that ends with a state."""
-    env = RacingEnv(ScriptedBackend(oval, {**state}, {}), recovery=10.0, unstick=True)
+    env = RacingEnv(ScriptedBackend(oval, state, {}), recovery=10.0, unstick=True)
     env.reset(seed=0)
     env.step(ASKED)
     env.step(ASKED)
@@ -98,6 +99,18 @@ def test_it_comes_free_and_points_along_the_road(make, track, heading):
         else:
             pytest.fail(f"from {place} it still points {car.heading_error:.1f} rad away")
     env.close()
+
+
+@pytest.mark.parametrize("env_id", ["TorcsLite-v0", "Torcs-v0"])
+def test_races_driven_at_once_free_their_cars_as_single_ones_do(request, env_id):
+    if env_id == "Torcs-v0":
+        request.getfixturevalue("game")
+    with both_kinds(env_id, **FREELY) as (ours, theirs):
+        for envs in (ours, theirs):
+            envs.set_options({"distance": 330.0, "heading_error": 2.4})
+        assert_they_see_the_same(ours, theirs)
+        gears = {controls.gear for controls in theirs.get_attr("controls")}
+        assert gears <= {-1, 1}  # not None, which leaves it to the gearbox
 
 
 def test_who_has_not_asked_for_it_drives_on(make):
