@@ -22,7 +22,7 @@ from sb3_torcs.sensors import feature_slices
 from sb3_torcs.vec_env import TorcsVecEnv
 
 SENSORS = ("base", "line", "rivals")
-# The fields of robots, of which each race draws one. All but two drive the agents' car.
+# The fields of robots, of which each race draws one. Those with a number drive another car.
 FIELDS = (
     ("berniw", "bt", "inferno", "lliaw", "olethros", "tita", "inferno:4"),
     ("lliaw", "olethros", "tita", "inferno:4", "bt", "tita:4", "berniw"),
@@ -73,7 +73,7 @@ def callbacks(
 ) -> list[BaseCallback]:
     """Save models with what `sb3-torcs race` has to know of their training."""
     asked = recipe("ppo", "Torcs-v0", {"env_kwargs": env_kwargs})
-    every = CheckpointCallback(16 * 256, str(args.folder), name_prefix=stage)
+    every = CheckpointCallback(4096, str(args.folder), name_prefix=stage)  # timesteps of each car
     learning = [LeanUpdatesCallback(), AdaptiveLearningRateCallback(kl=kl, last_kl=0.002)]
     return [RecordCallback(asked), *starts, *learning, every]
 

@@ -158,8 +158,8 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
     :param runoff: how far the mass centre may be beside the road before the episode ends [m]
     :param recovery: how long a car may stand, or face backwards, before the episode ends [s]; 0
         ends it after 1.5 s of standing, and at once if it faces backwards
-    :param unstick: whether a car that is stuck across the road frees itself; actions count for
-        nothing meanwhile
+    :param unstick: whether a car that is stuck across the road or beside it frees itself; actions
+        count for nothing meanwhile
     :param delay: control ticks by which controls arrive late; or a pair, between which each
         episode draws
     :param grip: factor on the friction of all ground; or a pair, as for the delay

@@ -72,8 +72,8 @@ class TorcsEnv(RacingEnv):
     :param runoff: how far the mass centre may be beside the road before the episode ends [m]
     :param recovery: how long a car may stand, or face backwards, before the episode ends [s]; 0
         ends it after 1.5 s of standing, and at once if it faces backwards
-    :param unstick: whether a car that is stuck across the road frees itself, as the game's robots
-        do; actions count for nothing meanwhile
+    :param unstick: whether a car that is stuck across the road or beside it frees itself, as the
+        game's robots do; actions count for nothing meanwhile
     :param delay: control ticks of 0.02 s from an observation until the controls that answer it
         arrive; or a pair, e.g. ``(0, 5)``, between which each episode draws
     :param grip: factor on the friction of all ground; or a pair, e.g. ``(0.8, 1.1)``, between which

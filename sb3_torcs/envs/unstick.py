@@ -37,7 +37,7 @@ def freeing_controls(car: CarState) -> tuple[float, float, float, int]:
     Turn a car towards the road, forward while its nose points to the axis and else backward; from
     beside the road drive back to it.
 
-    The first is the rule of the driver that comes with the Simulated Car Racing championship's
+    To turn is the rule of the driver that comes with the Simulated Car Racing championship's
     software (Loiacono, Cardamone and Lanzi, "Simulated Car Racing Championship: Competition
     Software Manual", 2013, arXiv:1304.1672), but slow. Compiled code calls it, too.
 
