@@ -20,8 +20,8 @@ import pytest
 PACKAGE = Path(__file__).parent.parent / "sb3_torcs"
 FILES = sorted(PACKAGE.rglob("*.py"))
 
-MAX_MODULES = 14  # at the top of the package
-MAX_FOLDERS = 16  # of Python there, races of many drivers the last; beside them native/, the C++
+MAX_MODULES = 13  # at the top of the package
+MAX_FOLDERS = 17  # of Python there; beside them native/, the C++
 MAX_CODE_LINES = 300
 LONGER_FILES = {
     "backends/lite/physics.py": 320,  # one physics step is one piece
