@@ -180,6 +180,28 @@ class TestInstallation:
         assert "start another process" in message
 
 
+# Robots that plan by splines seek an interval by halving. With two knots it never ends for a number
+# before the first.
+SPLINES = """
+static void nothing() {{}}
+double spline(int dim, double z, const double* x, const double* y, const double* slopes) {{
+    int a = 0, b = dim - 1, i;
+    do {{
+        i = (a + b) / 2;
+        if (x[i] <= z) a = i; else b = i;
+    }} while (a + 1 != b);
+    return y[a];
+}}
+{family}
+static int init(int, void* to) {{
+    const double x[] = {{1.0, 2.0}}, y[] = {{5.0, 8.0}}, slopes[] = {{3.0, 3.0}};
+    void** table = (void**)to;
+    for (int i = 0; i < 6; i++) table[i] = (void*)nothing;
+    return spline(2, {at}, x, y, slopes) == {value} ? 0 : -1;
+}}
+"""
+FAMILY = "void parametricslopesp(int, const double*, const double*, double*, double*, double*) {}"
+
 # Modules that any version could have: they fill the tables that the game asks for.
 MODULE = """
 #include <cstdlib>
@@ -491,6 +513,19 @@ class TestRobots:
         other = (libraries / "drivers/berniw/berniw.so").read_bytes()
         replace(libraries / "drivers/inferno/inferno.so", other)
         assert attempt(root, entries=INFERNO)[0] in ("LayoutMismatch", "RobotUnavailable")
+
+    @pytest.mark.parametrize(
+        ("family", "at", "value"),
+        [(FAMILY, 0.0, 2.0), (FAMILY, 1.5, 6.5), (FAMILY, 3.0, 11.0), ("", 1.5, 5.0)],
+        ids=["before", "between", "behind", "another family's"],
+    )
+    def test_a_spline_before_whose_begin_the_game_hangs(self, copy, family, at, value):
+        """The robot's own one returns the first value; only those of the family are replaced."""
+        root, _, libraries = copy
+        body = SPLINES.format(family=family, at=at, value=value)
+        source = MODULE.format(body=body, name="inferno").replace("index = 0", "index = 3")
+        compiled(source, libraries / "drivers/inferno/inferno.so")
+        assert attempt(root, entries=INFERNO) == ("nothing", "")
 
     def test_a_failure_leaves_the_others_as_they_were(self):
         code = BEGIN + (

@@ -98,6 +98,26 @@ void seed_random(unsigned seed) {
     if (current) srandom_r(seed, &current->random->state);
 }
 
+// Names of functions of the robots that plan by splines, as the compiler writes them.
+const char* const SPLINE = "_Z6splineidPKdS0_S0_";
+const char* const SPLINE_FAMILY = "_Z17parametricslopespiPKdS0_PdS1_S1_";
+
+// Some robots (berniw, inferno, lliaw, tita) plan how to pass by splines. They seek the interval of
+// a number by halving, which never ends for one before the first of two knots: the game hangs. Here
+// the only interval is the answer. For all other numbers this is what the robots compute, to the
+// bit.
+double spline(int knots, double at, const double* x, const double* y, const double* slopes) {
+    int i = 0, last = knots - 1;
+    while (i + 1 < last) {
+        const int middle = (i + last) / 2;
+        (x[middle] <= at ? i : last) = middle;
+    }
+    const double width = x[i + 1] - x[i], part = (at - x[i]) / width, rise = y[i + 1] - y[i];
+    const double bend = rise - width * slopes[i];
+    const double change = width * slopes[i + 1] - rise - bend;
+    return y[i] + (rise + (bend + change * part) * (part - 1.0)) * part;
+}
+
 // One robot stops planning after a time by the clock. With a clock that stands still, it plans to
 // the end on every machine.
 long no_time_passes() { return 0; }
@@ -505,13 +525,17 @@ void Library::redirect_imports(bool race_memory) const {
         }
         return nullptr;
     };
+    // A robot of another family may have a spline that is another function.
+    const bool has_splines = find(SPLINE) && find(SPLINE_FAMILY);
     const Linked linked(handle_);
     for (const Relocations& table : {linked.data, linked.calls}) {
         for (const ElfW(Rela) & relocation : table) {
             const ElfW(Sym) & symbol = linked.symbol(relocation);
-            if (symbol.st_name == 0 || symbol.st_shndx != SHN_UNDEF) continue;
-            if (void* target = replacement(linked.names + symbol.st_name))
-                linked.write(relocation, target);
+            if (symbol.st_name == 0) continue;
+            const std::string name = linked.names + symbol.st_name;
+            if (has_splines && name == SPLINE) linked.write(relocation, address(spline));
+            if (symbol.st_shndx != SHN_UNDEF) continue;
+            if (void* target = replacement(name)) linked.write(relocation, target);
         }
     }
 }
