@@ -13,6 +13,7 @@ from typing import Literal
 
 from sb3_torcs.car import CAR_WIDTH, FIRST_RIVAL, RIVALS, CarState, Controls, is_number
 from sb3_torcs.errors import InvalidOption, UnknownRewardTerm, near_miss
+from sb3_torcs.rivals import NEARBY
 
 __all__ = ["CRASHES", "PRESETS", "TERMS", "Reward", "RewardChoice", "RewardName", "safe_speed"]
 
@@ -115,6 +116,18 @@ def closing(before: CarState, after: CarState, controls: Controls) -> float:
     return worst
 
 
+def passing(before: CarState, after: CarState, controls: Controls) -> float:
+    """Metres per second gained on each of the nearest cars [m/s], full beside it, none from 80 m.
+
+    So it is earned before a place is won, and after it (Wurman et al., Nature 602, 2022).
+    """
+    gained = 0.0
+    rivals = after.race[FIRST_RIVAL:]
+    for i in range(RIVALS):
+        gained -= max(1.0 - abs(rivals[i]) / NEARBY, 0.0) * rivals[2 * RIVALS + i]
+    return gained
+
+
 def off_line(before: CarState, after: CarState, controls: Controls) -> float:
     """Speed × how far the car's outer side is over the edge of the road [m²/s]."""
     over = abs(after.distance_from_axis) + 0.5 * (CAR_WIDTH - after.track_width)
@@ -133,7 +146,7 @@ TERMS: dict[str, Term] = {
     term.__name__: term
     for term in (
         speed_along, speed_across, speed_off_axis, progress, time, damage, pedals, overspeed,
-        places, gap, contact, fault, closing, off_line, leaving,
+        places, gap, contact, fault, closing, passing, off_line, leaving,
     )
 }  # fmt: skip
 

@@ -25,6 +25,7 @@ from numba.extending import overload
 
 from sb3_torcs.car import RIVALS, CarState, FloatArray
 from sb3_torcs.errors import InvalidOption
+from sb3_torcs.rivals import see_rivals
 from sb3_torcs.tracks.profile import INTERVALS, QUANTITIES, RoadProfile, look_ahead, speed_margins
 from sb3_torcs.tracks.racing_line import LINE_PLACES, look_along, racing_line
 
@@ -121,16 +122,18 @@ RIVAL_ROWS = (
     Sensor("rivals_across", "", RIVALS, "-", -1.0, 1.0, 1.0, "opposite"),
     Sensor("rivals_speed_along", "", RIVALS, "m/s", -60.0, 60.0, 1.0 / 10.0),
     Sensor("rivals_speed_across", "", RIVALS, "m/s", -30.0, 30.0, 1.0 / 10.0, "opposite"),
-    Sensor("rivals_length", "", RIVALS, "m", 0.0, 10.0, 1.0 / 10.0),
-    Sensor("rivals_width", "", RIVALS, "m", 0.0, 5.0, 1.0 / 5.0),
+    Sensor("rivals_urgency", "", RIVALS, "-", 0.0, 2.0, 1.0),
+    Sensor("rivals_beside", "", RIVALS, "-", -1.0, 1.0, 1.0, "opposite"),
 )
 """The cars that are nearest along the road, the nearest first: where they are against this one, how
-much faster, and how large. Who is not there is 200 m ahead and has no size.
+much faster, how urgent it is to brake for them, and how close they are beside.
 
 A distance d along the road is shown as d / (10 m + |d|), one across as d / (3 m + |d|), so that a
-metre counts most where cars are close.
+metre counts most where cars are close. These and the speeds fade with the distance along the road,
+to 0 at 80 m. So nothing jumps when a car comes near, and who is alone sees zeros. The urgency is 1
+at the speed from which 15 m/s² avoid a car ahead that goes on as it does, and 0 at 20 m/s less. A
+car beside is seen as 1, or -1 to the right, where it touches, and as 0 from two metres.
 """
-NEAR = np.repeat([10.0, 3.0], RIVALS)  # [m] seen as 0.5
 
 RACE = (
     Sensor("race_position", "racePos", 1, "-", 1.0, 20.0, 1.0 / 20.0),
@@ -178,10 +181,8 @@ _PARTS = dict(zip(GROUPS, map(slice, (0, *_ENDS), _ENDS), strict=True))
 
 def _spread(column: str) -> FloatArray:
     """One number per element of an observation with all groups, from a column of the table."""
-    return np.repeat(
-        [float(getattr(sensor, column)) for sensor in _TABLE],
-        [sensor.size for sensor in _TABLE],
-    )
+    values = [float(getattr(sensor, column)) for sensor in _TABLE]
+    return np.repeat(values, [sensor.size for sensor in _TABLE])
 
 
 _SCALE = _spread("scale")
@@ -387,9 +388,7 @@ def _write_opponents(_world: Any, car: CarState, numbers: npt.NDArray[np.float32
 
 
 def _write_rivals(_world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> None:
-    values = car.race[-len(numbers) :].copy()
-    values[: len(NEAR)] /= NEAR + np.abs(values[: len(NEAR)])
-    _scale_into(values, _PARTS["rivals"].start, numbers)
+    _scale_into(see_rivals(car.race[-len(numbers) :]), _PARTS["rivals"].start, numbers)
 
 
 def _write_race(_world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> None:

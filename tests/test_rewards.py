@@ -106,6 +106,26 @@ def test_closing_is_the_speed_that_cannot_be_lost_before_a_car(along, across, fa
     assert TERMS["closing"](BEFORE, AFTER._replace(race=race), GAS) == pytest.approx(over)
 
 
+@pytest.mark.parametrize(
+    ("rivals", "gained"),
+    [
+        ({0: (0.0, -5.0)}, 5.0),  # beside it
+        ({0: (40.0, -5.0)}, 2.5),
+        ({0: (-40.0, 3.0)}, -1.5),  # it catches up
+        ({0: (-20.0, -2.0), 3: (60.0, -8.0)}, 1.5 + 2.0),
+        ({0: (80.0, -50.0)}, 0.0),
+        ({0: (-120.0, -50.0)}, 0.0),
+        ({}, 0.0),
+    ],
+)
+def test_passing_is_the_speed_against_cars_nearby(rivals, gained):
+    race = NO_RACE.copy()
+    for rival, (along, faster) in rivals.items():
+        race[5 + rival] = along
+        race[5 + 2 * RIVALS + rival] = faster
+    assert TERMS["passing"](BEFORE, AFTER._replace(race=race), GAS) == pytest.approx(gained)
+
+
 def test_a_weight_multiplies_duration_and_scale():
     assert Reward({"speed_off_axis": -2.0, "scale": 0.1})(BEFORE, AFTER, GAS, None) == {
         "speed_off_axis": -2.0 * 0.1 * 0.5 * 5.0,

@@ -516,13 +516,24 @@ class TestSensorsOfARace:
         for _ in range(30):
             for row, car in zip(seen, envs.get_attr("car"), strict=True):
                 assert row[where["opponents"]] == pytest.approx(car.opponents / 200.0)
-                for name, part, near in (("along", 5, 10.0), ("across", 5 + RIVALS, 3.0)):
-                    distances = car.race[part : part + RIVALS]
-                    shown = distances / (near + np.abs(distances))
-                    assert row[where[f"rivals_{name}"]] == pytest.approx(shown, abs=1e-6)
+                along, across, speed_along = car.race[5:].reshape(6, RIVALS)[:3]
+                clarity = np.clip(1.0 - np.abs(along) / 80.0, 0.0, 1.0)
+                for name, shown in (
+                    ("along", along / (10.0 + np.abs(along))),
+                    ("across", across / (3.0 + np.abs(across))),
+                    ("speed_along", np.clip(speed_along / 10.0, -6.0, 6.0)),
+                ):
+                    seen_as = pytest.approx(clarity * shown, abs=1e-6)
+                    assert row[where[f"rivals_{name}"]] == seen_as
                 assert row[where["race_position"]] == pytest.approx(car.race_position / 20.0)
             assert envs.observation_space.contains(seen[0])
             seen = envs.step(np.array([GAS] * 3, np.float32))[0]
+
+    def test_who_is_alone_sees_zeros_for_rivals(self, make):
+        sensors = ("base", "rivals")
+        envs = make(1, 1, sensors=sensors)
+        seen = envs.reset()
+        assert (seen[0, 29:] == 0.0).all()
 
     @pytest.mark.parametrize("sensors", [("base", "rivals"), ("base", "race")])
     def test_a_world_without_races_cannot_tell_of_one(self, sensors):

@@ -19,7 +19,7 @@ from sb3_torcs.torcs.installation import find_game
 
 __all__ = ["CarOfAnAgent", "Crew", "Pilots"]
 
-SEEN = ("action_repeat", "sensors", "action", "unstick")
+SEEN = ("action_repeat", "sensors", "action", "unstick", "keep_distance")
 """What an agent drives with as in its training, besides its car, gearbox and range finders."""
 
 

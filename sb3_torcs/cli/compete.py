@@ -20,7 +20,10 @@ if TYPE_CHECKING:
 
 __all__ = ["add_parser", "run"]
 
-KEPT = ("track", "car", "action_repeat", "range_finders", "sensors", "action", "gearbox", "unstick")
+KEPT = (
+    "track", "car", "action_repeat", "range_finders", "sensors", "action", "gearbox", "unstick",
+    "keep_distance",
+)  # fmt: skip
 """Settings that are taken from the training, unless they are given on the command line."""
 
 DESCRIPTION = """\

@@ -16,7 +16,10 @@ if TYPE_CHECKING:
 
 __all__ = ["add_parser", "run"]
 
-KEPT = ("car", "action_repeat", "range_finders", "sensors", "action", "gearbox", "unstick")
+KEPT = (
+    "car", "action_repeat", "range_finders", "sensors", "action", "gearbox", "unstick",
+    "keep_distance",
+)  # fmt: skip
 """What an agent drives with as in its training, unless the command line says otherwise."""
 
 DESCRIPTION = """\

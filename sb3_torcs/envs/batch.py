@@ -19,7 +19,7 @@ from sb3_torcs.backends.native import NativeBackend
 from sb3_torcs.backends.seats import SeatWorld
 from sb3_torcs.backends.several import world_index, worlds_of
 from sb3_torcs.car import CAR_RECORD, CarState, Controls, FloatArray, car_from_record
-from sb3_torcs.envs.compiled import COMPILED, free_cars, read_actions, value_timesteps
+from sb3_torcs.envs.compiled import COMPILED, aid_cars, read_actions, value_timesteps
 from sb3_torcs.envs.racing import RacingEnv, racing_info
 from sb3_torcs.errors import CarLost, InvalidAction, InvalidOption
 from sb3_torcs.rewards import Term
@@ -143,6 +143,7 @@ class Batch:
         self._runoff = np.zeros(number)
         self._recovery = np.zeros(number, np.int64)
         self._unstick = np.zeros(number, np.bool_)
+        self._keep_distance = np.zeros(number, np.bool_)
         self._ticks, self._patience, self._standing = np.ones((3, number), np.int64)
         self._driven: list[list[list[Held]]] = [[] for _ in self.envs]
         self._controls = np.zeros((number, len(Controls._fields)))
@@ -176,7 +177,8 @@ class Batch:
         self._cars[race] = np.hstack(env.car)
         self._laps[race] = np.inf if env.laps is None else env.laps
         self._runoff[race], self._recovery[race] = env.runoff, env.recovery
-        self._unstick[race] = env.unstick
+        self._unstick[race] = env.aids.unstick
+        self._keep_distance[race] = env.aids.keep_distance
         self._ticks[race] = env.action_repeat
         self._patience[race], self._standing[race] = env.patience, env.standing
         self._driven[race] = []
@@ -213,8 +215,9 @@ class Batch:
             has been driven
         """
         controls = self._read(asked)
-        if self._unstick.any():
-            free_cars(self._cars.view(CAR_RECORD)[:, 0], self._unstick, controls)
+        if self._unstick.any() or self._keep_distance.any():
+            cars = self._cars.view(CAR_RECORD)[:, 0]
+            aid_cars(cars, self._unstick, self._keep_distance, controls)
         before, after = self._cars, np.empty_like(self._cars)
         waiting = [env.delay.waiting for env in self.envs]
         parts = self._parts(controls)

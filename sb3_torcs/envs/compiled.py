@@ -18,9 +18,10 @@ from sb3_torcs import actions, rewards
 from sb3_torcs.car import CarState, FloatArray
 from sb3_torcs.envs.racing import STUCK_TICKS, end_of, stands
 from sb3_torcs.envs.unstick import freeing_controls, needs_freeing
+from sb3_torcs.rivals import needed_brake
 from sb3_torcs.sensors import encode_record
 
-__all__ = ["COMPILED", "free_cars", "read_actions", "value_timesteps"]
+__all__ = ["COMPILED", "aid_cars", "read_actions", "value_timesteps"]
 
 Counts = npt.NDArray[np.int64]
 
@@ -47,7 +48,8 @@ def _derived(name: str) -> None:
 for _name in ("track_position", "off_track", "gap_ahead", "gap_behind", "contacts", "faults"):
     _derived(_name)
 _readers = (actions.action_layout(name).read for name in actions.ACTIONS)
-for _function in (end_of, stands, needs_freeing, freeing_controls, rewards.safe_speed, *_readers):
+_aids = (needed_brake, needs_freeing, freeing_controls)
+for _function in (end_of, stands, rewards.safe_speed, *_aids, *_readers):
     register_jitable(_function)
 _read_pedals, _read_pedal, _read_manual = (
     actions.action_layout(name).read for name in ("pedals", "pedal", "manual")
@@ -93,12 +95,18 @@ def read_actions(asked: Any, low: FloatArray, high: FloatArray, controls: FloatA
 
 
 @njit(cache=True)
-def free_cars(cars: Any, unstick: npt.NDArray[np.bool_], controls: FloatArray) -> None:
+def aid_cars(
+    cars: Any,
+    unstick: npt.NDArray[np.bool_],
+    keep_distance: npt.NDArray[np.bool_],
+    controls: FloatArray,
+) -> None:
     """
-    Free the cars that are stuck, as ``RacingEnv.begin_step`` does.
+    Change controls as :class:`~sb3_torcs.envs.aids.Aids` does.
 
     :param cars: (n,) at the begin of a timestep
     :param unstick: (n,) which cars may free themselves
+    :param keep_distance: (n,) which cars brake by themselves for the one ahead
     :param controls: (n, 5) that were asked for, changed
     """
     for row in range(len(cars)):
@@ -107,6 +115,10 @@ def free_cars(cars: Any, unstick: npt.NDArray[np.bool_], controls: FloatArray) -
             fields = (steering, throttle, brake, float(gear), 0.0)
             for i in range(5):
                 controls[row, i] = fields[i]
+        elif keep_distance[row]:
+            brake = needed_brake(cars[row])
+            if brake > 0.0:
+                controls[row, 1], controls[row, 2] = 0.0, max(controls[row, 2], brake)
 
 
 def _one_of(terms: Sequence[rewards.Term]) -> Any:

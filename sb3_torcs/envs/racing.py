@@ -30,9 +30,9 @@ from sb3_torcs.car import (
     checked_start_speed,
     is_count,
 )
+from sb3_torcs.envs.aids import Aids
 from sb3_torcs.envs.conditions import Conditions, Delay, Part
 from sb3_torcs.envs.starts import Starts, read_start
-from sb3_torcs.envs.unstick import freeing_controls, needs_freeing
 from sb3_torcs.errors import CarLost, EnvClosed, InvalidOption
 from sb3_torcs.rewards import CRASHES, Reward, RewardChoice
 from sb3_torcs.sensors import NEEDS_CAR, NEEDS_RACE, SensorsName, View
@@ -129,13 +129,14 @@ def stands(car: CarState) -> bool:
     return along < 0.0 or car.speed_x * along < STUCK_SPEED
 
 
-def _check_tells(world: Backend, view: View) -> None:
-    """Refuse sensors of a race, or of a car's file, in a world that does not know of it."""
-    lacking = NEEDS_RACE.intersection(view.sensors)
+def _check_tells(world: Backend, view: View, keep_distance: bool) -> None:
+    """Refuse what needs a race, or a car's file, in a world that does not know of it."""
+    lacking = [f"sensors {name!r}" for name in sorted(NEEDS_RACE.intersection(view.sensors))]
+    lacking += ["keep_distance"] if keep_distance else []
     if lacking and not getattr(world, "tells_race", False):
         raise InvalidOption(
-            f"sensors {', '.join(map(repr, sorted(lacking)))} are of races, of which this world "
-            "does not tell; leave them out, or use backend 'native' of Torcs-v0"
+            f"{', '.join(lacking)} are of races, of which this world does not tell; leave them "
+            "out, or use backend 'native' of Torcs-v0"
         )
     if NEEDS_CAR.intersection(view.sensors) and getattr(world, "facts", None) is None:
         raise InvalidOption(
@@ -160,6 +161,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         ends it after 1.5 s of standing, and at once if it faces backwards
     :param unstick: whether a car that is stuck across the road or beside it frees itself; actions
         count for nothing meanwhile
+    :param keep_distance: whether a car brakes by itself where it is too close to the car ahead
     :param delay: control ticks by which controls arrive late; or a pair, between which each
         episode draws
     :param grip: factor on the friction of all ground; or a pair, as for the delay
@@ -183,6 +185,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         runoff: float = 0.0,
         recovery: float = 0.0,
         unstick: bool = False,
+        keep_distance: bool = False,
         delay: int | Sequence[int] = 0,
         grip: float | Sequence[float] = 1.0,
         mass: float | Sequence[float] = 1.0,
@@ -202,16 +205,14 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         self.laps = checked_laps(laps)
         self.runoff = checked_runoff(runoff)
         self.recovery = round(checked_recovery(recovery) / CONTROL_TICK)
-        if not isinstance(unstick, bool):
-            raise InvalidOption(f"unstick is {unstick!r}; expected True or False")
-        self.unstick = unstick
+        self.aids = Aids(unstick, keep_distance)
         self.render_mode = render_mode
         self.metadata = {
             **self.metadata,
             "render_fps": 1.0 / (action_repeat * CONTROL_TICK),
         }
         self.view = View(sensors)
-        _check_tells(backend, self.view)
+        _check_tells(backend, self.view, keep_distance)
         self.observation_space = spaces.Box(self.view.low, self.view.high, dtype=np.float32)
         self.action = action
         self.layout = action_layout(action, getattr(backend, "gears", GEARS))
@@ -372,8 +373,8 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         """
         self.check_ready()
         self._controls = controls_from_action(action, self.layout)
-        if self.unstick and self.car is not None and needs_freeing(self.car):
-            self._controls = Controls(*freeing_controls(self.car))
+        if self.car is not None:
+            self._controls = self.aids.change(self._controls, self.car)
         at_once = (self._controls, self.action_repeat)
         return self.delay.hold(self._controls) if self.delay.ticks else [at_once]
 

@@ -74,6 +74,8 @@ class TorcsEnv(RacingEnv):
         ends it after 1.5 s of standing, and at once if it faces backwards
     :param unstick: whether a car that is stuck across the road or beside it frees itself, as the
         game's robots do; actions count for nothing meanwhile
+    :param keep_distance: whether a car brakes by itself where it is too close to the car ahead;
+        for the backend ``"native"``
     :param delay: control ticks of 0.02 s from an observation until the controls that answer it
         arrive; or a pair, e.g. ``(0, 5)``, between which each episode draws
     :param grip: factor on the friction of all ground; or a pair, e.g. ``(0.8, 1.1)``, between which
@@ -122,6 +124,7 @@ class TorcsEnv(RacingEnv):
         runoff: float = 0.0,
         recovery: float = 0.0,
         unstick: bool = False,
+        keep_distance: bool = False,
         delay: int | Sequence[int] = 0,
         grip: float | Sequence[float] = 1.0,
         mass: float | Sequence[float] = 1.0,
@@ -187,6 +190,7 @@ class TorcsEnv(RacingEnv):
             runoff=runoff,
             recovery=recovery,
             unstick=unstick,
+            keep_distance=keep_distance,
             delay=delay,
             grip=grip,
             mass=mass,

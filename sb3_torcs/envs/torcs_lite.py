@@ -84,6 +84,7 @@ class TorcsLiteEnv(RacingEnv):
         ends it after 1.5 s of standing, and at once if it faces backwards
     :param unstick: whether a car that is stuck across the road or beside it frees itself, as the
         game's robots do; actions count for nothing meanwhile
+    :param keep_distance: ``False``; there are no other cars here
     :param delay: control ticks of 0.02 s from an observation until the controls that answer it
         arrive; or a pair, e.g. ``(0, 5)``, between which each episode draws
     :param grip: factor on the friction of all ground; or a pair, e.g. ``(0.8, 1.1)``, between which
@@ -109,6 +110,7 @@ class TorcsLiteEnv(RacingEnv):
         runoff: float = 0.0,
         recovery: float = 0.0,
         unstick: bool = False,
+        keep_distance: bool = False,
         delay: int | Sequence[int] = 0,
         grip: float | Sequence[float] = 1.0,
         render_mode: RenderMode | None = None,
@@ -141,6 +143,7 @@ class TorcsLiteEnv(RacingEnv):
             runoff=runoff,
             recovery=recovery,
             unstick=unstick,
+            keep_distance=keep_distance,
             delay=delay,
             grip=grip,
             render_mode=render_mode,

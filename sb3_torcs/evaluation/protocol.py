@@ -38,7 +38,7 @@ GAME, WITHOUT_GAME = "Torcs-v0", "TorcsLite-v0"
 LONGEST_TRACK = 10000.0  # [m] for such a one, whose length is not known beforehand
 KEPT = (
     "track", "car", "reward", "action_repeat", "range_finders", "sensors", "action", "gearbox",
-    "unstick",
+    "unstick", "keep_distance",
 )  # fmt: skip
 """What an evaluation takes from the training's environment, unless it is told otherwise."""
 

@@ -1,0 +1,43 @@
+"""What a car does by itself, whatever it is asked: driver aids."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sb3_torcs.car import CarState, Controls
+from sb3_torcs.envs.unstick import freeing_controls, needs_freeing
+from sb3_torcs.errors import InvalidOption
+from sb3_torcs.rivals import needed_brake
+
+__all__ = ["Aids"]
+
+
+class Aids:
+    """
+    The driver aids of a car.
+
+    :param unstick: whether a car that is stuck frees itself
+    :param keep_distance: whether a car brakes by itself for the one ahead
+    :raises InvalidOption: if one is neither ``True`` nor ``False``
+    """
+
+    def __init__(self, unstick: Any, keep_distance: Any) -> None:
+        for name, choice in (("unstick", unstick), ("keep_distance", keep_distance)):
+            if not isinstance(choice, bool):
+                raise InvalidOption(f"{name} is {choice!r}; expected True or False")
+        self.unstick, self.keep_distance = unstick, keep_distance
+
+    def change(self, controls: Controls, car: CarState) -> Controls:
+        """
+        Change what a car is asked to do, where an aid steps in.
+
+        :param controls: that were asked for
+        :param car: at the begin of a timestep
+        """
+        if self.unstick and needs_freeing(car):
+            return Controls(*freeing_controls(car))
+        if self.keep_distance:
+            brake = needed_brake(car)
+            if brake > 0.0:
+                return controls._replace(throttle=0.0, brake=max(controls.brake, brake))
+        return controls

@@ -1,0 +1,87 @@
+"""The cars around a car: how an agent sees them, and when it has to brake for one."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from sb3_torcs.car import FIRST_RIVAL, RIVALS, CarState, FloatArray
+
+__all__ = ["NEARBY", "needed_brake", "see_rivals"]
+
+NEARBY = 80.0  # [m] along the road, within which cars are seen
+HALF_ALONG, HALF_ACROSS = 10.0, 3.0  # [m] distances that are seen as 0.5
+
+BRAKING = 15.0  # [m/s²] that a car can do while it turns, too
+HASTE = 20.0  # [m/s] of spare speed, from which on a car ahead is not urgent
+MARGIN, BESIDE = 0.5, 2.0  # [m] lengthwise, and sidewise until nothing is close
+
+REACTION = 0.12  # [s] until the brake works
+HOLD = 0.2  # [s] for which a car goes on sidewise
+ROOM, SIDE = 0.4, 0.3  # [m] that a car keeps lengthwise and sidewise
+STRONGEST = 0.6  # of the brake, about 25 m/s²
+
+
+@njit(cache=True)
+def see_rivals(rivals: FloatArray) -> FloatArray:
+    """
+    Turn the numbers of the cars nearby into those that an agent sees.
+
+    :param rivals: (6 × ``RIVALS``,) along the road [m], across it [m], both velocities against the
+        own [m/s], lengths and widths [m]
+    :return: (6 × ``RIVALS``,) places and velocities, that fade with the distance along the road,
+        then how urgent it is to brake for each, and how close it is beside
+    """
+    seen = np.zeros(6 * RIVALS)
+    for i in range(RIVALS):
+        along, across = rivals[i], rivals[RIVALS + i]
+        faster, aside = rivals[2 * RIVALS + i], rivals[3 * RIVALS + i]
+        length, width = rivals[4 * RIVALS + i], rivals[5 * RIVALS + i]
+        clarity = max(0.0, 1.0 - abs(along) / NEARBY)
+        if clarity == 0.0:
+            continue
+        seen[i] = clarity * along / (HALF_ALONG + abs(along))
+        seen[RIVALS + i] = clarity * across / (HALF_ACROSS + abs(across))
+        seen[2 * RIVALS + i] = clarity * faster
+        seen[3 * RIVALS + i] = clarity * aside
+        if along > 0.0:
+            in_way = min(max((width + MARGIN + BESIDE - abs(across)) / BESIDE, 0.0), 1.0)
+            spare = faster + math.sqrt(2.0 * BRAKING * max(along - length - MARGIN, 0.0))
+            seen[4 * RIVALS + i] = in_way * max(1.0 - spare / HASTE, 0.0)
+        overlap = min(max((length + 4.0 - abs(along)) / 3.0, 0.0), 1.0)
+        close = min(max(1.0 - (abs(across) - width) / BESIDE, 0.0), 1.0)
+        seen[5 * RIVALS + i] = overlap * close * (1.0 if across > 0.0 else -1.0)
+    return seen
+
+
+def needed_brake(car: CarState) -> float:
+    """
+    Return the least brake that keeps a car from the one ahead, 0 to 0.6.
+
+    It keeps the distance of Shalev-Shwartz, Shammah and Shashua, "On a Formal Model of Safe and
+    Scalable Self-driving Cars", arXiv:1708.06374: that which the car ahead needs to stop may be
+    lost, and what the own car drives until its brake works. Cars beside the way, and those that
+    draw away, count for nothing. Compiled code calls it, too.
+
+    :param car: at the begin of a timestep
+    """
+    most = 0.0
+    speed = max(car.speed_x, 0.0)
+    rivals = car.race[FIRST_RIVAL:]
+    for i in range(RIVALS):
+        along, across = rivals[i], rivals[RIVALS + i]
+        faster, aside = rivals[2 * RIVALS + i], rivals[3 * RIVALS + i]
+        length, width = rivals[4 * RIVALS + i], rivals[5 * RIVALS + i]
+        if not 0.5 * length < along <= NEARBY or faster >= 1.0:
+            continue
+        if min(abs(across), abs(across + HOLD * aside)) > width + SIDE:
+            continue
+        theirs = max(speed + faster, 0.0)
+        room = along - length - ROOM
+        needed = speed * REACTION + max(speed * speed - theirs * theirs, 0.0) / (2.0 * BRAKING)
+        if room < needed:
+            short = (needed - max(room, 0.0)) / max(needed, 0.5)
+            most = max(most, min(short, 1.0))
+    return STRONGEST * most
