@@ -113,7 +113,7 @@ def closing(before: CarState, after: CarState, controls: Controls) -> float:
             # Between their centres lies half of each car; its own length is taken as the other's.
             room = max(along - length - ROOM, 0.0)
             worst = max(worst, -faster - math.sqrt(2.0 * BRAKING * room))
-    return worst
+    return float(worst)
 
 
 def passing(before: CarState, after: CarState, controls: Controls) -> float:
@@ -125,7 +125,7 @@ def passing(before: CarState, after: CarState, controls: Controls) -> float:
     rivals = after.race[FIRST_RIVAL:]
     for i in range(RIVALS):
         gained -= max(1.0 - abs(rivals[i]) / NEARBY, 0.0) * rivals[2 * RIVALS + i]
-    return gained
+    return float(gained)
 
 
 def off_line(before: CarState, after: CarState, controls: Controls) -> float:

@@ -84,4 +84,4 @@ def needed_brake(car: CarState) -> float:
         if room < needed:
             short = (needed - max(room, 0.0)) / max(needed, 0.5)
             most = max(most, min(short, 1.0))
-    return STRONGEST * most
+    return STRONGEST * float(most)

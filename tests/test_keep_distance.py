@@ -66,6 +66,9 @@ class TestTheRule:
     def test_a_car_that_stands_need_not_brake(self):
         assert brake(0.0, 5.0) == 0.0
 
+    def test_it_is_a_plain_number(self):
+        assert type(brake(50.0, 10.0)) is float
+
 
 class TestWhatIsSeen:
     def seen(self, *rival):
@@ -90,7 +93,7 @@ class TestWhatIsSeen:
 
 
 def contacts(keep_distance):
-    """What a car does that stands on its throttle behind a slower one, until both stand."""
+    """Count the contacts of a car that drives faster than the one ahead of it."""
     envs = TorcsVecEnv(1, agents=2, track="g-track-1", keep_distance=keep_distance)
     try:
         envs.seed(0)
