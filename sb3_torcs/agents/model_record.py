@@ -21,7 +21,20 @@ from sb3_torcs.agents.model_policy import Spaces, restored_space
 from sb3_torcs.errors import ModelMismatch
 from sb3_torcs.files import read_yaml
 
-__all__ = ["RECORD", "VERSION", "Statistics", "TrainingRecord", "record_beside", "record_within"]
+__all__ = [
+    "DRIVEN_WITH",
+    "RECORD",
+    "VERSION",
+    "Statistics",
+    "TrainingRecord",
+    "record_beside",
+    "record_within",
+]
+
+DRIVEN_WITH = (
+    "action_repeat", "range_finders", "sensors", "action", "gearbox", "unstick", "keep_distance",
+)  # fmt: skip
+"""Options of its environment without which an agent does not drive as in its training."""
 
 RECORD = "sb3_torcs"
 """What the attribute is called."""

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from sb3_torcs.agents.ghosts import is_ghost
+from sb3_torcs.agents.model_record import DRIVEN_WITH
 from sb3_torcs.agents.models import agent_record, load_driver
 from sb3_torcs.agents.wrapping import wrapped
 from sb3_torcs.backends.seats import SeatWorld, SharedRace
@@ -19,8 +20,9 @@ from sb3_torcs.torcs.installation import find_game
 
 __all__ = ["CarOfAnAgent", "Crew", "Pilots"]
 
-SEEN = ("action_repeat", "sensors", "action", "unstick", "keep_distance")
-"""What an agent drives with as in its training, besides its car, gearbox and range finders."""
+OF_THE_SEAT = ("range_finders", "gearbox")
+"""What an agent drives with that its seat brings along: both are chosen before a race is loaded."""
+OF_THE_ENV = tuple(name for name in DRIVEN_WITH if name not in OF_THE_SEAT)
 
 
 class CarOfAnAgent:
@@ -57,7 +59,7 @@ class Pilots:
     def __init__(self, cars: Sequence[CarOfAnAgent], race: SharedRace, trust: bool = False) -> None:
         self._race = race
         self._envs = [
-            RaceCarEnv(seat, **car.record.kept(SEEN))
+            RaceCarEnv(seat, **car.record.kept(OF_THE_ENV))
             for car, seat in zip(cars, race.seats, strict=True)
         ]
         self._teams: dict[str, list[int]] = {}

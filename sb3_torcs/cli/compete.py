@@ -20,12 +20,6 @@ if TYPE_CHECKING:
 
 __all__ = ["add_parser", "run"]
 
-KEPT = (
-    "track", "car", "action_repeat", "range_finders", "sensors", "action", "gearbox", "unstick",
-    "keep_distance",
-)  # fmt: skip
-"""Settings that are taken from the training, unless they are given on the command line."""
-
 DESCRIPTION = """\
 Drive a saved model in a race of an SCR server: `sb3-torcs serve`, a patched game, a league's
 server. The agent chooses an action as often as in its training, and repeats it at every control
@@ -70,11 +64,12 @@ def run(args: argparse.Namespace) -> int:
     with quiet_output(args.json):  # said first, because loading takes seconds
         print(f"{args.model} is being loaded for the race at {where}", flush=True)
 
+    from sb3_torcs.agents.model_record import DRIVEN_WITH
     from sb3_torcs.agents.models import driver_name, one_of
     from sb3_torcs.agents.remote import Agent
 
     record = told_record(args.model)
-    settings = record.kept(KEPT)
+    settings = record.kept(("track", "car", *DRIVEN_WITH))
     given = {"track": args.track, "car": args.car, "host": args.host, "port": args.port}
     settings |= {name: value for name, value in given.items() if value is not None}
     one_of("track", settings.get("track"))

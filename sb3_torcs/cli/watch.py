@@ -16,12 +16,6 @@ if TYPE_CHECKING:
 
 __all__ = ["add_parser", "run"]
 
-KEPT = (
-    "car", "action_repeat", "range_finders", "sensors", "action", "gearbox", "unstick",
-    "keep_distance",
-)  # fmt: skip
-"""What an agent drives with as in its training, unless the command line says otherwise."""
-
 DESCRIPTION = """\
 Show a saved model or a robot in the game's own window. The game's keys work there: F2 to F11 change
 the view, p pauses, + and - change the speed of time, Esc ends the race.
@@ -133,7 +127,8 @@ def _shows(game: Game, names: Sequence[str], args: argparse.Namespace) -> list[S
     :param names: of models or robots
     :param args: from the command line
     """
-    from sb3_torcs.agents.models import TrainingRecord, one_of
+    from sb3_torcs.agents.model_record import DRIVEN_WITH, TrainingRecord
+    from sb3_torcs.agents.models import one_of
     from sb3_torcs.errors import InvalidOption
     from sb3_torcs.evaluation.watching import Show
 
@@ -152,7 +147,7 @@ def _shows(game: Game, names: Sequence[str], args: argparse.Namespace) -> list[S
     words = args.robots.split(",") if args.robots else []
     opponents = [game.parse_robot(word) for word in words]
     own = {} if args.car is None else {"car": args.car}
-    settings = [{**record.kept(KEPT), **own} for record in records]
+    settings = [{**record.kept(("car", *DRIVEN_WITH)), **own} for record in records]
     for kept in settings:
         one_of("car", kept.get("car"))
     return [

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sb3_torcs.agents import text_mode
-from sb3_torcs.agents.pilots import SEEN
+from sb3_torcs.agents.model_record import DRIVEN_WITH
 from sb3_torcs.agents.remote import Agent
 from sb3_torcs.errors import GameFailed, InvalidOption, ModelMismatch, ServerLost
 from sb3_torcs.races.entrants import Entrant
@@ -134,7 +134,7 @@ def _client(entrant: Entrant, race: RaceSetup, port: int, trust: bool) -> Agent:
             "which the game's server does not tell; leave out --game"
         )
     settings: dict[str, Any] = {
-        **pilot.record.kept((*SEEN, "range_finders", "gearbox")),
+        **pilot.record.kept(DRIVEN_WITH),
         "track": race.track, "car": pilot.car, "host": "127.0.0.1", "port": port,
     }  # fmt: skip
     return Agent(pilot.driver, settings, trust=trust, name=entrant.name)
