@@ -127,7 +127,9 @@ def test_races_driven_at_once_brake_as_single_ones_do(game):
 
 @pytest.mark.parametrize("world", [{"id": "TorcsLite-v0"}, {"id": "Torcs-v0", "backend": "scr"}])
 def test_a_world_without_races_has_nobody_to_keep_from(game, world):
-    with pytest.raises(InvalidOption, match="keep_distance are of races, of which this world"):
+    with pytest.raises(
+        InvalidOption, match="of which this world does not tell, there is no 'keep_distance'; leave"
+    ):
         gym.make(**world, keep_distance=True)
 
 

@@ -131,12 +131,13 @@ def stands(car: CarState) -> bool:
 
 def _check_tells(world: Backend, view: View, keep_distance: bool) -> None:
     """Refuse what needs a race, or a car's file, in a world that does not know of it."""
-    lacking = [f"sensors {name!r}" for name in sorted(NEEDS_RACE.intersection(view.sensors))]
+    lacking = sorted(NEEDS_RACE.intersection(view.sensors))
     lacking += ["keep_distance"] if keep_distance else []
     if lacking and not getattr(world, "tells_race", False):
         raise InvalidOption(
-            f"{', '.join(lacking)} are of races, of which this world does not tell; leave them "
-            "out, or use backend 'native' of Torcs-v0"
+            "without a race, of which this world does not tell, there is no "
+            f"{' and no '.join(map(repr, lacking))}; leave that out, or use backend 'native' of "
+            "Torcs-v0"
         )
     if NEEDS_CAR.intersection(view.sensors) and getattr(world, "facts", None) is None:
         raise InvalidOption(
