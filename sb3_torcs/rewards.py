@@ -13,7 +13,7 @@ from typing import Literal
 
 from sb3_torcs.car import CAR_WIDTH, FIRST_RIVAL, RIVALS, CarState, Controls, is_number
 from sb3_torcs.errors import InvalidOption, UnknownRewardTerm, near_miss
-from sb3_torcs.rivals import NEARBY
+from sb3_torcs.rivals import clarity
 
 __all__ = ["CRASHES", "PRESETS", "TERMS", "Reward", "RewardChoice", "RewardName", "safe_speed"]
 
@@ -124,7 +124,7 @@ def passing(before: CarState, after: CarState, controls: Controls) -> float:
     gained = 0.0
     rivals = after.race[FIRST_RIVAL:]
     for i in range(RIVALS):
-        gained -= max(1.0 - abs(rivals[i]) / NEARBY, 0.0) * rivals[2 * RIVALS + i]
+        gained -= clarity(rivals[i]) * rivals[2 * RIVALS + i]
     return float(gained)
 
 

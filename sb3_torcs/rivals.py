@@ -9,19 +9,31 @@ from numba import njit
 
 from sb3_torcs.car import FIRST_RIVAL, RIVALS, CarState, FloatArray
 
-__all__ = ["NEARBY", "needed_brake", "see_rivals"]
+__all__ = ["clarity", "needed_brake", "see_rivals"]
 
 NEARBY = 80.0  # [m] along the road, within which cars are seen
 HALF_ALONG, HALF_ACROSS = 10.0, 3.0  # [m] distances that are seen as 0.5
 
 BRAKING = 15.0  # [m/s²] that a car can do while it turns, too
 HASTE = 20.0  # [m/s] of spare speed, from which on a car ahead is not urgent
-MARGIN, BESIDE = 0.5, 2.0  # [m] lengthwise, and sidewise until nothing is close
+MARGIN = 0.5  # [m] that are kept to the car ahead, and to who is in the way
+BESIDE = 2.0  # [m] sidewise between two cars, from which on they are not close
+OVERLAP, FADE = 4.0, 3.0  # [m] lengthwise: up to here cars are beside, and so far they fade before
 
 REACTION = 0.12  # [s] until the brake works
 HOLD = 0.2  # [s] for which a car goes on sidewise
 ROOM, SIDE = 0.4, 0.3  # [m] that a car keeps lengthwise and sidewise
 STRONGEST = 0.6  # of the brake, about 25 m/s²
+
+
+@njit(cache=True)
+def clarity(along: float) -> float:
+    """
+    Tell how much a car nearby counts: 1 beside, falling to 0 at 80 m.
+
+    :param along: how far it is ahead along the road, or behind [m]
+    """
+    return max(0.0, 1.0 - abs(along) / NEARBY)
 
 
 @njit(cache=True)
@@ -39,18 +51,18 @@ def see_rivals(rivals: FloatArray) -> FloatArray:
         along, across = rivals[i], rivals[RIVALS + i]
         faster, aside = rivals[2 * RIVALS + i], rivals[3 * RIVALS + i]
         length, width = rivals[4 * RIVALS + i], rivals[5 * RIVALS + i]
-        clarity = max(0.0, 1.0 - abs(along) / NEARBY)
-        if clarity == 0.0:
+        clear = clarity(along)
+        if clear == 0.0:
             continue
-        seen[i] = clarity * along / (HALF_ALONG + abs(along))
-        seen[RIVALS + i] = clarity * across / (HALF_ACROSS + abs(across))
-        seen[2 * RIVALS + i] = clarity * faster
-        seen[3 * RIVALS + i] = clarity * aside
+        seen[i] = clear * along / (HALF_ALONG + abs(along))
+        seen[RIVALS + i] = clear * across / (HALF_ACROSS + abs(across))
+        seen[2 * RIVALS + i] = clear * faster
+        seen[3 * RIVALS + i] = clear * aside
         if along > 0.0:
             in_way = min(max((width + MARGIN + BESIDE - abs(across)) / BESIDE, 0.0), 1.0)
             spare = faster + math.sqrt(2.0 * BRAKING * max(along - length - MARGIN, 0.0))
             seen[4 * RIVALS + i] = in_way * max(1.0 - spare / HASTE, 0.0)
-        overlap = min(max((length + 4.0 - abs(along)) / 3.0, 0.0), 1.0)
+        overlap = min(max((length + OVERLAP - abs(along)) / FADE, 0.0), 1.0)
         close = min(max(1.0 - (abs(across) - width) / BESIDE, 0.0), 1.0)
         seen[5 * RIVALS + i] = overlap * close * (1.0 if across > 0.0 else -1.0)
     return seen
@@ -60,10 +72,10 @@ def needed_brake(car: CarState) -> float:
     """
     Return the least brake that keeps a car from the one ahead, 0 to 0.6.
 
-    It keeps the distance of Shalev-Shwartz, Shammah and Shashua, "On a Formal Model of Safe and
-    Scalable Self-driving Cars", arXiv:1708.06374: that which the car ahead needs to stop may be
-    lost, and what the own car drives until its brake works. Cars beside the way, and those that
-    draw away, count for nothing. Compiled code calls it, too.
+    A car is too close if it would hit the other when both brake at 15 m/s² to a stand, and its own
+    brake works 0.12 s late (Shalev-Shwartz, Shammah and Shashua, "On a Formal Model of Safe and
+    Scalable Self-driving Cars", arXiv:1708.06374). The less room is left, the harder it brakes.
+    Cars beside the way, and those that draw away, count for nothing. Compiled code calls it, too.
 
     :param car: at the begin of a timestep
     """
