@@ -5,8 +5,10 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3 import A2C, PPO
+from torch import nn
 from toy import ToyRace
 
+from sb3_torcs.callbacks import LeanUpdatesCallback
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.policies import BoundedPolicy
 
@@ -60,3 +62,39 @@ def test_what_it_cannot_bound_is_refused():
         PPO(BoundedPolicy, gym.make("CartPole-v1"))
     with pytest.raises(InvalidOption, match="has no use_sde"):
         PPO(BoundedPolicy, ToyRace(), use_sde=True)
+
+
+def test_who_rounds_otherwise_drives_the_same():
+    """
+    A product of another size is added up in another order, as on another processor.
+
+    So the means of SB3's own network depend on how many it is asked for at once.
+    """
+    policy = make(net_arch=[128, 128]).policy
+    with th.no_grad():
+        policy.action_net.linear.weight *= 100.0
+    seen = np.random.default_rng(0).uniform(-1, 1, (2000, 29)).astype(np.float32)
+    alone = np.concatenate([policy.predict(row[None], deterministic=True)[0] for row in seen])
+    np.testing.assert_array_equal(alone, policy.predict(seen, deterministic=True)[0])
+    with th.no_grad():
+        plain = policy.get_distribution(th.as_tensor(seen)).mode().numpy()
+    assert np.any(plain != alone)
+    np.testing.assert_allclose(plain, alone, atol=1e-5)
+
+
+@pytest.mark.parametrize("callbacks", [[], [LeanUpdatesCallback()]])
+def test_what_drives_follows_the_training(callbacks):
+    model = PPO(
+        BoundedPolicy, ToyRace(), policy_kwargs={"net_arch": [8], "activation_fn": nn.ReLU},
+        n_steps=8, batch_size=8, seed=0,
+    )  # fmt: skip
+    seen = np.random.default_rng(0).uniform(-1, 1, (50, 29)).astype(np.float32)
+    drives = []
+    for _ in range(3):
+        model.learn(8, callback=callbacks, reset_num_timesteps=False)
+        drives.append(model.predict(seen, deterministic=True)[0])
+        with th.no_grad():
+            mean = model.policy.get_distribution(th.as_tensor(seen)).mode().numpy()
+        np.testing.assert_allclose(drives[-1], mean, atol=1e-6)
+    assert np.any(drives[0] != drives[1])
+    assert np.any(drives[1] != drives[2])

@@ -6,6 +6,7 @@ every draw is full throttle: then no draw brakes, and PPO never learns that it s
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from typing import Any
 
@@ -18,6 +19,7 @@ from stable_baselines3.common.type_aliases import Schedule
 from torch import nn
 
 from sb3_torcs.errors import InvalidOption
+from sb3_torcs.policies.exact import ExactDriver, ExactPolicy
 
 __all__ = ["BoundedHead", "BoundedPolicy"]
 
@@ -53,7 +55,7 @@ class BoundedHead(nn.Module):
         return self.middle + self.reach * th.tanh(self.linear(latent))
 
 
-class BoundedPolicy(ActorCriticPolicy):
+class BoundedPolicy(ExactPolicy, ActorCriticPolicy):
     """
     SB3's ``ActorCriticPolicy`` for a Gaussian whose mean has the bounds of the action space.
 
@@ -99,6 +101,11 @@ class BoundedPolicy(ActorCriticPolicy):
             self.log_std.copy_(th.as_tensor(self._first_log_std))
         assert isinstance(self.action_space, spaces.Box)
         self.action_net = BoundedHead(self.action_net, self.action_space)  # type: ignore[arg-type]
+
+    def exact_driver(self) -> ExactDriver:
+        """Return a copy of what gives the mean action, which drives if it is deterministic."""
+        network = nn.Sequential(self.mlp_extractor.policy_net, self.action_net)
+        return ExactDriver(self, self.pi_features_extractor, copy.deepcopy(network))
 
 
 BoundedPolicy.__module__ = "sb3_torcs.policies"  # which hyperparameter files name

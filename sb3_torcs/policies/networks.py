@@ -13,7 +13,7 @@ from typing import Any, cast
 
 import torch as th
 from stable_baselines3.common.policies import ContinuousCritic
-from stable_baselines3.common.preprocessing import get_action_dim, preprocess_obs
+from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.td3.policies import Actor
 from torch import nn
 from torch.func import functional_call
@@ -21,12 +21,10 @@ from torch.optim.swa_utils import AveragedModel
 
 from sb3_torcs.policies import fused
 from sb3_torcs.policies.flat import FlatParameters
-from sb3_torcs.policies.mirror import mirror_actions, mirror_image, mirror_observations
 
 __all__ = [
     "HEAD_GAINS",
     "ActorAverage",
-    "ExactDriver",
     "FlatHeads",
     "LateActionCritic",
     "LateActionQ",
@@ -218,49 +216,6 @@ class ActorAverage(AveragedModel):
         for average, new in zip(self.module.parameters(), model.parameters(), strict=True):
             average.lerp_(new, share)
         self.n_averaged += 1
-
-
-class ExactDriver(nn.Module):
-    """
-    A copy of an actor that drives in double precision.
-
-    Processors round sums differently, and a car that is steered slightly differently is elsewhere
-    after a lap. Actions in double precision, rounded to single, are the same on all of them.
-
-    :param actor: of SB3's DDPG or TD3
-    :param symmetric: drive the mean of the actor's action and the mirror image of its action in
-        the mirrored drive
-    """
-
-    def __init__(self, actor: Actor, *, symmetric: bool = False) -> None:
-        super().__init__()
-        self.observation_space = actor.observation_space
-        self.normalize_images = actor.normalize_images
-        # Copy the parts only: the actor itself holds its optimizer and the hooks of a noise.
-        self.features_extractor = copy.deepcopy(actor.features_extractor)
-        heads = actor.mu.plain() if isinstance(actor.mu, FlatHeads) else copy.deepcopy(actor.mu)
-        self.mu = heads.double()
-        self._image = mirror_image(self.observation_space) if symmetric else None
-
-    def forward(self, observation: th.Tensor) -> th.Tensor:
-        """
-        Decide.
-
-        :param observation: (batch, observation)
-        :return: (batch, actuators) in [-1, 1]
-        """
-        seen = cast(
-            th.Tensor, preprocess_obs(observation, self.observation_space, self.normalize_images)
-        )
-        actions = self._drive(seen)
-        if self._image is not None:
-            image = mirror_observations(seen, self._image)
-            actions = 0.5 * (actions + mirror_actions(self._drive(image)))
-        return actions.float()
-
-    def _drive(self, seen: th.Tensor) -> th.Tensor:
-        actions: th.Tensor = self.mu(self.features_extractor(seen).double())
-        return actions
 
 
 class LateActionQ(nn.Module):

@@ -8,6 +8,7 @@ file can name ``sb3_torcs.policies.split_head.SplitHeadPolicy`` without an impor
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from typing import Any, cast
 
@@ -18,20 +19,21 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.td3.policies import Actor, TD3Policy
 from torch import nn
 
 from sb3_torcs.actions import layout_of_width
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.policies import fast_matmul as matmul
+from sb3_torcs.policies.exact import ExactDriver, ExactPolicy
 from sb3_torcs.policies.export import export_actor
 from sb3_torcs.policies.flat import FlatParameters, keep_plain_state
 from sb3_torcs.policies.mirror import sensors_of
 from sb3_torcs.policies.networks import (
     HEAD_GAINS,
     ActorAverage,
-    ExactDriver,
+    FlatHeads,
     LateActionCritic,
     SplitHeadActor,
 )
@@ -46,7 +48,7 @@ OWN_KERNEL = frozenset({"fused", "foreach", "capturable", "differentiable"})
 """Options of Adam with which somebody chooses its kernel; then it stays as chosen."""
 
 
-class SplitHeadPolicy(TD3Policy):
+class SplitHeadPolicy(ExactPolicy, TD3Policy):
     """
     The networks of the original post for the stock ``DDPG`` and ``TD3``.
 
@@ -120,7 +122,6 @@ class SplitHeadPolicy(TD3Policy):
         )
 
     def _build(self, lr_schedule: Schedule) -> None:
-        self._exact: tuple[list[int], ExactDriver] | None = None
         super()._build(lr_schedule)
         scale = self.own_kwargs["critic_lr_scale"]
         self.actor.optimizer = self._optimizer(self.actor, 1.0, lr_schedule)
@@ -171,16 +172,11 @@ class SplitHeadPolicy(TD3Policy):
 
     def exact_driver(self) -> ExactDriver:
         """Return a copy of the actor that drives when ``predict`` is deterministic."""
-        return ExactDriver(self.driver, symmetric=self.own_kwargs["symmetric"])
-
-    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        if not deterministic:
-            return self.actor(observation)
         driver = self.driver
-        versions = [id(driver), *(parameter._version for parameter in driver.parameters())]
-        if self._exact is None or self._exact[0] != versions:
-            self._exact = (versions, self.exact_driver())
-        return self._exact[1](observation)
+        heads = driver.mu.plain() if isinstance(driver.mu, FlatHeads) else copy.deepcopy(driver.mu)
+        return ExactDriver(
+            self, driver.features_extractor, heads, symmetric=self.own_kwargs["symmetric"]
+        )
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
         """
@@ -207,17 +203,6 @@ class SplitHeadPolicy(TD3Policy):
         kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
         own = {"layer_norm": self.own_kwargs["layer_norm"]}
         return LateActionCritic(**own, **kwargs).to(self.device)
-
-    def set_training_mode(self, mode: bool) -> None:
-        """
-        Switch between training and prediction; visit the modules only if something changes.
-
-        :param mode: ``True`` to train
-        """
-        if mode:
-            self._exact = None  # an update by a fused optimizer leaves the versions as they were
-        if mode != self.training:
-            super().set_training_mode(mode)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {**super()._get_constructor_parameters(), **self.own_kwargs}

@@ -1,0 +1,97 @@
+"""Deterministic actions that are the same on all processors.
+
+Processors round sums differently, and a car that is steered slightly differently is elsewhere after
+a lap. Actions in double precision, rounded to single, are the same on all of them.
+"""
+
+from __future__ import annotations
+
+import copy
+from typing import cast
+
+import torch as th
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import preprocess_obs
+from stable_baselines3.common.type_aliases import PyTorchObs
+from torch import nn
+
+from sb3_torcs.policies.mirror import mirror_actions, mirror_image, mirror_observations
+
+__all__ = ["ExactDriver", "ExactPolicy"]
+
+
+class ExactDriver(nn.Module):
+    """
+    A copy of the part of a policy that drives, in double precision.
+
+    :param policy: whose spaces it has
+    :param features_extractor: of the policy; copied
+    :param network: from features to actions; taken over
+    :param symmetric: drive the mean of the action and the mirror image of the action in the
+        mirrored drive
+    """
+
+    def __init__(
+        self,
+        policy: BasePolicy,
+        features_extractor: nn.Module,
+        network: nn.Module,
+        *,
+        symmetric: bool = False,
+    ) -> None:
+        super().__init__()
+        self.observation_space = policy.observation_space
+        self.normalize_images = policy.normalize_images
+        self.features_extractor = copy.deepcopy(features_extractor)
+        self.network = network.double()
+        self._image = mirror_image(self.observation_space) if symmetric else None
+
+    def forward(self, observation: PyTorchObs) -> th.Tensor:
+        """
+        Decide.
+
+        :param observation: (batch, observation)
+        :return: (batch, actuators), as the policy scales them
+        """
+        seen = cast(
+            th.Tensor, preprocess_obs(observation, self.observation_space, self.normalize_images)
+        )
+        actions = self._drive(seen)
+        if self._image is not None:
+            image = mirror_observations(seen, self._image)
+            actions = 0.5 * (actions + mirror_actions(self._drive(image)))
+        return actions.float()
+
+    def _drive(self, seen: th.Tensor) -> th.Tensor:
+        actions: th.Tensor = self.network(self.features_extractor(seen).double())
+        return actions
+
+
+class ExactPolicy(BasePolicy):
+    """A policy that drives exactly whenever ``predict`` is ``deterministic``."""
+
+    _exact: tuple[list[int], ExactDriver] | None = None
+
+    def exact_driver(self) -> ExactDriver:
+        """Return a copy of what drives when ``predict`` is deterministic."""
+        raise NotImplementedError
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        if not deterministic:
+            return super()._predict(observation, deterministic)  # type: ignore[safe-super]
+        versions = [number for own in self.parameters() for number in (id(own), own._version)]
+        if self._exact is None or self._exact[0] != versions:
+            self._exact = (versions, self.exact_driver())
+        actions: th.Tensor = self._exact[1](observation)
+        return actions
+
+    def set_training_mode(self, mode: bool) -> None:
+        """
+        Switch between training and prediction; visit the modules only if something changes.
+
+        :param mode: ``True`` to train
+        """
+        if mode:
+            self._exact = None  # an update by a fused optimizer leaves the versions as they were
+        if mode != self.training:
+            super().set_training_mode(mode)
