@@ -51,10 +51,12 @@ class Settings:
 
 
 ONE_TRACK = Settings(
-    1_310_720, 64, 2, 1000, 65.0, 0.5, (-1.0, -0.5), None, 0.001, mirror=False, env_kwargs={}
-)
+    timesteps_alone=1_310_720, cars_alone=64, beside_races=2, episode=1000, speed=65.0, hard=0.5,
+    off_line=(-1.0, -0.5), batch_size=None, ent_coef=0.001, mirror=False, env_kwargs={},
+)  # fmt: skip
 ALL_ROADS = Settings(
-    3_145_728, 128, 3, 300, 80.0, 0.7, (-4.0, -1.5), 2048, 0.004, mirror=True,
+    timesteps_alone=3_145_728, cars_alone=128, beside_races=3, episode=300, speed=80.0, hard=0.7,
+    off_line=(-4.0, -1.5), batch_size=2048, ent_coef=0.004, mirror=True,
     env_kwargs={"grip": [0.85, 1.0]},
 )  # fmt: skip
 
