@@ -47,17 +47,17 @@ class Settings:
     batch_size: int | None  # None is a quarter of a rollout
     ent_coef: float
     mirror: bool  # whether every other car drives on the mirror image of its road
-    env_kwargs: dict  # of cars alone
+    grip: float | list[float]  # of a car alone, of that of the game
 
 
 ONE_TRACK = Settings(
     timesteps_alone=1_310_720, cars_alone=64, beside_races=2, episode=1000, speed=65.0, hard=0.5,
-    off_line=(-1.0, -0.5), batch_size=None, ent_coef=0.001, mirror=False, env_kwargs={},
+    off_line=(-1.0, -0.5), batch_size=None, ent_coef=0.001, mirror=False, grip=1.0,
 )  # fmt: skip
 ALL_ROADS = Settings(
     timesteps_alone=3_145_728, cars_alone=128, beside_races=3, episode=300, speed=80.0, hard=0.7,
     off_line=(-4.0, -1.5), batch_size=2048, ent_coef=0.004, mirror=True,
-    env_kwargs={"grip": [0.85, 1.0]},
+    grip=[0.85, 1.0],
 )  # fmt: skip
 
 
@@ -128,8 +128,8 @@ def cars_alone(
         reward=reward_alone(settings.off_line[0]),
         start="random",
         max_episode_steps=settings.episode,
+        grip=settings.grip,
         **env_kwargs,
-        **settings.env_kwargs,
     )
     cars.env_method("set_random_speed", settings.speed)
     cars.env_method("set_hard_starts", settings.hard)
@@ -192,9 +192,10 @@ def begin_to_race(weights: dict) -> None:
 
 def main() -> None:
     args = parser.parse_args()
-    settings = ONE_TRACK if len(args.track) == 1 else ALL_ROADS
+    several = len(args.track) > 1
+    settings = ALL_ROADS if several else ONE_TRACK
     env_kwargs = {
-        "track": args.track[0] if len(args.track) == 1 else args.track,
+        "track": args.track if several else args.track[0],
         "sensors": list(SENSORS), "range_finders": "narrow", "action": "pedal",
         "gearbox": "road_speed", "action_repeat": 5, "unstick": True, "keep_distance": True,
     }  # fmt: skip

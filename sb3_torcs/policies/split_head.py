@@ -8,7 +8,6 @@ file can name ``sb3_torcs.policies.split_head.SplitHeadPolicy`` without an impor
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
 from typing import Any, cast
 
@@ -172,11 +171,8 @@ class SplitHeadPolicy(ExactPolicy, TD3Policy):
 
     def exact_driver(self) -> ExactDriver:
         """Return a copy of the actor that drives when ``predict`` is deterministic."""
-        driver = self.driver
-        heads = driver.mu.plain() if isinstance(driver.mu, FlatHeads) else copy.deepcopy(driver.mu)
-        return ExactDriver(
-            self, driver.features_extractor, heads, symmetric=self.own_kwargs["symmetric"]
-        )
+        heads, symmetric = cast(FlatHeads, self.driver.mu).plain(), self.own_kwargs["symmetric"]
+        return ExactDriver(self, self.driver.features_extractor, heads, symmetric=symmetric)
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
         """
