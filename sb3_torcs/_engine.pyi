@@ -87,9 +87,10 @@ class Engine:
 
 class Fleet:
     def __init__(self, engines: Sequence[Engine], threads: int) -> None: ...
+    def put(self, race: int, engine: Engine) -> None: ...
     def begin(
         self,
-        index: int,
+        race: int,
         steering: float,
         throttle: float,
         brake: float,
@@ -97,11 +98,11 @@ class Fleet:
         ticks: int,
         clutch: float = 0.0,
     ) -> None: ...
-    def wait(self, index: int) -> CarState: ...
+    def wait(self, race: int) -> CarState: ...
     def finish(self) -> None: ...
     def step(
         self,
-        indices: npt.NDArray[np.int64],  # (n,) of the engines; rows of one follow each other
+        races: npt.NDArray[np.int64],  # (n,); rows of one follow each other
         seats: npt.NDArray[np.int64],  # (n,) which car; -1 is the first agent's
         controls: FloatArray,  # (n, 5) as of Controls; a gear of nan is the gearbox's choice
         ticks: npt.NDArray[np.int64],  # (n,)

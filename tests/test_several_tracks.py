@@ -8,11 +8,14 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import SubprocVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 import sb3_torcs  # noqa: F401  # registers the ids
+from sb3_torcs.backends import several
+from sb3_torcs.backends.several import WorldPool
 from sb3_torcs.errors import InvalidOption, TrackNotFound
 from sb3_torcs.tracks.catalogue import load_track
+from sb3_torcs.vec_env import TorcsVecEnv
 
 TRACKS = ("aalborg", "alpine-1", "g-track-1")
 GAS = np.array([0.0, 1.0, 0.0], np.float32)
@@ -122,3 +125,115 @@ def test_every_car_has_its_turn_on_every_track():
 def test_a_list_of_cars_may_not_be_empty():
     with pytest.raises(InvalidOption, match="car is an empty list"):
         gym.make("Torcs-v0", car=[])
+
+
+class Loaded:
+    """A world that a pool has loaded."""
+
+    def __init__(self, name, everything):
+        self.name, self.closed = name, False
+        everything.append(self)
+
+    def close(self):
+        assert not self.closed, "closed twice"
+        self.closed = True
+
+
+class TestWorldPool:
+    def test_a_world_is_loaded_when_there_is_no_spare_one(self):
+        everything = []
+        pool = WorldPool([lambda: Loaded("a", everything), lambda: Loaded("b", everything)])
+        assert [world.name for world in pool.examples] == ["a", "b"]
+        first, second = pool.take(0), pool.take(0)
+        assert first is pool.examples[0]
+        assert second is not first
+        assert [world.name for world in everything] == ["a", "b", "a"]
+        pool.give_back(0, first)
+        assert pool.take(0) is first
+        assert len(everything) == 3
+
+    def test_the_last_user_closes_all(self):
+        everything = []
+        pool = WorldPool([lambda: Loaded("a", everything), lambda: Loaded("b", everything)])
+        taken = []
+        for choice in (0, 0, 1):
+            pool.join()
+            taken.append((choice, pool.take(choice)))
+        for choice, world in taken:
+            assert not any(world.closed for world in everything)
+            pool.give_back(choice, world)
+            pool.leave()
+        assert all(world.closed for world in everything)
+
+    def test_what_was_loaded_before_a_wrong_choice_is_closed(self):
+        everything = []
+        with pytest.raises(ZeroDivisionError):
+            WorldPool([lambda: Loaded("a", everything), lambda: 1 // 0])
+        assert [world.closed for world in everything] == [True]
+
+
+class TestRacesAtOnce:
+    """Races of one vector environment share their worlds, which nobody can tell."""
+
+    RACES = 12
+
+    @pytest.fixture(params=["TorcsLite-v0", "Torcs-v0"])
+    def functions(self, request):
+        """Make functions that make the environments; each has a grip of its own."""
+        if request.param == "Torcs-v0":
+            request.getfixturevalue("game")
+        env_id = f"sb3_torcs:{request.param}"
+
+        def make(grip):
+            return gym.make(env_id, track=TRACKS, start="random", grip=grip, max_episode_steps=4)
+
+        grips = [1.0, 0.6, [0.5, 0.9]] * (self.RACES // 3)
+        return [lambda grip=grip: make(grip) for grip in grips]
+
+    @pytest.mark.parametrize("threads", [1, 2])
+    def test_what_another_race_left_does_not_matter(self, functions, threads):
+        alone, together = DummyVecEnv(functions), TorcsVecEnv(functions, threads=threads)
+        drives = []
+        for envs in (alone, together):
+            envs.seed(0)
+            drive = [envs.reset().tobytes()]
+            for _ in range(40):
+                observations, rewards, dones, _ = envs.step(np.stack([GAS] * self.RACES))
+                drive.append((observations.tobytes(), rewards.tobytes(), dones.tobytes()))
+            drives.append(drive)
+            envs.close()
+        assert drives[0] == drives[1]
+
+    @pytest.mark.parametrize("made_by", ["number", "functions"])
+    @pytest.mark.usefixtures("game")
+    def test_few_worlds_are_loaded(self, monkeypatch, made_by):
+        pools = []
+
+        class Watched(WorldPool):
+            def __init__(self, makers):
+                super().__init__(makers)
+                self.loaded = list(self.examples)
+                pools.append(self)
+
+            def take(self, choice):
+                world = super().take(choice)
+                self.loaded += [world] if world not in self.loaded else []
+                return world
+
+        monkeypatch.setattr(several, "WorldPool", Watched)
+        options = {"track": TRACKS, "max_episode_steps": 2}
+        if made_by == "number":
+            envs = TorcsVecEnv(self.RACES, **options)
+        else:
+            env_id = "sb3_torcs:Torcs-v0"
+            envs = make_vec_env(env_id, self.RACES, env_kwargs=options, vec_env_cls=TorcsVecEnv)
+        envs.seed(0)
+        envs.reset()
+        for _ in range(60):
+            envs.step(np.stack([GAS] * self.RACES))
+        (pool,) = pools
+        assert self.RACES <= len(pool.loaded) < 3 * self.RACES
+        envs.close()
+        for world in pool.loaded:
+            with pytest.raises(Exception, match="close"):
+                world.engine.read(0)

@@ -289,12 +289,12 @@ def by_hand(agents, actions, **options):
     """What a vector environment is held to: each car asked and valued alone, until one ends."""
     envs = make_race(agents, track=TRACK, **options)
     observations = [[env.reset(seed=seed)[0] for seed, env in enumerate(envs)]]
-    engine = envs[0].backend.worlds[0].engine
+    engine = envs[0].backend.world.engine
     rewards, ended = [], False
     for row in actions:
         for env, action in zip(envs, row, strict=True):
             ((controls, _),) = env.begin_step(action)
-            engine.hold(env.backend.worlds[0].seat, *controls)
+            engine.hold(env.backend.world.seat, *controls)
         engine.drive(5)
         answers = [env.finish_step(lambda env=env: _read(env)) for env in envs]
         rewards.append([np.float32(answer[1]) for answer in answers])
@@ -309,7 +309,7 @@ def by_hand(agents, actions, **options):
 
 
 def _read(env):
-    world = env.backend.worlds[0]
+    world = env.backend.world
     return world.engine.read(world.seat)
 
 
@@ -409,7 +409,7 @@ class TestVectorEnvironment:
         drawn = set()
         for _ in range(40):
             first, second = (env.unwrapped.backend for env in envs.envs)
-            assert first.index == second.index
+            assert first.world.engine is second.world.engine
             drawn.add((first.track.name, envs.get_attr("car")[0].race_position))
             envs.step(np.array([GAS] * 2, np.float32))
         assert drawn == {(track, place) for track in (TRACK, "aalborg") for place in (1, 2)}
@@ -421,13 +421,13 @@ class TestVectorEnvironment:
         fleet = envs._batch._fleet
 
         class Losing:
-            close = fleet.close
+            close, put = fleet.close, fleet.put
 
-            def step(self, worlds, controls, ticks, cars):
-                fleet.step(worlds, controls, ticks, cars)
+            def step(self, races, controls, ticks, cars):
+                fleet.step(races, controls, ticks, cars)
                 return [0, 1]
 
-            def failure(self, world):
+            def failure(self, race):
                 return CarLost("the car is nowhere")
 
         envs._batch._fleet = Losing()
@@ -560,7 +560,7 @@ class TestAgentsAsOpponents:
         """Off the grid in the first seconds, while the other agent stands on its brake."""
         envs = make(1, 1, opponents=["ddpg-roads"], grid_place=2, track="aalborg")
         (backend,) = envs.get_attr("seat")
-        engine = backend.worlds[0].engine
+        engine = backend.world.engine
         envs.seed(0)
         envs.reset()
         for _ in range(28):
@@ -577,7 +577,7 @@ class TestAgentsAsOpponents:
             envs.seed(0)
             digest = [envs.reset().tobytes()]
             digest += [envs.step(action)[0].tobytes() for action in random_actions(40, 2)]
-            engine = envs.envs[0].unwrapped.backend.worlds[0].engine
+            engine = envs.envs[0].unwrapped.backend.world.engine
             seen.append((digest, [np.hstack(engine.read(car)).tobytes() for car in range(4)]))
         assert seen[0] == seen[1]
 
@@ -605,7 +605,7 @@ class TestAgentsAsOpponents:
                 assert all(np.array_equal(seen[0], other) for other in seen[1:])
                 seen = [env.step(action[0])[0] for env in (alone, noted)]
                 seen += [vector.step(action)[0][0] for vector in vectors]
-        opponent = alone.unwrapped.backend.worlds[0].engine.read(2)
+        opponent = alone.unwrapped.backend.world.engine.read(2)
         assert opponent.distance_raced > 1.0, "the agent behind has set off, too"
         assert len(log.frame()) == 2 * 20 * 5
         for env in (alone, noted, own):

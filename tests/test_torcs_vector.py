@@ -234,7 +234,7 @@ def test_a_car_that_is_lost_ends_its_own_race_only(make):
             raise CarLost("the car is nowhere")
         return fleet.wait(place)
 
-    envs._fleet = SimpleNamespace(begin=fleet.begin, finish=fleet.finish, wait=wait)
+    envs._fleet = SimpleNamespace(put=fleet.put, begin=fleet.begin, finish=fleet.finish, wait=wait)
     _, _, terminated, truncated, infos = envs.step(np.stack([GAS] * 2))
     assert (terminated.tolist(), truncated.tolist()) == ([False, True], [False, False])
     assert infos["end"].tolist() == ["", "lost"]

@@ -149,7 +149,7 @@ class Crew:
 
         :param worlds: their cars, in the order of the drivers
         """
-        self._race = SharedRace([worlds])
+        self._race = SharedRace.of(worlds)
         self._pilots = Pilots(self._members, self._race)
 
     def begin(self) -> None:

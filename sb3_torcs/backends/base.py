@@ -7,7 +7,7 @@ write these three methods and three attributes, and run the contract suite over 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -32,11 +32,13 @@ class Backend(Protocol):
     ``facts``, a :class:`~sb3_torcs.torcs.car_file.CarFacts` of the present episode's car.
     """
 
-    track: Track
-    """The track of the present episode."""
+    @property
+    def track(self) -> Track:
+        """The track of the present episode."""
 
-    car: str
-    """Name of the car, e.g. ``"car1-trb1"``."""
+    @property
+    def car(self) -> str:
+        """Name of the car, e.g. ``"car1-trb1"``."""
 
     range_finder_angles: FloatArray
     """(19,) [rad] of the range finders against the car's axis, left negative as in SCR."""
@@ -65,19 +67,27 @@ class Backend(Protocol):
 
 
 class Fleet(Protocol):
-    """Several worlds of one kind that are driven at once, in the process that has made them."""
+    """Worlds of one kind that are driven at once, one per race, in the process that made them."""
+
+    def put(self, race: int, world: Any) -> None:
+        """
+        Let a race go on in another world, or in the same.
+
+        :param race: which
+        :param world: of the same kind
+        """
 
     def step(
         self,
-        worlds: npt.NDArray[np.int64],
+        races: npt.NDArray[np.int64],
         controls: FloatArray,
         ticks: npt.NDArray[np.int64],
         cars: FloatArray,
     ) -> list[int]:
         """
-        Hold controls in some of the worlds.
+        Hold controls in some of the races.
 
-        :param worlds: (n,) which
+        :param races: (n,) which
         :param controls: (n, 5) as of :class:`~sb3_torcs.car.Controls`, finite and within their
             ranges; a gear of nan leaves it to the gearbox
         :param ticks: (n,) control ticks of 0.02 s
@@ -85,18 +95,18 @@ class Fleet(Protocol):
         :return: the rows that are not filled, of races that failed
         """
 
-    def failure(self, world: int) -> Exception:
+    def failure(self, race: int) -> Exception:
         """
         Return what stopped a race.
 
-        :param world: one that failed in the latest step
+        :param race: one that failed in the latest step
         """
 
-    def arrive(self, world: int, steps: Iterable[tuple[Controls, int]], car: CarState) -> None:
+    def arrive(self, race: int, steps: Iterable[tuple[Controls, int]], car: CarState) -> None:
         """
         Tell a world which steps it has been driven, before it is used without the fleet.
 
-        :param world: which
+        :param race: whose world
         :param steps: controls and ticks since it was told
         :param car: at their end
         """

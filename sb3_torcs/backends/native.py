@@ -350,65 +350,70 @@ class Fleet:
     """
     Several worlds that are driven at once, by threads that live as long as this object.
 
-    :param backends: each only once; seats of one race follow each other
+    :param worlds: one for each agent; seats of one race follow each other
     :param threads: that drive, with the calling one among them
     """
 
-    def __init__(self, backends: Sequence[NativeBackend | SeatWorld], threads: int) -> None:
-        self._backends = list(backends)
+    def __init__(self, worlds: Sequence[NativeBackend | SeatWorld], threads: int) -> None:
+        self._worlds = list(worlds)
         self._begun: dict[int, tuple[Controls, int]] = {}  # the latest step of each
-        engines = list(dict.fromkeys(backend.engine for backend in backends))
-        self._engines = np.array([engines.index(backend.engine) for backend in backends])
-        self._seats = np.array([backend.seat for backend in backends])
+        engines = list(dict.fromkeys(world.engine for world in worlds))
+        self._engines = np.array([engines.index(world.engine) for world in worlds])
+        self._seats = np.array([world.seat for world in worlds])
         self._fleet = _extension().Fleet(engines, threads)
 
-    def begin(self, index: int, controls: Controls, ticks: int) -> None:
+    def put(self, race: int, world: NativeBackend | SeatWorld) -> None:
+        """Let a race go on in another world; see :class:`~sb3_torcs.backends.base.Fleet`."""
+        self._worlds[race], self._seats[race] = world, world.seat
+        self._fleet.put(int(self._engines[race]), world.engine)
+
+    def begin(self, race: int, controls: Controls, ticks: int) -> None:
         """
         Begin a step of one world and return at once. Call :meth:`wait` before using that world.
 
-        :param index: of the backend
+        :param race: which
         :param controls: as of ``step``
         :param ticks: as of ``step``
         """
-        self._begun[index] = controls, ticks
+        self._begun[race] = controls, ticks
         steering, throttle, brake, gear, clutch = controls
-        self._fleet.begin(index, steering, throttle, brake, gear, ticks, clutch)
+        self._fleet.begin(race, steering, throttle, brake, gear, ticks, clutch)
 
-    def wait(self, index: int) -> CarState:
+    def wait(self, race: int) -> CarState:
         """
         Drive until the step of one world is done.
 
-        :param index: of the backend
+        :param race: which
         :return: as of ``step``
         """
-        state: CarState = self._fleet.wait(index)
-        self._backends[index].arrive(*self._begun[index], state)
+        state: CarState = self._fleet.wait(race)
+        self._worlds[race].arrive(*self._begun[race], state)
         return state
 
     def step(
         self,
-        worlds: npt.NDArray[np.int64],
+        races: npt.NDArray[np.int64],
         controls: FloatArray,
         ticks: npt.NDArray[np.int64],
         cars: FloatArray,
     ) -> list[int]:
         """Drive some of them; see :class:`~sb3_torcs.backends.base.Fleet`."""
-        engines, seats = self._engines[worlds], self._seats[worlds]
+        engines, seats = self._engines[races], self._seats[races]
         failed: list[int] = self._fleet.step(engines, seats, controls, ticks, cars)
         return failed
 
-    def failure(self, world: int) -> Exception:
+    def failure(self, race: int) -> Exception:
         """Return what stopped a race; see :class:`~sb3_torcs.backends.base.Fleet`."""
         try:
-            self._fleet.wait(int(self._engines[world]))
+            self._fleet.wait(int(self._engines[race]))
         except Exception as error:
             return error
         raise AssertionError("the race has not failed")
 
-    def arrive(self, world: int, steps: Iterable[tuple[Controls, int]], car: CarState) -> None:
+    def arrive(self, race: int, steps: Iterable[tuple[Controls, int]], car: CarState) -> None:
         """Tell a world what it has been driven; see :class:`~sb3_torcs.backends.base.Fleet`."""
         for controls, ticks in steps:
-            self._backends[world].arrive(controls, ticks, car)
+            self._worlds[race].arrive(controls, ticks, car)
 
     def finish(self) -> None:
         """Drive until all steps are done."""

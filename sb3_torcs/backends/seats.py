@@ -9,6 +9,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from sb3_torcs.backends.several import WorldPool
 from sb3_torcs.car import CarState, Controls, FloatArray, Start
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.torcs.car_file import CarFacts, car_facts
@@ -112,6 +113,10 @@ class Grid(NamedTuple):
     worlds: Sequence[SeatWorld]  # the cars of its agents
     crew: Any = None  # drives the opponents that are agents; see ``agents.pilots.Crew``
 
+    def close(self) -> None:
+        """Close the race."""
+        self.worlds[0].engine.close()
+
 
 class SharedRace:
     """
@@ -123,28 +128,32 @@ class SharedRace:
     ended the episode that they began the race with, the race is over, and the next reset begins
     another one, on a track and in a field that are drawn again.
 
-    :param grids: the cars of the agents, of each race that can be drawn
+    :param grids: of each race that can be drawn
     :param noise: whether sensors err as those of the SCR server's ``-noisy``
-    :param crews: of each such race who drives the opponents that are agents, or ``None``
     """
 
-    def __init__(
-        self,
-        grids: Sequence[Sequence[SeatWorld]],
-        noise: bool = False,
-        crews: Sequence[Any] = (),
-    ) -> None:
-        self.grids = [tuple(grid) for grid in grids]
-        self._crews = list(crews) or [None] * len(self.grids)
+    def __init__(self, grids: WorldPool[Grid], noise: bool = False) -> None:
+        self.grids = grids
+        grids.join()
+        self.index = 0  # of the present grid
+        self.grid = grids.take(0)
         self._tick = 0  # control ticks since the race began
         self._asked = -1  # when the crew was asked
-        self.index = 0  # of the present grid
-        self.agents = len(self.grids[0])
+        self.agents = len(self.grid.worlds)
         self._noise = noise
         self._waiting: set[int] = set()  # agents that have not begun an episode in this race
         self._lasting: set[int] = set()  # agents whose first episode in this race goes on
         self._open = self.agents
         self.seats = [Seat(self, number) for number in range(self.agents)]
+
+    @classmethod
+    def of(cls, worlds: Sequence[SeatWorld]) -> SharedRace:
+        """
+        Share one race, which is loaded.
+
+        :param worlds: the cars of its agents
+        """
+        return cls(WorldPool([lambda: Grid(worlds)]))
 
     def world(self, number: int) -> SeatWorld:
         """
@@ -152,7 +161,7 @@ class SharedRace:
 
         :param number: of the agent
         """
-        return self.grids[self.index][number]
+        return self.grid.worlds[number]
 
     def is_over(self, ending: set[int]) -> bool:
         """
@@ -165,6 +174,18 @@ class SharedRace:
     def end(self) -> None:
         """End the race: the next reset of an agent begins another."""
         self._waiting, self._lasting = set(), set()
+
+    def draw(self, rng: np.random.Generator) -> None:
+        """
+        Choose the next race.
+
+        :param rng: of the environment whose reset begins it
+        """
+        index = int(rng.integers(len(self.grids)))
+        if index != self.index:
+            grid = self.grids.take(index)
+            self.grids.give_back(self.index, self.grid)
+            self.index, self.grid = index, grid
 
     def begins_with(self, number: int) -> bool:
         """
@@ -204,8 +225,8 @@ class SharedRace:
         else:
             engine.start_at(*start)
         self._tick, self._asked = 0, -1
-        if self._crews[self.index] is not None:
-            self._crews[self.index].begin()
+        if self.grid.crew is not None:
+            self.grid.crew.begin()
 
     def join(self) -> None:
         """Let all agents begin in a race that is begun elsewhere."""
@@ -214,9 +235,8 @@ class SharedRace:
 
     def ask(self) -> None:
         """Ask the opponents that are agents what they do next, once before each timestep."""
-        crew = self._crews[self.index]
-        if crew is not None and self._asked != self._tick:
-            crew.act(self._tick)
+        if self.grid.crew is not None and self._asked != self._tick:
+            self.grid.crew.act(self._tick)
             self._asked = self._tick
 
     def advance(self, ticks: int) -> None:
@@ -238,11 +258,11 @@ class SharedRace:
         self.advance(ticks)
 
     def leave(self) -> None:
-        """Close the race when the last seat is left."""
+        """Leave the race to others when the last seat is left."""
         self._open -= 1
         if self._open == 0:
-            for grid in self.grids:
-                grid[0].engine.close()
+            self.grids.give_back(self.index, self.grid)
+            self.grids.leave()
 
 
 class Seat:
@@ -257,40 +277,39 @@ class Seat:
 
     def __init__(self, race: SharedRace, number: int) -> None:
         self.race, self.number = race, number
-        self.worlds = tuple(grid[number] for grid in race.grids)
-        self.gears = min(world.gears for world in self.worlds)
-        self.range_finder_angles = self.worlds[0].range_finder_angles
+        self.gears = min(grid.worlds[number].gears for grid in race.grids.examples)
+        self.range_finder_angles = self.world.range_finder_angles
         self._closed = False
 
     @property
-    def index(self) -> int:
-        """Which of the worlds is driven."""
-        return self.race.index
+    def world(self) -> SeatWorld:
+        """The agent's car in the present race."""
+        return self.race.world(self.number)
 
     @property
     def track(self) -> Track:
         """The track of the present race."""
-        return self.worlds[self.index].track
+        return self.world.track
 
     @property
     def profile(self) -> RoadProfile:
         """The road of the present race with its hills."""
-        return self.worlds[self.index].profile
+        return self.world.profile
 
     @property
     def car(self) -> str:
-        """The agent's car in the present race."""
-        return self.worlds[self.index].car
+        """Name of the agent's car in the present race."""
+        return self.world.car
 
     @property
     def facts(self) -> CarFacts:
         """What the file of the agent's car in the present race says."""
-        return self.worlds[self.index].facts
+        return self.world.facts
 
     def draw_track(self, rng: np.random.Generator) -> None:
         """Choose the next race, if it begins now; see ``Backend``."""
         if self.race.begins_with(self.number):
-            self.race.index = int(rng.integers(len(self.worlds)))
+            self.race.draw(rng)
 
     def reset(self, rng: np.random.Generator, start: Start | None) -> CarState:
         """Begin an episode; see :meth:`SharedRace.reset`."""
@@ -310,24 +329,20 @@ class Seat:
 
         :param controls: finite and within their ranges
         """
-        world = self.race.world(self.number)
-        world.engine.hold(world.seat, *controls)
+        self.world.engine.hold(self.world.seat, *controls)
 
     def read(self) -> CarState:
         """Return the car as it is."""
-        world = self.race.world(self.number)
-        return world.engine.read(world.seat)
+        return self.world.engine.read(self.world.seat)
 
     def retire(self) -> None:
         """Take the car off the road, until another race begins."""
-        world = self.race.world(self.number)
-        world.engine.retire(world.seat)
+        self.world.engine.retire(self.world.seat)
 
     @property
     def finished(self) -> bool:
         """Whether the car was flagged off."""
-        world = self.race.world(self.number)
-        return world.engine.finished(world.seat)
+        return self.world.engine.finished(self.world.seat)
 
     def close(self) -> None:
         """Leave the race, which is closed by the last one."""

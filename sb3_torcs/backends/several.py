@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any, TypeGuard
+import itertools
+import pickle
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from functools import partial
+from typing import Any, Generic, Protocol, TypeGuard, TypeVar
 
 import numpy as np
 
@@ -15,7 +20,15 @@ from sb3_torcs.torcs.car_file import CarFacts
 from sb3_torcs.tracks.profile import RoadProfile
 from sb3_torcs.tracks.track import Track
 
-__all__ = ["SeveralWorlds", "is_several", "one_or_several", "world_index", "worlds_of"]
+__all__ = [
+    "SeveralWorlds",
+    "WorldPool",
+    "is_several",
+    "one_or_several",
+    "present_world",
+    "shared_worlds",
+    "world_pool",
+]
 
 
 def is_several(choice: Any, name: str = "track") -> TypeGuard[Sequence[Any]]:
@@ -32,92 +45,207 @@ def is_several(choice: Any, name: str = "track") -> TypeGuard[Sequence[Any]]:
     return several
 
 
-def one_or_several(make: Callable[[Any, Any], Backend], track: Any, car: Any) -> Backend:
-    """
-    Make the world of a track and a car, or one world for each pair if a list is given.
+class Closable(Protocol):
+    """What a pool closes at the end."""
 
-    :param make: makes the world of a track and a car
+    def close(self) -> None:
+        """Free all resources."""
+
+
+World = TypeVar("World", bound=Closable)
+
+
+class WorldPool(Generic[World]):
+    """
+    Worlds among which each episode draws. Environments of one kind may share them.
+
+    One world of each choice is loaded at once, so that a wrong option is told at once. More of it
+    are loaded when it is drawn and there is no spare one.
+
+    :param makers: load a world of each choice
+    """
+
+    def __init__(self, makers: Iterable[Callable[[], World]]) -> None:
+        self.makers = tuple(makers)
+        self._spare: list[list[World]] = []
+        self._users = 0
+        try:
+            for make in self.makers:
+                self._spare.append([make()])
+        except BaseException:
+            self._close_spare()
+            raise
+        self.examples = tuple(world for (world,) in self._spare)
+        """One world of each choice, to look up what holds for all of that choice."""
+
+    def __len__(self) -> int:
+        return len(self.makers)
+
+    def join(self) -> None:
+        """Take note of a user, who may take one world at a time."""
+        self._users += 1
+
+    def take(self, choice: int) -> World:
+        """
+        Take a world, in which its former user has left what it likes.
+
+        :param choice: its index among the makers
+        """
+        return self._spare[choice].pop() if self._spare[choice] else self.makers[choice]()
+
+    def give_back(self, choice: int, world: World) -> None:
+        """
+        Leave a world to those who draw it next.
+
+        :param choice: its index among the makers
+        :param world: from :meth:`take`
+        """
+        self._spare[choice].append(world)
+
+    def leave(self) -> None:
+        """Take note that a user has given its world back for good. The last one closes them all."""
+        self._users -= 1
+        if self._users == 0:
+            self._close_spare()
+
+    def _close_spare(self) -> None:
+        for worlds in self._spare:
+            while worlds:
+                worlds.pop().close()
+
+
+_shared: ContextVar[dict[bytes, WorldPool[Any]] | None] = ContextVar("_shared", default=None)
+
+
+@contextmanager
+def shared_worlds() -> Iterator[None]:
+    """
+    Let environments that are made in this context share their pools, where options are the same.
+
+    Where each of 100 races had its own world of each of ten tracks, 1,000 would be loaded.
+    """
+    token = _shared.set({})
+    try:
+        yield
+    finally:
+        _shared.reset(token)
+
+
+def world_pool(makers: Sequence[partial[World]]) -> WorldPool[World]:
+    """
+    Make a pool, or find the one that another environment has made in :func:`shared_worlds`.
+
+    :param makers: as of :class:`WorldPool`, with arguments that can be pickled
+    """
+    pools = _shared.get()
+    if pools is None:
+        return WorldPool(makers)
+    key = pickle.dumps(makers)
+    if key not in pools:
+        pools[key] = WorldPool(makers)
+    return pools[key]
+
+
+def one_or_several(make: Callable[..., Backend], track: Any, car: Any) -> Backend:
+    """
+    Make the world of a track and a car, or several for each pair if a list is given.
+
+    :param make: makes the world of ``track`` and ``car``
     :param track: or several
     :param car: or several
     :raises InvalidOption: if a list is empty
     """
     several = is_several(track), is_several(car, "car")
     if not any(several):
-        return make(track, car)
+        return make(track=track, car=car)
     tracks, cars = (track if several[0] else [track]), (car if several[1] else [car])
-    return SeveralWorlds(make(one, other) for one in tracks for other in cars)
+    pairs = itertools.product(tracks, cars)
+    return SeveralWorlds(world_pool([partial(make, track=one, car=other) for one, other in pairs]))
 
 
 class SeveralWorlds:
     """
     One of several cars on one of several tracks: each episode draws a pair of them.
 
-    :param worlds: one for each track and car; they have the same range finders
+    :param pool: of a world for each track and car; they have the same range finders
     """
 
-    def __init__(self, worlds: Iterable[Backend]) -> None:
-        self.worlds = tuple(worlds)
-        self._enter(0)
-        self.gears: int = min(getattr(world, "gears", GEARS) for world in self.worlds)
-        self.range_finder_angles = self._world.range_finder_angles
-        self.tells_race = all(getattr(world, "tells_race", False) for world in self.worlds)
-        self.conditions: Sequence[str] = getattr(self._world, "conditions", ())
+    def __init__(self, pool: WorldPool[Backend]) -> None:
+        self._pool = pool
+        pool.join()
+        self._closed = False
+        self.index = 0  # of the present world
+        self.world = pool.take(0)
+        self.gears: int = min(getattr(world, "gears", GEARS) for world in pool.examples)
+        self.range_finder_angles = self.world.range_finder_angles
+        self.tells_race = all(getattr(world, "tells_race", False) for world in pool.examples)
+        self.conditions: Sequence[str] = getattr(self.world, "conditions", ())
+
+    @property
+    def track(self) -> Track:
+        """The track of the present episode."""
+        return self.world.track
+
+    @property
+    def car(self) -> str:
+        """The car of the present episode."""
+        return self.world.car
 
     @property
     def profile(self) -> RoadProfile | None:
         """The road of the present episode, if it has hills."""
-        return getattr(self._world, "profile", None)
+        return getattr(self.world, "profile", None)
 
     @property
     def facts(self) -> CarFacts | None:
         """What the file of the present episode's car says, if its world knows."""
-        return getattr(self._world, "facts", None)
-
-    def _enter(self, index: int) -> None:
-        self.index = index
-        self._world = self.worlds[index]
-        self.track: Track = self._world.track
-        self.car = self._world.car
+        return getattr(self.world, "facts", None)
 
     def draw_track(self, rng: np.random.Generator) -> None:
         """Choose the next episode's world; see :class:`~sb3_torcs.backends.base.Backend`."""
-        self._enter(int(rng.integers(len(self.worlds))))
+        index = int(rng.integers(len(self._pool)))
+        if index == self.index:
+            return
+        world = self._pool.take(index)
+        self._pool.give_back(self.index, self.world)
+        self.index, self.world = index, world
+        if self.conditions:
+            self.set_conditions(1.0, 1.0)  # whatever another environment has set
 
     def set_conditions(self, grip: float, mass: float) -> None:
         """Change the next episode's world; see :class:`~sb3_torcs.backends.base.Backend`."""
-        world: Any = self._world
+        world: Any = self.world
         world.set_conditions(grip, mass)
 
     def reset(self, rng: np.random.Generator, start: Start | None) -> CarState:
         """Begin an episode; see :class:`~sb3_torcs.backends.base.Backend`."""
-        car = self._world.reset(rng, start)
-        self.track = self._world.track  # a world may draw a new one by itself
-        return car
+        return self.world.reset(rng, start)
 
     def step(self, controls: Controls, ticks: int) -> CarState:
         """Drive on; see :class:`~sb3_torcs.backends.base.Backend`."""
-        return self._world.step(controls, ticks)
+        return self.world.step(controls, ticks)
 
     def close(self) -> None:
-        """Close all worlds."""
-        for world in self.worlds:
-            world.close()
+        """Leave the worlds to others; the last one closes them."""
+        if not self._closed:
+            self._closed = True
+            self._pool.give_back(self.index, self.world)
+            self._pool.leave()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_pool": self._pool.makers}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._pool = WorldPool(state["_pool"])
+        self._pool.join()
 
 
-def worlds_of(backend: Backend) -> tuple[Backend, ...]:
+def present_world(backend: Backend) -> Backend:
     """
-    Return the worlds of a backend.
+    Return the world of the present episode.
 
     :param backend: one world, or several
     """
-    worlds: tuple[Backend, ...] = getattr(backend, "worlds", (backend,))
-    return worlds
-
-
-def world_index(backend: Backend) -> int:
-    """
-    Return the index of the world of the present episode.
-
-    :param backend: one world, or several
-    """
-    return int(getattr(backend, "index", 0))
+    world: Backend = getattr(backend, "world", backend)
+    return world

@@ -17,7 +17,7 @@ from sb3_torcs.backends.lite.fleet import LiteFleet
 from sb3_torcs.backends.native import Fleet as NativeFleet
 from sb3_torcs.backends.native import NativeBackend
 from sb3_torcs.backends.seats import SeatWorld
-from sb3_torcs.backends.several import world_index, worlds_of
+from sb3_torcs.backends.several import present_world
 from sb3_torcs.car import CAR_RECORD, CarState, Controls, FloatArray, car_from_record
 from sb3_torcs.envs.compiled import COMPILED, aid_cars, read_actions, value_timesteps
 from sb3_torcs.envs.racing import RacingEnv, racing_info
@@ -134,10 +134,8 @@ class Batch:
             )
         self._layout, self._view = self.envs[0].layout, View(*views)
         self._bounds = np.array(self._layout.low), np.array(self._layout.high)
-        worlds = [worlds_of(env.backend) for env in self.envs]
-        self._first = np.cumsum([0, *map(len, worlds)])[:-1]
-        self._fleet = fleet_of([world for several in worlds for world in several], self.threads)
-        self._worlds = self._first.astype(np.int64)
+        self._fleet = fleet_of([present_world(env.backend) for env in self.envs], self.threads)
+        self._races = np.arange(number)
         self._cars = np.zeros((number, CAR_NUMBERS))
         self._laps = np.full(number, np.inf)
         self._runoff = np.zeros(number)
@@ -173,7 +171,7 @@ class Batch:
         """
         env = self.envs[race]
         assert env.car is not None, "step raises before the first reset"
-        self._worlds[race] = self._first[race] + world_index(env.backend)
+        self._fleet.put(race, present_world(env.backend))
         self._cars[race] = np.hstack(env.car)
         self._laps[race] = np.inf if env.laps is None else env.laps
         self._runoff[race], self._recovery[race] = env.runoff, env.recovery
@@ -201,7 +199,7 @@ class Batch:
             for controls, ticks in parts
             if ticks[race]
         ]
-        self._fleet.arrive(int(self._worlds[race]), steps, car)
+        self._fleet.arrive(race, steps, car)
         env.arrive(car, _controls(self._controls[race]), int(self._standing[race]))
         self._driven[race] = []
 
@@ -264,7 +262,7 @@ class Batch:
             patience,
             waiting,
             ended,
-            {race: self._fleet.failure(int(self._worlds[race])) for race in failed},
+            {race: self._fleet.failure(race) for race in failed},
         )
 
     def finish(self, race: int, timestep: Timestep, act: Callable[[], Any]) -> Any:
@@ -327,12 +325,12 @@ class Batch:
         :return: the races that failed, whose rows are not
         """
         if len(parts) == 1:
-            return self._fleet.step(self._worlds, *parts[0], after)
+            return self._fleet.step(self._races, *parts[0], after)
         going, failed = np.ones(len(self.envs), np.bool_), []
         for controls, ticks in parts:
             races = np.flatnonzero(going & (ticks > 0))
             cars = np.empty((len(races), CAR_NUMBERS))
-            lost = self._fleet.step(self._worlds[races], controls[races], ticks[races], cars)
+            lost = self._fleet.step(races, controls[races], ticks[races], cars)
             after[races] = cars
             failed += races[lost].tolist()
             going[races[lost]] = False

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -279,10 +280,7 @@ def _world(
         )  # fmt: skip
         world: Any = LoneSeat(race, 0)  # whose track and car may not be set
         return world
-
-    def make(track: Any, car: str) -> Backend:
-        return NativeBackend(track, car=car, **options, sensor_noise=sensor_noise)
-
+    make = partial(NativeBackend, sensor_noise=sensor_noise, **options)
     return one_or_several(make, track, car)
 
 

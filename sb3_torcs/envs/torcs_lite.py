@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 from sb3_torcs.actions import ActionName, GearboxName, used_gearbox
-from sb3_torcs.backends.base import Backend
 from sb3_torcs.backends.lite.backend import LiteBackend
 from sb3_torcs.backends.several import one_or_several
 from sb3_torcs.car import DEFAULT_CAR, StartName
@@ -128,10 +128,8 @@ class TorcsLiteEnv(RacingEnv):
             raise InvalidOption(f"picture is {picture!r}; expected 'above'")
         _refuse(of_the_game)
 
-        def make(track: Any, car: str) -> Backend:
-            box = used_gearbox(gearbox, action)
-            return LiteBackend(track, car=car, range_finders=range_finders, gearbox=box)
-
+        box = used_gearbox(gearbox, action)
+        make = partial(LiteBackend, range_finders=range_finders, gearbox=box)
         super().__init__(
             one_or_several(make, track, car),
             action=action,

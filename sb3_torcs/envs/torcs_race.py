@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from sb3_torcs.actions import ActionName, GearboxName, used_gearbox
 from sb3_torcs.backends.native import load_race
 from sb3_torcs.backends.seats import Grid, Seat, SeatWorld, SharedRace
-from sb3_torcs.backends.several import is_several
+from sb3_torcs.backends.several import is_several, world_pool
 from sb3_torcs.car import DEFAULT_CAR, CarState, checked_laps
 from sb3_torcs.envs.racing import RacingEnv
 from sb3_torcs.errors import InvalidOption
@@ -142,7 +143,7 @@ def make_shared_race(
     **shared: Any,
 ) -> SharedRace:
     """
-    Load all races that can be drawn.
+    Make a race that is drawn among several, one of each of which is loaded at once.
 
     :param agents: as of :func:`make_race`
     :param track: as there
@@ -163,14 +164,18 @@ def make_shared_race(
         fields,
         grid_place if is_several(grid_place, "grid_place") else [grid_place],
     )
-    grids = [
-        make_grid(one, model, agents=agents, opponents=field, grid_place=place, **shared)
-        for one, model, field, place in choices
-    ]
-    for grid in grids:
+    grids = world_pool(
+        [
+            partial(
+                make_grid, one, model, agents=agents, opponents=field, grid_place=place, **shared
+            )
+            for one, model, field, place in choices
+        ]
+    )
+    for grid in grids.examples:
         if grid.crew is not None and grid.crew.action_repeats != {action_repeat}:
             raise InvalidOption(
                 f"action_repeat is {action_repeat!r}, and agents among the opponents were trained "
                 f"with {', '.join(map(str, sorted(grid.crew.action_repeats)))}; give all the same"
             )
-    return SharedRace([grid.worlds for grid in grids], sensor_noise, [grid.crew for grid in grids])
+    return SharedRace(grids, sensor_noise)

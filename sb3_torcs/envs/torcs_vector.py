@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import os
 from collections.abc import Callable, Iterable
@@ -17,7 +16,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from sb3_torcs.backends.native import Fleet
-from sb3_torcs.backends.several import world_index, worlds_of
+from sb3_torcs.backends.several import present_world, shared_worlds
 from sb3_torcs.car import CarState, is_count
 from sb3_torcs.envs.conditions import Part
 from sb3_torcs.envs.racing import Observation
@@ -90,13 +89,13 @@ class TorcsVectorEnv(SyncVectorEnv):
         timesteps = math.inf if limit == NO_LIMIT else limit
         self.envs: list[_Race]  # type: ignore[assignment]  # a list of Env, says Gymnasium
         self._env_obs: list[Observation | None]  # type: ignore[assignment]  # of None, says Gymnasium
-        super().__init__(
-            [lambda: _Race(timesteps, **options)] * int(num_envs), autoreset_mode=autoreset_mode
-        )
+        with shared_worlds():
+            super().__init__(
+                [lambda: _Race(timesteps, **options)] * int(num_envs), autoreset_mode=autoreset_mode
+            )
         self.threads = min(threads or len(os.sched_getaffinity(0)), self.num_envs)
-        worlds: list[Any] = [worlds_of(env.backend) for env in self.envs]
-        self._first = [0, *itertools.accumulate(map(len, worlds))]  # of each race's worlds
-        self._fleet = Fleet([world for several in worlds for world in several], self.threads)
+        worlds: list[Any] = [present_world(env.backend) for env in self.envs]
+        self._fleet: Any = Fleet(worlds, self.threads)
 
     def step(self, actions: Iterable[npt.NDArray[np.float32]]) -> Answers:
         """
@@ -123,24 +122,21 @@ class TorcsVectorEnv(SyncVectorEnv):
         }
         try:
             for index, (held, *_) in parts.items():
-                self._fleet.begin(self._world(index), *held)
+                self._fleet.put(index, present_world(self.envs[index].backend))
+                self._fleet.begin(index, *held)
             for index, (_, *later) in parts.items():
                 for held in later:  # the controls have arrived
-                    self._go_on(self._world(index), held)
+                    self._go_on(index, held)
             return self._collect(anew)
         except BaseException:
             self._fleet.finish()  # so that a reset finds no thread at work
             raise
 
-    def _go_on(self, world: int, held: Part) -> None:
+    def _go_on(self, race: int, held: Part) -> None:
         """Drive the next part of a timestep, unless the race has failed in the one before."""
         with suppress(CarLost):  # told when the car is collected
-            self._fleet.wait(world)
-            self._fleet.begin(world, *held)
-
-    def _world(self, index: int) -> int:
-        """The world of the fleet in which a race is."""
-        return self._first[index] + world_index(self.envs[index].backend)
+            self._fleet.wait(race)
+            self._fleet.begin(race, *held)
 
     def _begin_anew(self) -> list[bool]:
         """Say for each race whether this timestep begins an episode instead."""
@@ -167,7 +163,7 @@ class TorcsVectorEnv(SyncVectorEnv):
                 observation, info = env.reset()
             else:
                 observation, reward, end, cut, info = env.finish_step(
-                    partial(self._fleet.wait, self._world(index))
+                    partial(self._fleet.wait, index)
                 )
                 rewards[index] = reward
                 if end or cut:

@@ -111,27 +111,28 @@ std::vector<Entry> entries_of(const std::vector<std::pair<std::string, int>>& na
     return entries;
 }
 
-std::vector<Engine*> checked(std::vector<Engine*> engines) {
-    for (const Engine* engine : engines)
+template <typename Pointer>
+std::vector<Pointer> checked(std::vector<Pointer> engines) {
+    for (const Pointer& engine : engines)
         if (!engine) throw py::type_error("engine is None; expected an Engine");
     return engines;
 }
 
 // Reads orders from arrays with one row per order. Controls are those of sb3_torcs.car.Controls; a
 // gear of NaN leaves the choice to the gearbox. Arrivals are written into the rows of `cars`.
-std::vector<Fleet::Order> orders_of(const py::array_t<std::int64_t, py::array::c_style>& indices,
+std::vector<Fleet::Order> orders_of(const py::array_t<std::int64_t, py::array::c_style>& races,
                                     const py::array_t<std::int64_t, py::array::c_style>& seats,
                                     const py::array_t<double, py::array::c_style>& controls,
                                     const py::array_t<std::int64_t, py::array::c_style>& ticks,
                                     py::array_t<double, py::array::c_style>& cars) {
     constexpr py::ssize_t NUMBERS = sizeof(Reading) / sizeof(double);
-    const py::ssize_t number = indices.size();
-    if (indices.ndim() != 1 || ticks.ndim() != 1 || ticks.size() != number || seats.ndim() != 1 ||
+    const py::ssize_t number = races.size();
+    if (races.ndim() != 1 || ticks.ndim() != 1 || ticks.size() != number || seats.ndim() != 1 ||
         seats.size() != number || controls.ndim() != 2 || controls.shape(0) != number ||
         controls.shape(1) != 5 || cars.ndim() != 2 || cars.shape(0) != number ||
         cars.shape(1) != NUMBERS)
         throw py::type_error(
-            "expected indices and seats (n,), controls (n, 5), ticks (n,), cars (n, " +
+            "expected races and seats (n,), controls (n, 5), ticks (n,), cars (n, " +
             std::to_string(NUMBERS) + ")");
     const auto asked = controls.unchecked<2>();
     Reading* const arrivals = reinterpret_cast<Reading*>(cars.mutable_data());
@@ -140,7 +141,7 @@ std::vector<Fleet::Order> orders_of(const py::array_t<std::int64_t, py::array::c
     for (py::ssize_t i = 0; i < number; i++) {
         std::optional<int> gear;
         if (!std::isnan(asked(i, 3))) gear = static_cast<int>(asked(i, 3));
-        orders.push_back({static_cast<std::size_t>(indices.at(i)), static_cast<int>(seats.at(i)),
+        orders.push_back({static_cast<std::size_t>(races.at(i)), static_cast<int>(seats.at(i)),
                           controls_of(asked(i, 0), asked(i, 1), asked(i, 2), gear, asked(i, 4)),
                           static_cast<int>(ticks.at(i)), arrivals + i});
     }
@@ -239,7 +240,7 @@ PYBIND11_MODULE(_engine, module) {
         .def_property_readonly("size",
                                [](const Moment& moment) { return moment.race.memory.size(); });
 
-    py::class_<Engine>(module, "Engine", "One race of the real game.")
+    py::class_<Engine, std::shared_ptr<Engine>>(module, "Engine", "One race of the real game.")
         .def(py::init([](const std::string& data, const std::string& libraries,
                          const std::string& plib, const std::string& track,
                          const std::string& session,
@@ -417,41 +418,49 @@ PYBIND11_MODULE(_engine, module) {
         });
 
     py::class_<Fleet>(module, "Fleet", "Engines that are driven at once, on threads that stay.")
-        .def(py::init([](const std::vector<Engine*>& engines, int threads) {
+        .def(py::init([](const std::vector<std::shared_ptr<Engine>>& engines, int threads) {
                  return std::make_unique<Fleet>(checked(engines), threads);
              }),
-             py::keep_alive<1, 2>(), "engines"_a, "threads"_a)
+             "engines"_a, "threads"_a)
+        .def(
+            "put",
+            [](Fleet& fleet, std::size_t race, const std::shared_ptr<Engine>& engine) {
+                checked<std::shared_ptr<Engine>>({engine});
+                const WithoutPython released;
+                fleet.put(race, engine);
+            },
+            "race"_a, "engine"_a, "Let a race go on with another engine.")
         .def(
             "begin",
-            [](Fleet& fleet, std::size_t index, double steering, double throttle, double brake,
+            [](Fleet& fleet, std::size_t race, double steering, double throttle, double brake,
                std::optional<int> gear, int ticks, double clutch) {
                 const Controls controls = controls_of(steering, throttle, brake, gear, clutch);
                 const WithoutPython released;
-                fleet.begin(index, controls, ticks);
+                fleet.begin(race, controls, ticks);
             },
-            "index"_a, "steering"_a, "throttle"_a, "brake"_a, "gear"_a, "ticks"_a, "clutch"_a = 0.0)
+            "race"_a, "steering"_a, "throttle"_a, "brake"_a, "gear"_a, "ticks"_a, "clutch"_a = 0.0)
         .def("wait",
-             [](Fleet& fleet, std::size_t index) {
+             [](Fleet& fleet, std::size_t race) {
                  const Reading* reading;
                  {
                      const WithoutPython released;
-                     reading = &fleet.wait(index);
+                     reading = &fleet.wait(race);
                  }
                  return as_state(*reading);
              })
         .def(
             "step",
-            [](Fleet& fleet, const py::array_t<std::int64_t, py::array::c_style>& indices,
+            [](Fleet& fleet, const py::array_t<std::int64_t, py::array::c_style>& races,
                const py::array_t<std::int64_t, py::array::c_style>& seats,
                const py::array_t<double, py::array::c_style>& controls,
                const py::array_t<std::int64_t, py::array::c_style>& ticks,
                py::array_t<double, py::array::c_style>& cars) {
                 const std::vector<Fleet::Order> orders =
-                    orders_of(indices, seats, controls, ticks, cars);
+                    orders_of(races, seats, controls, ticks, cars);
                 const WithoutPython released;
                 return fleet.step(orders);
             },
-            "indices"_a, "seats"_a, "controls"_a, "ticks"_a, py::arg("cars").noconvert(),
+            "races"_a, "seats"_a, "controls"_a, "ticks"_a, py::arg("cars").noconvert(),
             "Drive several at once; writes their cars, and returns the rows of those that failed.")
         .def("finish", [](Fleet& fleet) {
             const WithoutPython released;

@@ -5,41 +5,47 @@
 
 namespace torcs {
 
-Fleet::Fleet(const std::vector<Engine*>& engines, int threads)
+Fleet::Fleet(std::vector<std::shared_ptr<Engine>> engines, int threads)
     : tasks_(engines.size()), pool_(threads, tasks_.size(), [this](std::size_t i) { work(i); }) {
-    for (std::size_t i = 0; i < engines.size(); i++) tasks_[i].engine = engines[i];
+    for (std::size_t i = 0; i < engines.size(); i++) tasks_[i].engine = std::move(engines[i]);
 }
 
-void Fleet::begin(std::size_t index, const Controls& controls, int ticks) {
-    begin({{index, FIRST_AGENT, controls, ticks, &tasks_.at(index).reading}});
+void Fleet::put(std::size_t race, std::shared_ptr<Engine> engine) {
+    Task& task = tasks_.at(race);
+    pool_.wait(race);
+    task.engine = std::move(engine);
+}
+
+void Fleet::begin(std::size_t race, const Controls& controls, int ticks) {
+    begin({{race, FIRST_AGENT, controls, ticks, &tasks_.at(race).reading}});
 }
 
 void Fleet::begin(std::vector<Order> orders) {
-    const std::size_t index = orders.front().index;
-    pool_.wait(index);
-    tasks_[index].orders = std::move(orders);
-    pool_.begin(index);
+    const std::size_t race = orders.front().race;
+    pool_.wait(race);
+    tasks_[race].orders = std::move(orders);
+    pool_.begin(race);
 }
 
 std::vector<std::size_t> Fleet::step(const std::vector<Order>& orders) {
-    for (const Order& order : orders) (void)tasks_.at(order.index);  // before any of them drives
+    for (const Order& order : orders) (void)tasks_.at(order.race);  // before any of them drives
     for (auto first = orders.begin(); first != orders.end();) {
         const auto last = std::find_if(
-            first, orders.end(), [&](const Order& order) { return order.index != first->index; });
+            first, orders.end(), [&](const Order& order) { return order.race != first->race; });
         begin({first, last});
         first = last;
     }
     std::vector<std::size_t> failed;
     for (std::size_t i = 0; i < orders.size(); i++) {
-        pool_.wait(orders[i].index);
-        if (tasks_[orders[i].index].failure) failed.push_back(i);
+        pool_.wait(orders[i].race);
+        if (tasks_[orders[i].race].failure) failed.push_back(i);
     }
     return failed;
 }
 
-const Reading& Fleet::wait(std::size_t index) {
-    const Task& task = tasks_.at(index);
-    pool_.wait(index);
+const Reading& Fleet::wait(std::size_t race) {
+    const Task& task = tasks_.at(race);
+    pool_.wait(race);
     if (task.failure) std::rethrow_exception(task.failure);
     return task.reading;
 }

@@ -218,7 +218,7 @@ def run_race(
                 SeatWorld(engine, seat, road, agent.angles)
                 for seat, agent in zip(engine.agents, agents, strict=True)
             ]
-            pilots = Pilots(agents, SharedRace([grid]), trust)
+            pilots = Pilots(agents, SharedRace.of(grid), trust)
             pilots.begin(seed)
         else:
             engine.start()

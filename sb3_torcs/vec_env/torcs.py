@@ -15,6 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 from sb3_torcs.backends.seats import Seat, SharedRace
+from sb3_torcs.backends.several import shared_worlds
 from sb3_torcs.car import is_count
 from sb3_torcs.envs.batch import Batch, Timestep
 from sb3_torcs.envs.making import EnvMaker, env_makers
@@ -150,11 +151,13 @@ class TorcsVecEnv(DummyVecEnv):
                 )
             makers = list(races)
         elif is_count(races):
-            made = env_makers(int(races), agents, env_id, env_kwargs)  # type: ignore[arg-type]
+            with shared_worlds():  # races of several agents are loaded here
+                made = env_makers(int(races), agents, env_id, env_kwargs)  # type: ignore[arg-type]
             makers = [partial(_monitored, make) for make in made]
         else:
             raise InvalidOption(f"races is {races!r}; expected a whole number >= 1")
-        super().__init__(makers)
+        with shared_worlds():
+            super().__init__(makers)
         try:
             self._races = [_Race(env) for env in self._envs]
             self._batch = Batch([race.racing for race in self._races], threads)

@@ -84,6 +84,14 @@ class LiteBackend:
         state[:] = self._state
         self._state = state
 
+    def keeps_state_in(self, state: FloatArray) -> bool:
+        """
+        Check whether an array holds the state of the car.
+
+        :param state: (STATE_SIZE,)
+        """
+        return self._state is state
+
     @property
     def road(self) -> tuple[FloatArray, Edges]:
         """The present track as the physics takes it: its table, and the edges of its road."""

@@ -31,7 +31,7 @@ RACE = OPPONENTS + 36
 @njit(cache=True, nogil=True)
 def _drive(
     rows: Rows,
-    worlds: Rows,
+    races: Rows,
     states: FloatArray,
     table: FloatArray,
     shapes: FloatArray,
@@ -49,27 +49,27 @@ def _drive(
     Drive worlds that are on one track.
 
     :param rows: of the worlds, in the arrays that have a row for each race of a step
-    :param worlds: (n,) which world each race is in
-    :param states: (worlds, STATE_SIZE) of the physics, changed
+    :param races: (n,) which race each row is of
+    :param states: (races, STATE_SIZE) of the physics, changed
     :param table: ``Track.table``
     :param shapes: of the road's edges, as :class:`~sb3_torcs.backends.lite.rays.Edges` has them
     :param first: of the edges
     :param reach: of the edges
-    :param angles: (worlds, 19) of the range finders [rad]
-    :param gearboxes: (worlds,) ``AUTOMATIC`` or ``BY_ROAD_SPEED``
-    :param flying: (worlds,) whether the episode began elsewhere than on the grid
+    :param angles: (races, 19) of the range finders [rad]
+    :param gearboxes: (races,) ``AUTOMATIC`` or ``BY_ROAD_SPEED``
+    :param flying: (races,) whether the episode began elsewhere than on the grid
     :param controls: (n, 5)
     :param ticks: (n,) control ticks
     :param cars: (n, 111) filled
     :param lost: (n,) filled: whether the physics has given NaN
     """
     for row in rows:
-        world = worlds[row]
-        state, car = states[world], cars[row]
+        race = races[row]
+        state, car = states[race], cars[row]
         steering, throttle, brake, gear, clutch = controls[row]
-        wanted = gearboxes[world] if math.isnan(gear) else int(gear)
+        wanted = gearboxes[race] if math.isnan(gear) else int(gear)
         asked = (steering, throttle, brake, wanted, clutch)
-        physics.advance(state, table, asked, ticks[row], flying[world])
+        physics.advance(state, table, asked, ticks[row], flying[race])
         lost[row] = not math.isfinite(state[physics.X] + state[physics.VX])
         physics.read(
             state,
@@ -77,7 +77,7 @@ def _drive(
             shapes,
             first,
             reach,
-            angles[world],
+            angles[race],
             car[: physics.SCALARS],
             car[WHEELS:BEAMS],
             car[BEAMS:OPPONENTS],
@@ -91,39 +91,50 @@ class LiteFleet:
     """
     Several worlds that are driven at once, by threads that live as long as this object.
 
-    :param backends: none may be in the list twice; this object keeps their cars from now on
+    :param worlds: none may be in the list twice; this object keeps their cars from now on
     :param threads: that drive, with the calling one among them
     """
 
-    def __init__(self, backends: Sequence[LiteBackend], threads: int) -> None:
-        self._backends = list(backends)
-        self._states = np.zeros((len(self._backends), physics.STATE_SIZE))
-        for backend, state in zip(self._backends, self._states, strict=True):
-            backend.keep_state_in(state)
-        self._angles = np.stack([backend.range_finder_angles for backend in self._backends])
-        self._gearboxes = np.zeros(len(self._backends), np.int64)
-        self._flying = np.zeros(len(self._backends), np.bool_)
+    def __init__(self, worlds: Sequence[LiteBackend], threads: int) -> None:
+        self._worlds = list(worlds)
+        self._states = np.zeros((len(self._worlds), physics.STATE_SIZE))
+        self._rows = list(self._states)
+        for world, row in zip(self._worlds, self._rows, strict=True):
+            world.keep_state_in(row)
+        self._angles = np.stack([world.range_finder_angles for world in self._worlds])
+        self._gearboxes = np.zeros(len(self._worlds), np.int64)
+        self._flying = np.zeros(len(self._worlds), np.bool_)
         self._threads = threads
         self._others = ThreadPoolExecutor(max(threads - 1, 1))  # threads begin at need
         self._owner = os.getpid()
 
-    def step(self, worlds: Rows, controls: FloatArray, ticks: Rows, cars: FloatArray) -> list[int]:
+    def put(self, race: int, world: LiteBackend) -> None:
+        """Let a race go on in another world; see :class:`~sb3_torcs.backends.base.Fleet`."""
+        before, row = self._worlds[race], self._rows[race]
+        if before is not world:
+            if before.keeps_state_in(row):  # not in that of another race, which took it over
+                before.keep_state_in(np.empty_like(row))
+            self._worlds[race] = world
+        if not world.keeps_state_in(row):
+            world.keep_state_in(row)
+
+    def step(self, races: Rows, controls: FloatArray, ticks: Rows, cars: FloatArray) -> list[int]:
         """Drive some of them; see :class:`~sb3_torcs.backends.base.Fleet`."""
         if os.getpid() != self._owner:
             raise EngineForked(
                 "these threads belong to the parent process; make the environment after the fork"
             )
-        lost = np.zeros(len(worlds), np.bool_)
+        lost = np.zeros(len(races), np.bool_)
 
         def drive(rows: Rows, road: Road) -> None:
             table, edges = road
             manners = self._gearboxes, self._flying
             _drive(
-                rows, worlds, self._states, table, *edges, self._angles, *manners, controls, ticks,
+                rows, races, self._states, table, *edges, self._angles, *manners, controls, ticks,
                 cars, lost,
             )  # fmt: skip
 
-        jobs = iter(list(self._jobs(worlds)))
+        jobs = iter(list(self._jobs(races)))
 
         def work() -> None:
             for rows, road in jobs:  # an iterator that all threads share
@@ -138,23 +149,23 @@ class LiteFleet:
             other.result()
         return np.flatnonzero(lost).tolist()
 
-    def _jobs(self, worlds: Rows) -> Iterator[tuple[Rows, Road]]:
+    def _jobs(self, races: Rows) -> Iterator[tuple[Rows, Road]]:
         """Return the rows of each track, split so that all threads have work."""
         tracks: dict[int, list[int]] = {}
-        for row, world in enumerate(worlds.tolist()):
-            backend = self._backends[world]
-            self._gearboxes[world], self._flying[world] = backend.manner
-            tracks.setdefault(id(backend.road[0]), []).append(row)
+        for row, race in enumerate(races.tolist()):
+            world = self._worlds[race]
+            self._gearboxes[race], self._flying[race] = world.manner
+            tracks.setdefault(id(world.road[0]), []).append(row)
         for rows in tracks.values():
-            road = self._backends[worlds[rows[0]]].road
-            parts = math.ceil(self._threads * len(rows) / len(worlds))
+            road = self._worlds[races[rows[0]]].road
+            parts = math.ceil(self._threads * len(rows) / len(races))
             yield from ((part, road) for part in np.array_split(rows, parts) if len(part))
 
-    def failure(self, world: int) -> Exception:
+    def failure(self, race: int) -> Exception:
         """Return what stopped a race; see :class:`~sb3_torcs.backends.base.Fleet`."""
-        return self._backends[world].lost()
+        return self._worlds[race].lost()
 
-    def arrive(self, world: int, steps: Iterable[tuple[Controls, int]], car: CarState) -> None:
+    def arrive(self, race: int, steps: Iterable[tuple[Controls, int]], car: CarState) -> None:
         """Do nothing: the worlds share the cars. See :class:`~sb3_torcs.backends.base.Fleet`."""
 
     def close(self) -> None:
