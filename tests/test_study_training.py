@@ -121,7 +121,21 @@ BEHIND_WRAPPERS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("changes", [PPO, BEHIND_WRAPPERS], ids=["bare", "behind wrappers"])
+ADAPTIVE = {
+    **PPO,
+    "n_envs": 4,
+    "callback": {
+        "sb3_torcs.callbacks.RandomStartCallback": {"speed": 80.0, "hard": 1.0},
+        "sb3_torcs.callbacks.AdaptiveLearningRateCallback": {"kl": 0.1},
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [PPO, BEHIND_WRAPPERS, ADAPTIVE],
+    ids=["bare", "behind wrappers", "hard starts and a rate that adapts"],
+)
 def test_an_algorithm_without_a_replay_buffer_goes_on_the_same(tmp_path, changes):
     wanted = trial(tmp_path, changes)
     undisturbed = Training(wanted)

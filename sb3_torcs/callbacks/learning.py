@@ -154,7 +154,8 @@ class AdaptiveLearningRateCallback(_WhileLearning):
     rate falls by a factor of 1.5 after an update whose divergence from the policy before is more
     than twice the target, and rises by it after one with less than half of the target (Schulman et
     al., 2017, section 4, adapt a penalty in the same way). The model's own schedule goes on below;
-    models that callbacks save keep it. A resumed training begins with it again.
+    models that callbacks save keep it, and the factor, too, as ``learning_rate_factor``: a resumed
+    training goes on with it.
 
     With a target that stays, a policy never settles: what it drives well changes from update to
     update. A target that falls lets it come to rest.
@@ -173,7 +174,11 @@ class AdaptiveLearningRateCallback(_WhileLearning):
             if not is_number(target) or target <= 0.0:
                 raise InvalidOption(f"{name} is {target!r}; pass a divergence above 0, e.g. 0.01")
         self.kl, self.last_kl = kl, last_kl
-        self.factor = 1.0
+
+    @property
+    def factor(self) -> float:
+        """By which the model's own learning rate is multiplied."""
+        return float(vars(self.model).get("learning_rate_factor", 1.0))
 
     def _on_training_start(self) -> None:
         if not isinstance(self.model, PPO):
@@ -181,7 +186,10 @@ class AdaptiveLearningRateCallback(_WhileLearning):
                 f"{type(self).__name__} reads the divergence that PPO logs, but the model is a "
                 f"{type(self.model).__name__}; take it out of the callbacks"
             )
-        self._own, self.factor = self.model.lr_schedule, 1.0
+        self._own = self.model.lr_schedule
+
+    def _set_factor(self, factor: float) -> None:
+        self.model.learning_rate_factor = factor  # type: ignore[attr-defined]  # so that it is saved
 
     def _on_rollout_start(self) -> None:
         super()._on_rollout_start()
@@ -189,9 +197,9 @@ class AdaptiveLearningRateCallback(_WhileLearning):
         target = self.last_kl + remaining * (self.kl - self.last_kl)
         kl = self.logger.name_to_value.get("train/approx_kl")
         if kl is not None and kl > 2.0 * target:
-            self.factor = max(self.factor / RATE_STEP, LEAST_RATE)
+            self._set_factor(max(self.factor / RATE_STEP, LEAST_RATE))
         elif kl is not None and kl < 0.5 * target:
-            self.factor = min(self.factor * RATE_STEP, MOST_RATE)
+            self._set_factor(min(self.factor * RATE_STEP, MOST_RATE))
 
     def _on_rollout_end(self) -> None:
         self.model.lr_schedule = self._scaled

@@ -292,6 +292,18 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         previous, self._starts.hard = self._starts.hard, checked_hard_starts(share)
         return previous
 
+    def mishaps(self) -> dict[str, list[float]]:
+        """Return where the latest episodes ended badly, by track [m from the start line]."""
+        return {track: list(places) for track, places in self._starts.mishaps.items()}
+
+    def set_mishaps(self, mishaps: Mapping[str, Sequence[float]]) -> None:
+        """
+        Let hard starts go on from what another environment has met.
+
+        :param mishaps: from :meth:`mishaps` of that one
+        """
+        self._starts.set_mishaps(mishaps)
+
     def set_conditions(self, choice: Mapping[str, Any]) -> dict[str, Any]:
         """
         Change ``delay``, ``grip`` and ``mass`` from the next reset on.
@@ -379,16 +391,17 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         at_once = (self._controls, self.action_repeat)
         return self.delay.hold(self._controls) if self.delay.ticks else [at_once]
 
-    def check_ready(self) -> None:
+    def check_ready(self, what: str = "step") -> None:
         """
-        Check that the environment can be stepped.
+        Check that there is an episode.
 
+        :param what: is to be done, for the error
         :raises EnvClosed: before a reset and after ``close``
         """
-        if self._closed or self.car is None:
-            when = "close" if self._closed else "reset"
-            remedy = "make a new environment" if self._closed else "call reset first"
-            raise EnvClosed(f"step {'after' if self._closed else 'before'} {when}; {remedy}")
+        if self._closed:
+            raise EnvClosed(f"{what} after close; make a new environment with gym.make")
+        if self.car is None:
+            raise EnvClosed(f"{what} before reset; call reset first")
 
     @property
     def controls(self) -> Controls:
@@ -434,18 +447,15 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         if self.render_mode is None:
             gym.logger.warn('render without a mode: gym.make(..., render_mode="rgb_array")')
             return None
-        if self._closed:
-            raise EnvClosed("render after close; make a new environment with gym.make")
-        if self.car is None:
-            raise EnvClosed("render before reset; call reset first")
+        self.check_ready("render")
+        assert self.car is not None
         if self._viewer is None:
             # Imported here because graphics take long to load.
             from sb3_torcs.rendering.viewer import Viewer
 
             self._viewer = Viewer(mode=self.render_mode, fps=self.metadata["render_fps"])
-        angles = self.backend.range_finder_angles
         frame: npt.NDArray[np.uint8] = self._viewer.frame(
-            self.backend.track, self.car, self._controls, angles
+            self.track, self.car, self._controls, self.range_finder_angles
         )
         return frame if self.render_mode == "rgb_array" else None
 

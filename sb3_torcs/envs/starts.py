@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -41,7 +41,7 @@ class Starts:
         self.start = start
         self.speed = RANDOM_SPEED  # [m/s] at most
         self.hard = 0.0  # share of random starts
-        self._mishaps: dict[str, deque[float]] = {}  # [m] from the start line, per track
+        self.mishaps: dict[str, deque[float]] = {}  # [m] from the start line, per track
 
     def remember(self, track: Track, distance: float) -> None:
         """
@@ -50,7 +50,15 @@ class Starts:
         :param track: where it was driven
         :param distance: of its end from the start line [m]
         """
-        self._mishaps.setdefault(track.name, deque(maxlen=REMEMBERED)).append(distance)
+        self.mishaps.setdefault(track.name, deque(maxlen=REMEMBERED)).append(distance)
+
+    def set_mishaps(self, mishaps: Mapping[str, Sequence[float]]) -> None:
+        """
+        Replace what was remembered.
+
+        :param mishaps: places of bad ends by the name of the track [m from the start line]
+        """
+        self.mishaps = {track: deque(places, REMEMBERED) for track, places in mishaps.items()}
 
     def draw(self, rng: np.random.Generator, track: Track) -> Start | None:
         """
@@ -62,7 +70,7 @@ class Starts:
         """
         if self.start == "grid" or rng.uniform() < RANDOM_GRID_SHARE:
             return None
-        places = self._mishaps.get(track.name)
+        places = self.mishaps.get(track.name)
         if places and self.hard > 0.0 and rng.uniform() < self.hard:
             ahead = rng.uniform(*HARD_AHEAD)
             where = (places[int(rng.integers(len(places)))] - ahead) % track.length

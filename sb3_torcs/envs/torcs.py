@@ -19,7 +19,7 @@ from sb3_torcs.backends.several import is_several, one_or_several
 from sb3_torcs.car import DEFAULT_CAR, StartName, is_count
 from sb3_torcs.envs.racing import RacingEnv, RenderMode
 from sb3_torcs.envs.torcs_race import make_shared_race
-from sb3_torcs.errors import EnvClosed, InvalidOption, near_miss
+from sb3_torcs.errors import InvalidOption, near_miss
 from sb3_torcs.rewards import RewardChoice
 from sb3_torcs.sensors import RangeFinderName, SensorsName
 from sb3_torcs.torcs.installation import find_game
@@ -209,9 +209,7 @@ class TorcsEnv(RacingEnv):
         """
         if self.picture != "game" or self.render_mode is None:
             return super().render()
-        if self._closed or self.car is None:
-            when = "after close" if self._closed else "before reset; call reset first"
-            raise EnvClosed(f"render {when}")
+        self.check_ready("render")
         assert isinstance(self.backend, NativeBackend), "the constructor refuses others"
         appearance = self.backend.engine.appearance()
         if self._viewer is None:

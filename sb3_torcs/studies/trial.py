@@ -166,6 +166,7 @@ class Training:
             "episodes": self.episodes,
             "best": self._best,
             "spent": list(self._spent + _clocks() - self._clock),
+            "mishaps": self.model.get_env().env_method("mishaps"),
         }
         (folder / STATE).write_text(json.dumps(state), encoding="utf-8")
 
@@ -186,6 +187,8 @@ class Training:
         state = json.loads((folder / STATE).read_text(encoding="utf-8"))
         self.rows, self.episodes = state["rows"], state["episodes"]
         self._best, self._spent = Merit(*state["best"]), np.array(state["spent"])
+        for car, mishaps in enumerate(state["mishaps"]):
+            env.env_method("set_mishaps", mishaps, indices=car)
         names = (BEST_MODEL, BEST_STATISTICS)
         self._best_files = {n: (folder / n).read_bytes() for n in names if (folder / n).is_file()}
 
