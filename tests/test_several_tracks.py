@@ -204,6 +204,11 @@ class TestRacesAtOnce:
             envs.close()
         assert drives[0] == drives[1]
 
+    @pytest.mark.usefixtures("game")
+    def test_an_option_that_cannot_be_pickled_is_told_as_any_other_wrong_one(self):
+        with pytest.raises(InvalidOption, match="range_finders"):
+            TorcsVecEnv(2, track=TRACKS, range_finders=lambda: "narrow")
+
     @pytest.mark.parametrize("made_by", ["number", "functions"])
     @pytest.mark.usefixtures("game")
     def test_few_worlds_are_loaded(self, monkeypatch, made_by):

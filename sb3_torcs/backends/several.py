@@ -135,12 +135,15 @@ def world_pool(makers: Sequence[partial[World]]) -> WorldPool[World]:
     """
     Make a pool, or find the one that another environment has made in :func:`shared_worlds`.
 
-    :param makers: as of :class:`WorldPool`, with arguments that can be pickled
+    :param makers: as of :class:`WorldPool`
     """
     pools = _shared.get()
     if pools is None:
         return WorldPool(makers)
-    key = pickle.dumps(makers)
+    try:
+        key = pickle.dumps(makers)
+    except (pickle.PicklingError, AttributeError, TypeError):  # no option can be of such a type
+        return WorldPool(makers)  # and this says which of them is
     if key not in pools:
         pools[key] = WorldPool(makers)
     return pools[key]
