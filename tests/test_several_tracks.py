@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from contextlib import nullcontext
 
 import gymnasium as gym
 import numpy as np
@@ -200,6 +201,29 @@ class TestRacesAtOnce:
             for _ in range(40):
                 observations, rewards, dones, _ = envs.step(np.stack([GAS] * self.RACES))
                 drive.append((observations.tobytes(), rewards.tobytes(), dones.tobytes()))
+            drives.append(drive)
+            envs.close()
+        assert drives[0] == drives[1]
+
+    @pytest.mark.usefixtures("game")
+    def test_a_field_that_raced_before_does_not_matter(self, monkeypatch):
+        """Robots, damage and places are those of a field that was loaded for this race alone."""
+        options = {
+            "track": ["aalborg", "g-track-1"], "opponents": [["bt", "tita"], ["inferno"]],
+            "action": "pedal", "max_episode_steps": [60, 100],
+        }  # fmt: skip
+        drives = []
+        for share in (True, False):
+            if not share:
+                monkeypatch.setattr("sb3_torcs.vec_env.torcs.shared_worlds", nullcontext)
+            envs = TorcsVecEnv(4, agents=2, threads=2, **options)
+            envs.seed(0)
+            drive = [envs.reset().tobytes()]
+            for step in range(250):
+                actions = np.tile(np.float32([0.02 * (step % 3 - 1), 1.0]), (8, 1))
+                observations, rewards, dones, infos = envs.step(actions)
+                cars = [np.hstack(info["car"]).tobytes() for info in infos]
+                drive.append((observations.tobytes(), rewards.tobytes(), dones.tobytes(), cars))
             drives.append(drive)
             envs.close()
         assert drives[0] == drives[1]
