@@ -364,6 +364,8 @@ class Fleet:
 
     def put(self, race: int, world: NativeBackend | SeatWorld) -> None:
         """Let a race go on in another world; see :class:`~sb3_torcs.backends.base.Fleet`."""
+        if self._worlds[race] is world:
+            return
         self._worlds[race], self._seats[race] = world, world.seat
         self._fleet.put(int(self._engines[race]), world.engine)
 

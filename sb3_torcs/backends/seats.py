@@ -9,7 +9,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from sb3_torcs.backends.several import WorldPool
+from sb3_torcs.backends.several import Drawn, Turn, WorldPool
 from sb3_torcs.car import CarState, Controls, FloatArray, Start
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.torcs.car_file import CarFacts, car_facts
@@ -133,10 +133,7 @@ class SharedRace:
     """
 
     def __init__(self, grids: WorldPool[Grid], noise: bool = False) -> None:
-        self.grids = grids
-        grids.join()
-        self.index = 0  # of the present grid
-        self.grid = grids.take(0)
+        self._turn = Turn(grids)
         self._tick = 0  # control ticks since the race began
         self._asked = -1  # when the crew was asked
         self.agents = len(self.grid.worlds)
@@ -155,6 +152,11 @@ class SharedRace:
         """
         return cls(WorldPool([lambda: Grid(worlds)]))
 
+    @property
+    def grid(self) -> Grid:
+        """The present race."""
+        return self._turn.world
+
     def world(self, number: int) -> SeatWorld:
         """
         Return the car of an agent in the present race.
@@ -162,6 +164,14 @@ class SharedRace:
         :param number: of the agent
         """
         return self.grid.worlds[number]
+
+    def gears(self, number: int) -> int:
+        """
+        Return how many gears the car of an agent has, at least, in the races that can be drawn.
+
+        :param number: of the agent
+        """
+        return min(grid.worlds[number].gears for grid in self._turn.pool.examples)
 
     def is_over(self, ending: set[int]) -> bool:
         """
@@ -181,11 +191,7 @@ class SharedRace:
 
         :param rng: of the environment whose reset begins it
         """
-        index = int(rng.integers(len(self.grids)))
-        if index != self.index:
-            grid = self.grids.take(index)
-            self.grids.give_back(self.index, self.grid)
-            self.index, self.grid = index, grid
+        self._turn.draw(rng)
 
     def begins_with(self, number: int) -> bool:
         """
@@ -261,11 +267,10 @@ class SharedRace:
         """Leave the race to others when the last seat is left."""
         self._open -= 1
         if self._open == 0:
-            self.grids.give_back(self.index, self.grid)
-            self.grids.leave()
+            self._turn.close()
 
 
-class Seat:
+class Seat(Drawn):
     """
     The world of one agent of a shared race; see :class:`~sb3_torcs.backends.base.Backend`.
 
@@ -277,7 +282,7 @@ class Seat:
 
     def __init__(self, race: SharedRace, number: int) -> None:
         self.race, self.number = race, number
-        self.gears = min(grid.worlds[number].gears for grid in race.grids.examples)
+        self.gears = race.gears(number)
         self.range_finder_angles = self.world.range_finder_angles
         self._closed = False
 
@@ -285,26 +290,6 @@ class Seat:
     def world(self) -> SeatWorld:
         """The agent's car in the present race."""
         return self.race.world(self.number)
-
-    @property
-    def track(self) -> Track:
-        """The track of the present race."""
-        return self.world.track
-
-    @property
-    def profile(self) -> RoadProfile:
-        """The road of the present race with its hills."""
-        return self.world.profile
-
-    @property
-    def car(self) -> str:
-        """Name of the agent's car in the present race."""
-        return self.world.car
-
-    @property
-    def facts(self) -> CarFacts:
-        """What the file of the agent's car in the present race says."""
-        return self.world.facts
 
     def draw_track(self, rng: np.random.Generator) -> None:
         """Choose the next race, if it begins now; see ``Backend``."""

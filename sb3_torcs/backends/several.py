@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import pickle
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -21,7 +22,9 @@ from sb3_torcs.tracks.profile import RoadProfile
 from sb3_torcs.tracks.track import Track
 
 __all__ = [
+    "Drawn",
     "SeveralWorlds",
+    "Turn",
     "WorldPool",
     "is_several",
     "one_or_several",
@@ -166,33 +169,70 @@ def one_or_several(make: Callable[..., Backend], track: Any, car: Any) -> Backen
     return SeveralWorlds(world_pool([partial(make, track=one, car=other) for one, other in pairs]))
 
 
-class SeveralWorlds:
+class Turn(Generic[World]):
     """
-    One of several cars on one of several tracks: each episode draws a pair of them.
+    What one user of a pool has: the world that it has drawn.
 
-    :param pool: of a world for each track and car; they have the same range finders
+    :param pool: of the worlds that can be drawn
     """
 
-    def __init__(self, pool: WorldPool[Backend]) -> None:
-        self._pool = pool
+    def __init__(self, pool: WorldPool[World]) -> None:
+        self.pool = pool
         pool.join()
-        self._closed = False
-        self.index = 0  # of the present world
+        self._index = 0  # of the world
         self.world = pool.take(0)
-        self.gears: int = min(getattr(world, "gears", GEARS) for world in pool.examples)
-        self.range_finder_angles = self.world.range_finder_angles
-        self.tells_race = all(getattr(world, "tells_race", False) for world in pool.examples)
-        self.conditions: Sequence[str] = getattr(self.world, "conditions", ())
+        self._closed = False
+
+    def draw(self, rng: np.random.Generator) -> bool:
+        """
+        Draw the next world, and leave the present one to others if it is another.
+
+        :param rng: of the environment whose episode begins
+        :return: whether it is another
+        """
+        index = int(rng.integers(len(self.pool)))
+        if index == self._index:
+            return False
+        world = self.pool.take(index)
+        self.pool.give_back(self._index, self.world)
+        self._index, self.world = index, world
+        return True
+
+    def close(self) -> None:
+        """Leave the worlds to others; the last one closes them. A second call does nothing."""
+        if not self._closed:
+            self._closed = True
+            self.pool.give_back(self._index, self.world)
+            self.pool.leave()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "pool": self.pool.makers}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self.pool = WorldPool(state["pool"])
+        self.pool.join()
+
+
+class Drawn(ABC):
+    """A backend that passes on what the world of the present episode says."""
+
+    @property
+    @abstractmethod
+    def world(self) -> Any:
+        """The world of the present episode."""
 
     @property
     def track(self) -> Track:
         """The track of the present episode."""
-        return self.world.track
+        track: Track = self.world.track
+        return track
 
     @property
     def car(self) -> str:
-        """The car of the present episode."""
-        return self.world.car
+        """Name of the car of the present episode."""
+        car: str = self.world.car
+        return car
 
     @property
     def profile(self) -> RoadProfile | None:
@@ -204,44 +244,48 @@ class SeveralWorlds:
         """What the file of the present episode's car says, if its world knows."""
         return getattr(self.world, "facts", None)
 
+
+class SeveralWorlds(Drawn):
+    """
+    One of several cars on one of several tracks: each episode draws a pair of them.
+
+    :param pool: of a world for each track and car; they have the same range finders
+    """
+
+    def __init__(self, pool: WorldPool[Backend]) -> None:
+        self._turn = Turn(pool)
+        self.gears: int = min(getattr(world, "gears", GEARS) for world in pool.examples)
+        self.range_finder_angles = self.world.range_finder_angles
+        self.tells_race = all(getattr(world, "tells_race", False) for world in pool.examples)
+        self.conditions: Sequence[str] = getattr(self.world, "conditions", ())
+
+    @property
+    def world(self) -> Any:
+        """The world of the present episode."""
+        return self._turn.world
+
     def draw_track(self, rng: np.random.Generator) -> None:
         """Choose the next episode's world; see :class:`~sb3_torcs.backends.base.Backend`."""
-        index = int(rng.integers(len(self._pool)))
-        if index == self.index:
-            return
-        world = self._pool.take(index)
-        self._pool.give_back(self.index, self.world)
-        self.index, self.world = index, world
-        if self.conditions:
+        if self._turn.draw(rng) and self.conditions:
             self.set_conditions(1.0, 1.0)  # whatever another environment has set
 
     def set_conditions(self, grip: float, mass: float) -> None:
         """Change the next episode's world; see :class:`~sb3_torcs.backends.base.Backend`."""
-        world: Any = self.world
-        world.set_conditions(grip, mass)
+        self.world.set_conditions(grip, mass)
 
     def reset(self, rng: np.random.Generator, start: Start | None) -> CarState:
         """Begin an episode; see :class:`~sb3_torcs.backends.base.Backend`."""
-        return self.world.reset(rng, start)
+        car: CarState = self.world.reset(rng, start)
+        return car
 
     def step(self, controls: Controls, ticks: int) -> CarState:
         """Drive on; see :class:`~sb3_torcs.backends.base.Backend`."""
-        return self.world.step(controls, ticks)
+        car: CarState = self.world.step(controls, ticks)
+        return car
 
     def close(self) -> None:
         """Leave the worlds to others; the last one closes them."""
-        if not self._closed:
-            self._closed = True
-            self._pool.give_back(self.index, self.world)
-            self._pool.leave()
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_pool": self._pool.makers}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self._pool = WorldPool(state["_pool"])
-        self._pool.join()
+        self._turn.close()
 
 
 def present_world(backend: Backend) -> Backend:

@@ -56,6 +56,7 @@ class TorcsVectorEnv(SyncVectorEnv):
     :raises InvalidOption: if an option has a value that is not allowed
     """
 
+    @shared_worlds()
     def __init__(
         self,
         num_envs: int = 1,
@@ -89,10 +90,9 @@ class TorcsVectorEnv(SyncVectorEnv):
         timesteps = math.inf if limit == NO_LIMIT else limit
         self.envs: list[_Race]  # type: ignore[assignment]  # a list of Env, says Gymnasium
         self._env_obs: list[Observation | None]  # type: ignore[assignment]  # of None, says Gymnasium
-        with shared_worlds():
-            super().__init__(
-                [lambda: _Race(timesteps, **options)] * int(num_envs), autoreset_mode=autoreset_mode
-            )
+        super().__init__(
+            [lambda: _Race(timesteps, **options)] * int(num_envs), autoreset_mode=autoreset_mode
+        )
         self.threads = min(threads or len(os.sched_getaffinity(0)), self.num_envs)
         worlds: list[Any] = [present_world(env.backend) for env in self.envs]
         self._fleet: Any = Fleet(worlds, self.threads)

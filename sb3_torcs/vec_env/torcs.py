@@ -126,6 +126,7 @@ class TorcsVecEnv(DummyVecEnv):
     :raises InvalidOption: if an option has a value that is not allowed
     """
 
+    @shared_worlds()
     def __init__(
         self,
         races: int | list[EnvMaker] | tuple[EnvMaker, ...] = 1,
@@ -151,13 +152,11 @@ class TorcsVecEnv(DummyVecEnv):
                 )
             makers = list(races)
         elif is_count(races):
-            with shared_worlds():  # races of several agents are loaded here
-                made = env_makers(int(races), agents, env_id, env_kwargs)  # type: ignore[arg-type]
+            made = env_makers(int(races), agents, env_id, env_kwargs)  # type: ignore[arg-type]
             makers = [partial(_monitored, make) for make in made]
         else:
             raise InvalidOption(f"races is {races!r}; expected a whole number >= 1")
-        with shared_worlds():
-            super().__init__(makers)
+        super().__init__(makers)
         try:
             self._races = [_Race(env) for env in self._envs]
             self._batch = Batch([race.racing for race in self._races], threads)
