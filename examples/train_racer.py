@@ -1,8 +1,9 @@
 """Train PPO to race: first alone, then behind robots, while some cars stay alone.
 
 Each car of each race is an environment of TorcsVecEnv, so that stock PPO learns from all of them.
-It learns one track, or several, to race on those that it never saw. With --ancestor it goes on from
-a racer that was trained so, and races against itself, this ancestor and robots.
+It learns one track, or several, to race on those that it never saw. With --driver it goes on from a
+model that drives alone already. With --ancestor it goes on from a racer that was trained so, and
+races against itself, this ancestor and robots.
 """
 
 import argparse
@@ -81,6 +82,7 @@ parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
 parser.add_argument("--track", nargs="+", default=["aalborg"], help="one, or several")
 parser.add_argument("--alone", type=int, help="timesteps without other cars")
 parser.add_argument("--robots", type=int, default=6_000_000, help="timesteps in races")
+parser.add_argument("--driver", type=Path, help="model that drives alone, to go on from")
 parser.add_argument("--ancestor", type=Path, help="model.zip of a racer from which to go on")
 parser.add_argument("--races", type=int, default=16, help="held at once")
 parser.add_argument("--seed", type=int, default=0)
@@ -178,16 +180,24 @@ def learn_alone(args: argparse.Namespace, env_kwargs: dict, settings: Settings) 
     return model.policy.state_dict()
 
 
+def weights_of(path: Path) -> dict:
+    """Return the policy's weights in a model file."""
+    return PPO.load(path, device="cpu").policy.state_dict()
+
+
 def begin_to_race(weights: dict) -> None:
     """
     Let a policy that has never met a car see others without fright.
 
-    Alone it saw zeros for rivals, so the weights of theirs are those that it was born with.
+    Alone it saw zeros for rivals, so the weights of theirs are those that it was born with. A
+    driver that never saw them has none. Rivals come last.
     """
-    rivals = [where for name, where in feature_slices(SENSORS).items() if "rivals" in name]
+    features = feature_slices(SENSORS)
+    seen = min(where.start for name, where in features.items() if "rivals" in name)
+    missing = max(where.stop for where in features.values()) - seen
     for net in ("policy_net", "value_net"):
-        for columns in rivals:
-            weights[f"mlp_extractor.{net}.0.weight"][:, columns] = 0.0
+        name = f"mlp_extractor.{net}.0.weight"
+        weights[name] = nn.functional.pad(weights[name][:, :seen], (0, missing))
 
 
 def main() -> None:
@@ -199,11 +209,12 @@ def main() -> None:
         "sensors": list(SENSORS), "range_finders": "narrow", "action": "pedal",
         "gearbox": "road_speed", "action_repeat": 5, "unstick": True, "keep_distance": True,
     }  # fmt: skip
-    if args.ancestor is None:
-        weights = learn_alone(args, env_kwargs, settings)
-        begin_to_race(weights)
+    if args.ancestor is not None:
+        weights = weights_of(args.ancestor)
     else:
-        weights = PPO.load(args.ancestor, device="cpu").policy.state_dict()
+        driver = args.driver
+        weights = weights_of(driver) if driver else learn_alone(args, env_kwargs, settings)
+        begin_to_race(weights)
 
     # Some cars stay alone, for the pace: in races they are seldom free to drive at their own.
     beside = cars_alone(settings.beside_races * args.races, args, env_kwargs, settings)

@@ -66,6 +66,13 @@ def test_a_racer_is_trained_alone_and_against_robots(monkeypatch, capsys, tmp_pa
     assert racer.name == "model"
 
 
+def test_a_racer_goes_on_from_a_driver_that_never_saw_a_car(monkeypatch, capsys, tmp_path, game):
+    driver = EXAMPLES.parent / "sb3_torcs" / "agents" / "ppo-roads" / "best_model.zip"
+    budget = ["--driver", str(driver), "--robots=1", "--races=2"]
+    run(monkeypatch, "train_racer.py", *budget, "--folder", str(tmp_path))
+    assert f"{tmp_path}/model.zip" in capsys.readouterr().out
+
+
 def test_own_reward_learns_from_it(monkeypatch, capsys):
     run(monkeypatch, "own_reward.py", "--timesteps", "120")
     assert "the best return by this reward was" in capsys.readouterr().out
