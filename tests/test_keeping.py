@@ -240,6 +240,13 @@ def test_the_zoo_may_search_hyperparameters(capsys, tmp_path):
     assert f"its reports: {report.with_name('report_*.csv')}" in capsys.readouterr().out
 
 
+def test_a_search_that_the_zoo_cannot_make_is_told(capsys, tmp_path):
+    words = ["train", "--algo", "crossq", "--folder", str(tmp_path), "--timesteps", "30"]
+    assert main([*words, "--no-progress", "--", "-optimize"]) == 2
+    assert "cannot search hyperparameters of crossq; it can of: a2c" in capsys.readouterr().err
+    assert list((tmp_path / "crossq").iterdir()) == []
+
+
 def test_a_search_that_was_ended_before_its_first_trial_is_told(monkeypatch, tmp_path):
     def nothing(self):
         raise ValueError("No trials are completed yet.")

@@ -9,7 +9,10 @@ from typing import Any
 from sb3_torcs.agents.model_file import referenced_class
 from sb3_torcs.errors import InvalidOption, ModelMismatch, PackageMissing, near_miss
 
-__all__ = ["algorithm_of", "check_same", "is_sbx", "told_algorithm"]
+__all__ = ["SBX", "algorithm_class", "algorithm_of", "check_same", "is_sbx", "told_algorithm"]
+
+SBX = "sbx_"
+"""Begins the names of SBX's algorithms, which are SB3's in JAX: ``"sbx_tqc"``."""
 
 SAVED_AS = {"ddpg": "td3"}  # models of the two cannot be told apart
 
@@ -26,6 +29,38 @@ TELLING_KEYS = (
 )
 
 
+def algorithm_class(name: str) -> Any:
+    """
+    Find an algorithm.
+
+    :param name: the zoo's name of it, or SBX's in small letters after ``sbx_``
+    :return: its class
+    :raises InvalidOption: if there is no such algorithm
+    :raises PackageMissing: if it is one of SBX, and that is not installed
+    """
+    from rl_zoo3.utils import ALGOS
+
+    owner, classes = "the RL Zoo", ALGOS
+    if name.startswith(SBX):
+        owner, classes = "SBX", _sbx_algorithms(name)
+    if name not in classes:
+        advice = f"it has: {', '.join(sorted(classes))}"
+        raise InvalidOption(f"{owner} has no algorithm '{name}'{near_miss(name, classes, advice)}")
+    return classes[name]
+
+
+def _sbx_algorithms(name: str) -> dict[str, Any]:
+    """Import the algorithms of SBX, which is an optional package."""
+    try:
+        sbx = importlib.import_module("sbx")
+    except ImportError as error:
+        raise PackageMissing(
+            f"'{name}' is an algorithm of SBX, which does not import ({error}); type: pip install "
+            "sbx-rl"
+        ) from error
+    return {SBX + word.lower(): own for word, own in vars(sbx).items() if word[0].isupper()}
+
+
 def told_algorithm(data: dict[str, Any]) -> str | None:
     """
     Infer the algorithm of a model from its saved attributes.
@@ -35,6 +70,8 @@ def told_algorithm(data: dict[str, Any]) -> str | None:
     """
     from rl_zoo3.utils import ALGOS
 
+    if is_sbx(data):
+        return SBX + referenced_class(data.get("policy_class")).split(".")[1]  # sbx.tqc.policies
     if "recurrent" in str(data.get("policy_class")).lower():
         return "ppo_lstm"
     family = referenced_class(data.get("policy_class")).split(".")[1:2]  # as in sb3_contrib.ars
@@ -55,15 +92,15 @@ def algorithm_of(name: str | None, data: dict[str, Any], model: Path) -> tuple[s
     :raises InvalidOption: if there is no such algorithm
     :raises PackageMissing: if it is one of SBX, and that is not installed
     """
-    from rl_zoo3.utils import ALGOS
-
     name = name or told_algorithm(data)
     if name is None:
         raise ModelMismatch(f"'{model}' does not say its algorithm; give it, e.g. --algo ddpg")
-    if name not in ALGOS:
-        advice = f"it has: {', '.join(sorted(ALGOS))}"
-        raise InvalidOption(f"the RL Zoo has no algorithm '{name}'{near_miss(name, ALGOS, advice)}")
-    return name, _sbx_algorithm(name, model) if is_sbx(data) else ALGOS[name]
+    if is_sbx(data) and not name.startswith(SBX):
+        name = SBX + name
+    try:
+        return name, algorithm_class(name)
+    except PackageMissing as error:
+        raise PackageMissing(f"'{model}' is a model of SBX: {error}") from error
 
 
 def is_sbx(data: dict[str, Any]) -> bool:
@@ -74,21 +111,6 @@ def is_sbx(data: dict[str, Any]) -> bool:
     :return: whether it is
     """
     return referenced_class(data.get("policy_class")).startswith("sbx.")
-
-
-def _sbx_algorithm(name: str, model: Path) -> Any:
-    """Find an algorithm of SBX, which is an optional package."""
-    try:
-        sbx = importlib.import_module("sbx")
-    except ImportError as error:
-        raise PackageMissing(
-            f"'{model}' is a model of SBX, which does not import ({error}); type: pip install "
-            "sbx-rl"
-        ) from error
-    found = {word.lower(): word for word in vars(sbx)}.get(name)
-    if found is None:
-        raise InvalidOption(f"SBX has no algorithm '{name}'; give the --algo that '{model}' is of")
-    return getattr(sbx, found)
 
 
 def check_same(model: Path, saved: str | None, algo: str) -> None:

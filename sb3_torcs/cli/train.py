@@ -5,13 +5,10 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import shlex
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from sb3_torcs.cli.common import positive, seed
-from sb3_torcs.training.run import Run, TrainOptions, _going_on, train_run
-
-if TYPE_CHECKING:
-    pass
+from sb3_torcs.training.run import Run, TrainOptions, going_on, train_run
 
 __all__ = ["add_parser", "run"]
 
@@ -38,7 +35,11 @@ def add_parser(subparsers: Any) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
-    add("--algo", help="ddpg (default), td3, sac, ppo, or any of the zoo")
+    add(
+        "--algo",
+        help="ddpg (default), td3, sac, ppo, or any of the zoo; with SBX also sbx_sac, sbx_tqc, "
+        "sbx_crossq",
+    )
     add("--env", metavar="ID", help="default: TorcsLite-v0")
     add("--entry", metavar="NAME", help='entry of the file, e.g. "as the post"; default: the id')
     add("--conf-file", metavar="FILE", help="hyperparameter file; default: the shipped one")
@@ -111,6 +112,8 @@ def _trained_before(args: argparse.Namespace) -> dict[str, str]:
 
 def _closing_words(options: TrainOptions, result: Run) -> list[str]:
     """Name the files and the commands to type next."""
+    from sb3_torcs.agents.model_algorithm import SBX
+
     if result.last_model is None:
         return [f"the RL Zoo has searched; its reports: {result.folder / 'report_*.csv'}"]
     learned = f"learned from {result.timesteps} of {result.wanted} timesteps"
@@ -121,9 +124,10 @@ def _closing_words(options: TrainOptions, result: Run) -> list[str]:
     if options.resume is not None:
         lines += [f"before that, which may be better still: {options.resume}"]
     if result.timesteps < result.wanted:
-        lines += ["go on with:", f"  {_going_on(options, result)}"]
+        lines += ["go on with:", f"  {going_on(options, result)}"]
     track = result.track[0] if isinstance(result.track, list) else result.track
     words = ["sb3-torcs", "evaluate", str(result.best_model), "--env", options.env]
     words += ["--track", track] if track else []
+    words += ["--trust"] if options.algo.startswith(SBX) else []  # whose models are pickled
     lines += ["see what it learned:", f"  {shlex.join(words)}"]
     return lines

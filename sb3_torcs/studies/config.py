@@ -21,6 +21,7 @@ from typing import Any
 import gymnasium as gym
 import yaml
 
+from sb3_torcs.agents.model_algorithm import SBX
 from sb3_torcs.agents.wrapping import unrebuilt
 from sb3_torcs.errors import StudyError, near_miss, with_new_names
 from sb3_torcs.files import read_yaml
@@ -237,6 +238,11 @@ def _trials(
     source = _source(said, changes, place)
     algo, env_id = source["algo"] or "ddpg", source["env"] or "Torcs-v0"
     zoo.check_racing(env_id)
+    if algo.startswith(SBX):
+        raise StudyError(
+            f"{place}: algo is {algo}, and a study cannot stop and continue trainings of SBX "
+            f"exactly; give {algo.removeprefix(SBX)}, or type: sb3-torcs train --algo {algo}"
+        )
     conf_file = source["conf_file"] and file.parent / Path(os.path.expanduser(source["conf_file"]))
     entry = zoo.read_entry(zoo.config_file(algo, conf_file), source["entry"] or env_id)
     if source["n_timesteps"] is not None:

@@ -24,11 +24,14 @@ import rl_zoo3.train
 import yaml
 from rl_zoo3.callbacks import SaveVecNormalizeCallback
 from rl_zoo3.exp_manager import ExperimentManager
+from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
+from rl_zoo3.utils import ALGOS
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 import sb3_torcs  # noqa: F401  registers the environments
+from sb3_torcs.agents.model_algorithm import algorithm_class
 from sb3_torcs.agents.model_writing import RecordCallback, recipe
 from sb3_torcs.errors import InvalidOption, WorkerLost
 from sb3_torcs.training.keeping import KeepCallback, WholeFiles
@@ -92,6 +95,7 @@ def train(
         managers.append(Manager(*arguments, **keywords))
         return managers[-1]
 
+    ALGOS.setdefault(algo, algorithm_class(algo))  # those of SBX, as SBX's documentation does
     with tempfile.TemporaryDirectory() as scratch:
         conf_file = _write_entry(Path(scratch), env_id, entry)
         first = ["--gym-packages", "sb3_torcs", "--algo", algo, "--env", env_id]
@@ -168,6 +172,7 @@ class Manager(_Threaded):
 
     :param arguments: of the zoo's own
     :param keywords: of the zoo's own
+    :raises InvalidOption: if the zoo cannot search the algorithm's hyperparameters, and is to
     """
 
     def __init__(self, *arguments: Any, **keywords: Any) -> None:
@@ -176,6 +181,11 @@ class Manager(_Threaded):
             # The zoo numbers a run by the folders that exist. Two runs that begin at the same time
             # would write into one folder.
             super().__init__(*arguments, **keywords)
+            if self.optimize_hyperparameters and self.algo not in HYPERPARAMS_SAMPLER:
+                raise InvalidOption(
+                    f"the RL Zoo cannot search hyperparameters of {self.algo}; it can of: "
+                    f"{', '.join(sorted(HYPERPARAMS_SAMPLER))}"
+                )
             self.create_log_folder()
         self.files = WholeFiles(Path(self.save_path))
         if self.optimize_hyperparameters:

@@ -17,7 +17,7 @@ from sb3_torcs.errors import InvalidOption, OutputNotWritable, WorkerLost
 from sb3_torcs.files import writable_folder
 from sb3_torcs.signals import answered
 
-__all__ = ["Run", "TrainOptions", "train", "train_run"]
+__all__ = ["Run", "TrainOptions", "going_on", "train", "train_run"]
 
 if TYPE_CHECKING:
     from sb3_torcs.training.manager import Manager
@@ -304,7 +304,7 @@ def _told(error: OSError | WorkerLost, result: Run, options: TrainOptions) -> Ex
     """Compose a message: why a training ended, what is saved, and what to type."""
     if result.timesteps > 0:
         kept = f"kept: '{result.last_model}', {result.timesteps} of {result.wanted} timesteps"
-        more = f"go on with: {_going_on(options, result)}"
+        more = f"go on with: {going_on(options, result)}"
     else:
         kept, more = "nothing was kept yet", "start again"
     if isinstance(error, WorkerLost):
@@ -334,8 +334,13 @@ def _noted_interrupts() -> Iterator[list[int]]:
         yield seen
 
 
-def _going_on(options: TrainOptions, result: Run) -> str:
-    """Compose the command that continues the training."""
+def going_on(options: TrainOptions, result: Run) -> str:
+    """
+    Compose the command that continues a training.
+
+    :param options: of the training
+    :param result: how far it came
+    """
     left = result.wanted - result.timesteps
     return _command(dataclasses.replace(options, resume=result.last_model, timesteps=left))
 

@@ -20,11 +20,12 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import yaml
 
+from sb3_torcs.agents.model_algorithm import SBX, algorithm_class
 from sb3_torcs.car import is_count, is_number
-from sb3_torcs.errors import ZooConfigError, near_miss
+from sb3_torcs.errors import InvalidOption, ZooConfigError, near_miss
 from sb3_torcs.files import read_yaml
 from sb3_torcs.sensors import look_both_ways, range_finder_angles
-from sb3_torcs.training.zoo_data import as_data, check_class, check_data
+from sb3_torcs.training.zoo_data import as_data, check_class, check_data, check_jax
 
 __all__ = [
     "TIME_LIMIT",
@@ -112,7 +113,7 @@ def config_file(algo: str, conf_file: str | Path | None = None) -> Path:
         if not path.is_file():
             raise ZooConfigError(f"there is no hyperparameter file '{path}'; give a .yml file")
         return path
-    path = shipped_folder() / f"{algo}.yml"
+    path = shipped_folder() / f"{algo.removeprefix(SBX)}.yml"
     if not path.is_file():
         known = sorted(file.stem for file in shipped_folder().glob("*.yml"))
         advice = f"shipped: {', '.join(known)}; for another one give a file: --conf-file FILE.yml"
@@ -177,23 +178,22 @@ def check_entry(entry: Entry, algo: str, env_id: str, place: Place, *, trust: bo
     :param trust: let the zoo evaluate strings as Python
     :raises ZooConfigError: for the first mistake
     """
-    from rl_zoo3.utils import ALGOS
-
     if not trust:
         check_data(entry, str(place))
-    if algo not in ALGOS:
-        advice = f"it has: {', '.join(sorted(ALGOS))}"
-        raise ZooConfigError(
-            f"the RL Zoo has no algorithm '{algo}'{near_miss(algo, ALGOS, advice)}"
-        )
+    try:
+        algorithm = algorithm_class(algo)
+    except InvalidOption as error:
+        raise ZooConfigError(str(error)) from None
     for key in REQUIRED:
         if key not in entry:
             raise ZooConfigError(f"{place}: key '{key}' is missing")
     _check_numbers(entry, place)
-    constructor = (_arguments(ALGOS[algo]) or set()) - set(GIVEN_BY_ZOO)
+    constructor = (_arguments(algorithm) or set()) - set(GIVEN_BY_ZOO)
     _check_keys(entry, ZOO_KEYS | constructor, "key", place)
-    policy = _policy(entry["policy"], ALGOS[algo], place)
+    policy = _policy(entry["policy"], algorithm, place)
     _check_call("policy_kwargs", policy, entry.get("policy_kwargs"), place, GIVEN_BY_POLICY_OWNER)
+    if algo.startswith(SBX):
+        check_jax(policy, entry.get("policy_kwargs"), str(place))
     for key in ("callback", "env_wrapper", "vec_env_wrapper"):
         for path, arguments in _items(entry.get(key), key, place):
             _check_call(f"{key} {path}", _imported(path, key, place), arguments, place)

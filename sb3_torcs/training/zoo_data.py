@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import contextlib
 import copy
+import importlib
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -13,7 +14,7 @@ from torch.nn.modules import activation
 
 from sb3_torcs.errors import ZooConfigError
 
-__all__ = ["EVALUATED", "as_data", "check_class", "check_data", "plain_python"]
+__all__ = ["EVALUATED", "as_data", "check_class", "check_data", "check_jax", "plain_python"]
 
 EVALUATED = (
     "monitor_kwargs", "normalize", "policy_kwargs", "replay_buffer_class", "replay_buffer_kwargs",
@@ -85,6 +86,24 @@ def check_class(found: Callable[..., Any], path: str, key: str, place: str) -> N
         raise ZooConfigError(
             f"{place}: {key} '{path}' is none: expected a class derived from "
             f"{kind.__module__}.{kind.__qualname__}"
+        )
+
+
+def check_jax(policy: Any, policy_kwargs: Any, place: str) -> None:
+    """
+    Make sure that an entry for SBX asks for nothing of PyTorch.
+
+    :param policy: class of the policy
+    :param policy_kwargs: of :func:`as_data`; a string names an activation of PyTorch
+    :param place: where they stand, for the message
+    :raises ZooConfigError: if it does
+    """
+    base = importlib.import_module("sbx.common.policies").BaseJaxPolicy
+    named = "policy" if not issubclass(policy, base) else "policy_kwargs"
+    if named == "policy" or isinstance(policy_kwargs, str):
+        raise ZooConfigError(
+            f"{place}: {named} is of PyTorch, and SBX computes with JAX; the shipped entries for "
+            "it are those of sac, tqc and crossq; for others give a file of your own: --conf-file"
         )
 
 
