@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -188,6 +191,18 @@ def test_batches_are_those_of_sb3_with_half_mirrored(n_steps, kind):
             set_random_seed(seed)
             for one, two in zip(sample_mirrored(buffer, 9), expected, strict=True):
                 assert (one is None and two is None) or one.equal(two)
+
+
+def test_what_is_known_of_a_buffer_goes_with_it():
+    """Drawing must not keep a buffer, of many megabytes as a rule."""
+    model = make_model()
+    model.learn(12)
+    sample_mirrored(model.replay_buffer, 4)
+    known = weakref.ref(model.replay_buffer)
+    assert known() is not None
+    model.replay_buffer = None
+    gc.collect()
+    assert known() is None
 
 
 def test_a_buffer_that_is_saved_while_the_algorithm_learns_is_a_stock_one(tmp_path):

@@ -6,7 +6,9 @@ The numbers drawn and the batches are those of Stable-Baselines3, followed by
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch as th
@@ -15,7 +17,7 @@ from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_torcs.policies.mirror import mirror_half, mirror_image, sensors_of
+from sb3_torcs.policies.mirror import mirror_half, mirror_image
 
 __all__ = ["sample_mirrored"]
 
@@ -31,21 +33,21 @@ def sample_mirrored(
     :param env: as in ``ReplayBuffer.sample``
     :return: the batch
     """
-    image = mirror_image(buffer.observation_space)
     if env is not None or not _is_stock(buffer):
+        image = mirror_image(buffer.observation_space)
         return mirror_half(type(buffer).sample(buffer, batch_size, env), image)
+    order, signs = _image_arrays(buffer)
     of_steps = buffer if isinstance(buffer, NStepReplayBuffer) else None
     n_steps, gamma = (1, 1.0) if of_steps is None else (of_steps.n_steps, of_steps.gamma)
     upper = buffer.buffer_size if buffer.full else buffer.pos
     rows = np.random.randint(0, upper, size=batch_size)  # noqa: NPY002  as SB3 draws
     columns = np.random.randint(0, buffer.n_envs, size=batch_size)  # noqa: NPY002
-    order, signs = (part.numpy() for part in image)
     widths = (order.size, buffer.action_dim, order.size, 1, 1, 1)
     batch = tuple(np.empty((batch_size, width), np.float32) for width in widths)
     _fill(
         batch, rows, columns, batch_size // 2, order, signs,
         (buffer.pos - 1) % buffer.buffer_size,
-        gamma ** np.arange(n_steps + 1, dtype=np.float32),
+        _discounts(gamma, n_steps),
         (buffer.observations, buffer.actions, buffer.next_observations),
         (buffer.dones, buffer.timeouts, buffer.rewards),
     )  # fmt: skip
@@ -62,8 +64,24 @@ def _is_stock(buffer: ReplayBuffer) -> bool:
         and not buffer.optimize_memory_usage
         and th.device(buffer.device).type == "cpu"
         and buffer.observations.dtype == buffer.actions.dtype == np.float32
-        and sensors_of(buffer.observation_space) != ()
     )
+
+
+_images: WeakKeyDictionary[ReplayBuffer, tuple[np.ndarray, ...]] = WeakKeyDictionary()
+
+
+def _image_arrays(buffer: ReplayBuffer) -> tuple[np.ndarray, ...]:
+    """Describe the mirror image of a buffer's observations; found once, as that takes a while."""
+    if buffer not in _images:
+        image = mirror_image(buffer.observation_space)
+        _images[buffer] = tuple(part.numpy() for part in image)
+    return _images[buffer]
+
+
+@lru_cache
+def _discounts(gamma: float, n_steps: int) -> np.ndarray:
+    """Find the discount of each timestep of a return, and of what follows it."""
+    return gamma ** np.arange(n_steps + 1, dtype=np.float32)
 
 
 @njit(cache=True)
