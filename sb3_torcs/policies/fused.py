@@ -13,7 +13,7 @@ from torch.autograd.function import once_differentiable
 
 from sb3_torcs.policies import kernels
 
-__all__ = ["FusedActor", "FusedValues", "array", "give"]
+__all__ = ["FusedActor", "FusedValues", "array", "give", "take"]
 
 UNUSED = {kind: np.empty((0, 0), kind) for kind in (np.float32, np.float64)}
 UNUSED_EACH = {kind: np.empty((0, 0, 0), kind) for kind in (np.float32, np.float64)}
@@ -33,8 +33,14 @@ def array(tensor: th.Tensor) -> np.ndarray:
 _spare: dict[tuple[Any, ...], list[np.ndarray]] = {}
 
 
-def _take(*size: int, dtype: Any) -> np.ndarray:
-    """Take a work space for a pass."""
+def take(*size: int, dtype: Any) -> np.ndarray:
+    """
+    Take a work space for a pass.
+
+    :param size: of the array
+    :param dtype: of its numbers
+    :return: the array, in which anything may stand
+    """
     free = _spare.get((*size, dtype))
     return free.pop() if free else np.empty(size, dtype)
 
@@ -84,7 +90,7 @@ class FusedActor:
         :return: (batch, actuators) in [-1, 1], and what the gradient needs
         """
         size = kernels.stack_work(self.sizes, len(features))
-        work = _take(size, dtype=weights.dtype)
+        work = take(size, dtype=weights.dtype)
         actions = np.empty((len(features), self.sizes[-1]), weights.dtype)
         gain = self.gain.astype(weights.dtype, copy=False)
         kernels.actor_forward(weights, self.sizes, self.norm, features, gain, work, actions)
@@ -166,7 +172,7 @@ class FusedValues:
         :return: (networks, batch, 1), and what the gradient needs
         """
         size = kernels.values_work(self.sizes, len(features))
-        work = _take(len(weights), size, dtype=weights.dtype)
+        work = take(len(weights), size, dtype=weights.dtype)
         values = np.empty((len(weights), len(features), 1), weights.dtype)
         kernels.values_forward(weights, self.sizes, self.norm, features, actions, work, values)
         return values, work

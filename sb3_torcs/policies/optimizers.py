@@ -79,14 +79,24 @@ class LeanAdam(_LrScale, th.optim.Adam):
         :param param: contiguous, on the CPU
         :param gradient: its gradient, flat
         """
+        weights = param.detach().numpy().reshape(-1)
+        kernels.adam(weights, gradient, *self.begin_step(param))
+
+    def begin_step(self, param: th.Tensor) -> tuple[Any, ...]:
+        """
+        Count an update of one parameter.
+
+        :param param: contiguous, on the CPU
+        :return: what the kernel takes after the weights and their gradient
+        """
         (group,) = (g for g in self.param_groups if any(param is own for own in g["params"]))
         step, mean, square = self._state_arrays(param)
         step += 1
-        count, (beta1, beta2), real = step.item(), group["betas"], gradient.dtype.type
+        count, (beta1, beta2), real = step.item(), group["betas"], mean.dtype.type
         rate = group["lr"] * group.get("lr_scale", 1.0)
-        kernels.adam(
-            param.detach().numpy().reshape(-1), gradient, mean, square, (real(beta1), real(beta2)),
-            real(rate / (1 - beta1**count)), real((1 - beta2**count) ** -0.5), real(group["eps"]),
+        return (
+            mean, square, (real(beta1), real(beta2)), real(rate / (1 - beta1**count)),
+            real((1 - beta2**count) ** -0.5), real(group["eps"]),
         )  # fmt: skip
 
     def _state_arrays(self, param: th.Tensor) -> list[np.ndarray]:

@@ -11,26 +11,13 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_torcs.policies import kernels
-from sb3_torcs.policies.fused import FusedActor, FusedValues, array, give
+from sb3_torcs.policies.fused import FusedActor, FusedValues, array, give, take
+from sb3_torcs.policies.layers import compiled
+from sb3_torcs.policies.networks import ActorAverage
 from sb3_torcs.policies.optimizers import LeanAdam, is_usual
 from sb3_torcs.policies.split_head import SplitHeadPolicy
 
 __all__ = ["LeanUpdates", "is_for"]
-
-
-class _Network:
-    """
-    A network whose passes are by hand.
-
-    :param owner: of its parameters
-    :param networks: number of those that pass together
-    """
-
-    def __init__(self, owner: Any, networks: int) -> None:
-        self.flat: th.Tensor = owner.flat
-        self.vector = array(owner.flat)
-        self.vectors = self.vector.reshape(networks, -1)
-        self.passes: Any = owner.fused
 
 
 class LeanUpdates:
@@ -41,20 +28,27 @@ class LeanUpdates:
     """
 
     def __init__(self, model: TD3) -> None:
-        self.model, policy = model, cast(SplitHeadPolicy, model.policy)
-        self.actor, self.actor_target = (
-            _Network(actor.mu, 1) for actor in (policy.actor, policy.actor_target)
+        self.model, policy = model, cast(Any, model.policy)
+        actor, critic = policy.actor.mu, policy.critic
+        self.actor: th.Tensor = actor.flat
+        self.critic: th.Tensor = critic.flat
+        weights, target = array(actor.flat), array(policy.actor_target.mu.flat)
+        dtype = weights.dtype
+        passes: FusedActor = actor.fused
+        self.actor_shape = passes.sizes, passes.norm, passes.gain.astype(dtype)
+        self.actors = weights, target, np.empty_like(weights)
+        weights, target = (
+            array(flat).reshape(critic.n_critics, -1)
+            for flat in (critic.flat, policy.critic_target.flat)
         )
-        self.critic, self.critic_target = (
-            _Network(critic, policy.critic.n_critics)
-            for critic in (policy.critic, policy.critic_target)
-        )
-        self.actor_gradient = np.empty_like(self.actor.vector)
-        self.critic_gradient = np.empty_like(self.critic.vectors)
-        self.average = policy.average
-        self.average_weights = (
-            None if self.average is None else array(cast(th.Tensor, policy.driver.mu.flat))
-        )
+        values: FusedValues = critic.fused
+        self.critic_shape = values.sizes, values.norm
+        self.critics = weights, target, np.empty_like(weights)
+        self.average: ActorAverage | None = policy.average
+        if self.average is None:
+            self.averages = np.empty(0, dtype), np.zeros((), np.int64)
+        else:
+            self.averages = array(policy.driver.mu.flat), self.average.n_averaged.numpy()
 
     def train(self, gradient_steps: int, batch_size: int) -> None:
         """
@@ -68,68 +62,148 @@ class LeanUpdates:
         model._update_learning_rate([model.actor.optimizer, model.critic.optimizer])
         actor_losses, critic_losses = [], []
         assert model.replay_buffer is not None
+        rooms = self._rooms(batch_size)
         for _ in range(gradient_steps):
             model._n_updates += 1
             batch = model.replay_buffer.sample(batch_size, env=model._vec_normalize_env)
-            critic_losses.append(self._update_critic(batch))
-            if model._n_updates % model.policy_delay == 0:
-                actor_losses.append(self._update_actor(array(batch.observations)))
-                self._follow()
+            both = model._n_updates % model.policy_delay == 0
+            # The actor's update does not read the critics' targets: these follow before it.
+            critic_losses.append(self._update_critic(batch, rooms, model.tau if both else 0.0))
+            if both:
+                actor_losses.append(self._update_actor(batch, rooms))
+        for room in rooms:
+            give(room)
         model.logger.record("train/n_updates", model._n_updates, exclude="tensorboard")
         if actor_losses:
             model.logger.record("train/actor_loss", np.mean(actor_losses))
         model.logger.record("train/critic_loss", np.mean(critic_losses))
 
-    def _update_critic(self, batch: ReplayBufferSamples) -> float:
-        """Learn from the targets' values; return the loss."""
-        observations, actions, following, dones, rewards = map(array, batch[:5])
+    def _rooms(self, batch_size: int) -> tuple[np.ndarray, np.ndarray]:
+        """Take work spaces for the passes of the actor and of the critics."""
+        networks, dtype = len(self.critics[0]), self.critics[0].dtype
+        return (
+            take(kernels.stack_work(self.actor_shape[0], batch_size), dtype=dtype),
+            take(networks, kernels.values_work(self.critic_shape[0], batch_size), dtype=dtype),
+        )
+
+    def _update_critic(
+        self, batch: ReplayBufferSamples, rooms: tuple[np.ndarray, np.ndarray], tau: float
+    ) -> float:
+        """Learn from the targets' values, which follow by a share; return the loss."""
+        model, arrays = self.model, tuple(map(array, batch[:5]))
         given = batch.discounts
-        discounts = np.full_like(rewards, self.model.gamma) if given is None else array(given)
-        passes: FusedValues = self.critic.passes
-        target = self.critic_target.vectors
-        next_values, work = passes.forward(target, following, self._next_actions(following))
-        give(work)
-        values, work = passes.forward(self.critic.vectors, observations, actions)
-        slope, gradient = np.empty_like(values), self.critic_gradient
-        loss: float = kernels.difference(values, next_values, rewards, dones, discounts, slope)
-        passes.backward(self.critic.vectors, observations, actions, work, slope, gradient)
-        optimizer = cast(LeanAdam, self.model.critic.optimizer)
-        optimizer.step_of(self.critic.flat, gradient.reshape(-1))
+        discounts = np.full_like(arrays[4], model.gamma) if given is None else array(given)
+        # Drawn even if it is clipped to 0, so that later random numbers are the same.
+        noise = th.empty(arrays[1].shape).normal_(0, model.target_policy_noise).numpy()
+        adam = cast(LeanAdam, model.critic.optimizer).begin_step(self.critic)
+        loss: float = _update_critic(
+            self.critic_shape, self.critics, self.actor_shape, self.actors[1], arrays, discounts,
+            noise, model.target_noise_clip, rooms, adam, tau,
+        )  # fmt: skip
         return loss
 
-    def _next_actions(self, following: np.ndarray) -> np.ndarray:
-        """Let the target decide, with a clipped noise."""
-        passes: FusedActor = self.actor_target.passes
-        actions, work = passes.forward(self.actor_target.vector, following)
-        give(work)
-        # Drawn even if it is clipped to 0, so that later random numbers are the same.
-        noise = th.empty(actions.shape).normal_(0, self.model.target_policy_noise).numpy()
-        clip = self.model.target_noise_clip
-        return np.clip(actions + np.clip(noise, -clip, clip), -1, 1) if clip else actions
-
-    def _update_actor(self, observations: np.ndarray) -> float:
+    def _update_actor(
+        self, batch: ReplayBufferSamples, rooms: tuple[np.ndarray, np.ndarray]
+    ) -> float:
         """Learn from the first critic's values; return the loss."""
-        passes: FusedActor = self.actor.passes
-        critic: FusedValues = self.critic.passes
-        weights, first = self.actor.vector, self.critic.vectors[:1]
-        actions, work = passes.forward(weights, observations)
-        values, seen = critic.forward(first, observations, actions)
-        share = np.full_like(values[0], -1.0 / len(observations))
-        slope = critic.backward_to_actions(first, seen, share)
-        passes.backward(weights, observations, work, actions, slope, self.actor_gradient)
-        cast(LeanAdam, self.model.actor.optimizer).step_of(self.actor.flat, self.actor_gradient)
-        return -float(values.mean())
+        adam = cast(LeanAdam, self.model.actor.optimizer).begin_step(self.actor)
+        decay = 0.0 if self.average is None else self.average.decay
+        loss: float = _update_actor(
+            self.critic_shape, self.critics[0][:1], self.actor_shape, self.actors,
+            array(batch.observations), rooms, adam, self.averages, decay, self.model.tau,
+        )  # fmt: skip
+        return loss
 
-    def _follow(self) -> None:
-        """Let the targets, and the average that drives, follow by a share."""
-        if self.average is not None:
-            # The average begins with the actor of the first update.
-            kept = self.average.decay if self.average.n_averaged > 0 else 0.0
-            kernels.follow(self.average_weights, self.actor.vector, np.float32(1.0 - kept))
-            self.average.n_averaged += 1
-        share = np.float32(self.model.tau)
-        kernels.follow(self.critic_target.vector, self.critic.vector, share)
-        kernels.follow(self.actor_target.vector, self.actor.vector, share)
+
+@compiled
+def _update_critic(
+    shape: Any, critics: Any, actor_shape: Any, actor: Any, batch: Any, discounts: Any, noise: Any,
+    clip: float, rooms: Any, adam: Any, tau: float,
+) -> float:  # fmt: skip
+    """
+    Learn from the targets' values.
+
+    :param shape: sizes of the critics' layers, and whether they have norms
+    :param critics: weights, those of the targets and their gradient, each (networks, parameters)
+    :param actor_shape: sizes of the actor's layers, whether it has norms, its gain
+    :param actor: weights of the target
+    :param batch: observations, actions, what followed, whether it was an end, rewards
+    :param discounts: (batch, 1)
+    :param noise: of the target's actions
+    :param clip: its limit
+    :param rooms: work spaces of the actor and of the critics
+    :param adam: from ``LeanAdam.begin_step``
+    :param tau: how far the targets follow, 0 to 1
+    :return: the loss
+    """
+    sizes, norm = shape
+    weights, target, gradient = critics
+    observations, actions, following, dones, rewards = batch
+    next_actions = np.empty_like(actions)
+    actor_sizes, actor_norm, gain = actor_shape
+    kernels.actor_forward(actor, actor_sizes, actor_norm, following, gain, rooms[0], next_actions)
+    if clip:
+        next_actions[:] = np.clip(next_actions + np.clip(noise, -clip, clip), -1, 1)
+    values = np.empty((len(weights), len(actions), 1), weights.dtype)
+    next_values, slope = np.empty_like(values), np.empty_like(values)
+    kernels.values_forward(target, sizes, norm, following, next_actions, rooms[1], next_values)
+    kernels.values_forward(weights, sizes, norm, observations, actions, rooms[1], values)
+    loss = kernels.difference(values, next_values, rewards, dones, discounts, slope)
+    unused = np.empty((0, 0, 0), weights.dtype)
+    kernels.values_backward(
+        weights, sizes, norm, observations, actions, rooms[1], slope, gradient, unused, unused
+    )
+    kernels.adam(weights.reshape(-1), gradient.reshape(-1), *adam)
+    if tau:
+        kernels.follow(target.reshape(-1), weights.reshape(-1), weights.dtype.type(tau))
+    return loss
+
+
+@compiled
+def _update_actor(
+    critic_shape: Any, first: Any, shape: Any, actors: Any, observations: Any, rooms: Any,
+    adam: Any, averages: Any, decay: float, tau: float,
+) -> float:  # fmt: skip
+    """
+    Learn from the first critic's values.
+
+    :param critic_shape: sizes of the critics' layers, and whether they have norms
+    :param first: weights of the first critic, (1, parameters)
+    :param shape: sizes of the actor's layers, whether it has norms, its gain
+    :param actors: weights, those of the target and their gradient
+    :param observations: (batch, features)
+    :param rooms: work spaces of the actor and of the critics
+    :param adam: from ``LeanAdam.begin_step``
+    :param averages: weights of the average that drives, of size 0 if there is none, and the
+        number of updates that it has followed
+    :param decay: share of the average that an update keeps
+    :param tau: how far the target follows, 0 to 1
+    :return: the loss
+    """
+    sizes, norm, gain = shape
+    weights, target, gradient = actors
+    batch, real = len(observations), weights.dtype.type
+    actions = np.empty((batch, len(gain)), weights.dtype)
+    kernels.actor_forward(weights, sizes, norm, observations, gain, rooms[0], actions)
+    critic_sizes, critic_norm = critic_shape
+    values, slope = np.empty((1, batch, 1), weights.dtype), np.empty_like(actions)
+    kernels.values_forward(
+        first, critic_sizes, critic_norm, observations, actions, rooms[1][:1], values
+    )
+    share = np.full((batch, 1), real(-1) / real(batch))
+    kernels.values_backward_to_actions(first, critic_sizes, critic_norm, rooms[1], share, slope)
+    kernels.actor_backward(
+        weights, sizes, norm, observations, gain, rooms[0], actions, slope, gradient,
+        np.empty((0, 0), weights.dtype),
+    )  # fmt: skip
+    kernels.adam(weights, gradient, *adam)
+    kernels.follow(target, weights, real(tau))
+    average, count = averages
+    if average.size:
+        # The average begins with the actor of the first update.
+        kernels.follow(average, weights, real(1 - decay) if count[()] > 0 else real(1))
+        count[()] += 1
+    return -values.mean()
 
 
 def is_for(model: TD3) -> bool:
