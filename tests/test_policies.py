@@ -22,6 +22,7 @@ from sb3_torcs.bench.policy import PlainSplitHeadPolicy, measure, updater
 from sb3_torcs.callbacks import LeanUpdatesCallback
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.policies import SplitHeadPolicy, fast_matmul
+from sb3_torcs.policies.fused import empty
 from sb3_torcs.policies.mirror import mirror_actions, mirror_image, mirror_observations
 from sb3_torcs.policies.optimizers import LeanAdam
 from sb3_torcs.policies.updates import LeanUpdates
@@ -461,6 +462,15 @@ def test_lean_updates_learn_as_the_algorithm_does(algorithm, kwargs):
         states[-1].append(th.get_rng_state())
     th.testing.assert_close(*states, rtol=1e-5, atol=1e-5)
     assert logs[0] == pytest.approx(logs[1], rel=1e-5)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_work_spaces_begin_at_a_cache_line(dtype):
+    """Of any size; those that NumPy makes begin anywhere, and products take longer."""
+    made = [empty(*size, dtype=dtype) for size in [(1,), (7,), (3, 1001), (2, 65_537)] * 5]
+    assert {work.ctypes.data % 64 for work in made} == {0}
+    assert {work.dtype for work in made} == {np.dtype(dtype)}
+    assert made[2].shape == (3, 1001)
 
 
 @pytest.mark.parametrize(("make", "found"), [

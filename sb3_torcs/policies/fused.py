@@ -13,7 +13,7 @@ from torch.autograd.function import once_differentiable
 
 from sb3_torcs.policies import kernels
 
-__all__ = ["FusedActor", "FusedValues", "array", "give", "take"]
+__all__ = ["FusedActor", "FusedValues", "array", "empty", "give", "take"]
 
 UNUSED = {kind: np.empty((0, 0), kind) for kind in (np.float32, np.float64)}
 UNUSED_EACH = {kind: np.empty((0, 0, 0), kind) for kind in (np.float32, np.float64)}
@@ -30,6 +30,19 @@ def array(tensor: th.Tensor) -> np.ndarray:
     return np.ascontiguousarray(tensor.detach().numpy())
 
 
+def empty(*size: int, dtype: Any) -> np.ndarray:
+    """
+    Make an array as PyTorch places it: it begins at a cache line, which NumPy's need not.
+
+    Products of matrices that begin elsewhere take up to 5 % longer.
+
+    :param size: of the array
+    :param dtype: of its numbers
+    :return: the array, in which anything may stand
+    """
+    return th.empty(size, dtype=th.from_numpy(np.empty(0, dtype)).dtype).numpy()
+
+
 _spare: dict[tuple[Any, ...], list[np.ndarray]] = {}
 
 
@@ -42,7 +55,7 @@ def take(*size: int, dtype: Any) -> np.ndarray:
     :return: the array, in which anything may stand
     """
     free = _spare.get((*size, dtype))
-    return free.pop() if free else np.empty(size, dtype)
+    return free.pop() if free else empty(*size, dtype=dtype)
 
 
 def give(work: np.ndarray) -> None:

@@ -11,7 +11,7 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_torcs.policies import kernels
-from sb3_torcs.policies.fused import FusedActor, FusedValues, array, give, take
+from sb3_torcs.policies.fused import FusedActor, FusedValues, array, empty, give, take
 from sb3_torcs.policies.layers import compiled
 from sb3_torcs.policies.networks import ActorAverage
 from sb3_torcs.policies.optimizers import LeanAdam, is_usual
@@ -36,14 +36,14 @@ class LeanUpdates:
         dtype = weights.dtype
         passes: FusedActor = actor.fused
         self.actor_shape = passes.sizes, passes.norm, passes.gain.astype(dtype)
-        self.actors = weights, target, np.empty_like(weights)
+        self.actors = weights, target, empty(*weights.shape, dtype=dtype)
         weights, target = (
             array(flat).reshape(critic.n_critics, -1)
             for flat in (critic.flat, policy.critic_target.flat)
         )
         values: FusedValues = critic.fused
         self.critic_shape = values.sizes, values.norm
-        self.critics = weights, target, np.empty_like(weights)
+        self.critics = weights, target, empty(*weights.shape, dtype=dtype)
         self.average: ActorAverage | None = policy.average
         if self.average is None:
             self.averages = np.empty(0, dtype), np.zeros((), np.int64)
