@@ -34,6 +34,38 @@ def test_a_random_track_is_drawn_from_the_seed_for_every_episode():
     assert lengths(1) != lengths(2)
 
 
+@pytest.mark.parametrize("track", ["random", ["g-track-1", "random"]])
+def test_an_episode_depends_on_its_seed_and_not_on_the_track_before(track):
+    """The start is one of the track that is drawn, and not of the one before."""
+    env = gym.make("TorcsLite-v0", track=track, start="random")
+    for seed in range(8):
+        first, _ = env.reset(seed=seed)
+        assert 0.0 <= env.unwrapped.car.distance_from_start < track_of(env).length
+        env.reset(seed=seed + 1000)
+        env.reset()
+        again, _ = env.reset(seed=seed)
+        np.testing.assert_array_equal(again, first)
+
+
+def test_a_chosen_start_wraps_on_the_random_track_that_is_drawn():
+    env = gym.make("TorcsLite-v0", track="random")
+    for before in range(3):
+        env.reset(seed=before)
+        _, info = env.reset(seed=7, options={"distance": 5000.0})
+        wanted = 5000.0 % track_of(env).length
+        assert info["car"].distance_from_start == pytest.approx(wanted, abs=1e-6)
+
+
+def test_nobody_remembers_places_of_a_random_track():
+    """It never comes again, and the next one has the same name."""
+    env = gym.make("TorcsLite-v0", track="random", start="random")
+    env.reset(seed=0)
+    ended = False
+    while not ended:
+        ended = env.step([1.0, 1.0, 0.0])[2]
+    assert env.unwrapped.mishaps() == {}
+
+
 def test_a_start_can_be_chosen_to_the_metre():
     env = gym.make("TorcsLite-v0")
     options = {"distance": 1000.0, "track_position": -0.5, "heading_error": 0.1, "speed": 25.0}

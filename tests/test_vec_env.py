@@ -269,6 +269,29 @@ def test_changes_through_methods_and_attributes_count(env_id, make):
         assert_same(change(ours), change(theirs))
 
 
+def test_to_look_at_a_standing_car_does_not_let_it_stand_longer(env_id, make):
+    """It drove first, so that it may stand for less long than at the start."""
+    for envs in (make(1, env_id=env_id), plain(1, env_id)):
+        envs.reset()
+        for timestep in range(100):
+            envs.get_attr("car")
+            _, _, dones, infos = envs.step([[0, 1, 0] if timestep < 25 else [0, 0, 1]])
+            if dones[0]:
+                break
+        assert (timestep, infos[0]["end"]) == (44 if env_id == LITE else 46, "stuck")
+
+
+def test_random_tracks_are_drawn_as_one_after_the_other(make):
+    kwargs = {"track": ["g-track-1", "random"], "start": "random"}
+    for seed in range(6):
+        ours, theirs = make(2, env_id=LITE, **kwargs), plain(2, LITE, **kwargs)
+        for envs in (ours, theirs):
+            envs.seed(seed)
+        for _ in range(3):
+            assert_same(ours.reset(), theirs.reset())
+            assert_same(ours.step(np.stack([GAS, GAS])), theirs.step(np.stack([GAS, GAS])))
+
+
 def test_a_term_that_somebody_adds_is_asked(make, monkeypatch):
     """Beside terms that are compiled, and in its place among them."""
 

@@ -268,6 +268,9 @@ class SeveralWorlds(Drawn):
         """Choose the next episode's world; see :class:`~sb3_torcs.backends.base.Backend`."""
         if self._turn.draw(rng) and self.conditions:
             self.set_conditions(1.0, 1.0)  # whatever another environment has set
+        draw_within = getattr(self.world, "draw_track", None)  # of a world of random tracks
+        if draw_within is not None:
+            draw_within(rng)
 
     def set_conditions(self, grip: float, mass: float) -> None:
         """Change the next episode's world; see :class:`~sb3_torcs.backends.base.Backend`."""

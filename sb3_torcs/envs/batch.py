@@ -200,7 +200,10 @@ class Batch:
             if ticks[race]
         ]
         self._fleet.arrive(race, steps, car)
-        env.arrive(car, _controls(self._controls[race]), int(self._standing[race]))
+        env.arrive(
+            car, _controls(self._controls[race]), int(self._standing[race]),
+            int(self._patience[race]),
+        )  # fmt: skip
         self._driven[race] = []
 
     def step(self, asked: npt.NDArray[np.floating]) -> Timestep:

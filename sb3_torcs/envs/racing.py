@@ -468,17 +468,17 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
             self._viewer.close()
         self.backend.close()
 
-    def arrive(self, car: CarState, controls: Controls, standing: int) -> None:
+    def arrive(self, car: CarState, controls: Controls, standing: int, patience: int) -> None:
         """
         Take over the state of a car that has been driven without ``step``, in a batch of races.
 
         :param car: the car now
         :param controls: the last that it was driven with
         :param standing: control ticks for which it has been standing
+        :param patience: control ticks for which it may stand
         """
-        self.car, self._controls, self.standing = car, controls, standing
-        if standing == 0:
-            self.patience = max(STUCK_TICKS, self.recovery)
+        self.car, self._controls = car, controls
+        self.standing, self.patience = standing, patience
 
     def end_race(self) -> None:
         """Truncate the episode with the next timestep: the race that others share is over."""

@@ -12,6 +12,7 @@ import numpy as np
 from sb3_torcs.car import MAX_START_SPEED, Start, StartName, is_number
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.rewards import safe_speed
+from sb3_torcs.torcs.track_names import RANDOM_TRACK
 from sb3_torcs.tracks.track import Track
 
 __all__ = ["RESET_OPTIONS", "Starts", "read_start"]
@@ -45,11 +46,13 @@ class Starts:
 
     def remember(self, track: Track, distance: float) -> None:
         """
-        Take note of an episode that ended badly.
+        Take note of an episode that ended badly, unless its track was drawn and never comes again.
 
         :param track: where it was driven
         :param distance: of its end from the start line [m]
         """
+        if track.name == RANDOM_TRACK:
+            return
         self.mishaps.setdefault(track.name, deque(maxlen=REMEMBERED)).append(distance)
 
     def set_mishaps(self, mishaps: Mapping[str, Sequence[float]]) -> None:

@@ -102,10 +102,13 @@ class LiteBackend:
         """The gearbox, and whether the episode began elsewhere than on the grid."""
         return self._gearbox, self._flying
 
-    def reset(self, rng: np.random.Generator, start: Start | None) -> CarState:
-        """Begin an episode; see :class:`~sb3_torcs.backends.base.Backend`."""
+    def draw_track(self, rng: np.random.Generator) -> None:
+        """Draw the next episode's track; see :class:`~sb3_torcs.backends.base.Backend`."""
         if self._random:
             self._set_track(load_track(RANDOM_TRACK, rng))
+
+    def reset(self, rng: np.random.Generator, start: Start | None) -> CarState:
+        """Begin an episode; see :class:`~sb3_torcs.backends.base.Backend`."""
         self._flying = start is not None
         track = self.track
         if start is None:
