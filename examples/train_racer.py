@@ -1,4 +1,4 @@
-"""Train PPO to race: first a driver, alone, then what it does otherwise where others are near.
+"""Train PPO to race: first alone, then behind robots, while some cars stay alone.
 
 Each car of each race is an environment of TorcsVecEnv, so that stock PPO learns from all of them.
 It learns one track, or several, to race on those that it never saw. With --driver it goes on from a
@@ -9,8 +9,8 @@ races against itself, this ancestor and robots.
 import argparse
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
+import torch as th
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.vec_env import VecEnv
@@ -18,10 +18,11 @@ from torch import nn
 
 from sb3_torcs.agents.model_writing import RecordCallback, recipe
 from sb3_torcs.callbacks import AdaptiveLearningRateCallback, LeanUpdatesCallback
-from sb3_torcs.policies import BoundedPolicy, ResidualPolicy
-from sb3_torcs.vec_env import MirrorVecEnv, TorcsVecEnv
+from sb3_torcs.policies import BoundedPolicy
+from sb3_torcs.sensors import feature_slices
+from sb3_torcs.vec_env import JoinedVecEnv, MirrorVecEnv, TorcsVecEnv
 
-SENSORS = ["base", "line"]  # of the driver
+SENSORS = ("base", "line", "rivals")
 # The fields of robots, of which each race draws one. Those with a number drive another car.
 FIELDS = (
     ("berniw", "bt", "inferno", "lliaw", "olethros", "tita", "inferno:4"),
@@ -38,7 +39,8 @@ class Settings:
     """What differs between a racer for one track and one for all roads."""
 
     timesteps_alone: int
-    cars_alone: int  # at once
+    cars_alone: int  # at once, before they meet others
+    beside_races: int  # cars alone per race
     episode: int  # timesteps of a car alone
     speed: float  # of a car alone at the begin of an episode, at most [m/s]
     hard: float  # share of the episodes alone that begin where another left the road
@@ -50,11 +52,11 @@ class Settings:
 
 
 ONE_TRACK = Settings(
-    timesteps_alone=1_310_720, cars_alone=64, episode=1000, speed=65.0, hard=0.5,
+    timesteps_alone=1_310_720, cars_alone=64, beside_races=2, episode=1000, speed=65.0, hard=0.5,
     off_line=(-1.0, -0.5), batch_size=None, ent_coef=0.001, mirror=False, grip=1.0,
 )  # fmt: skip
 ALL_ROADS = Settings(
-    timesteps_alone=3_145_728, cars_alone=128, episode=300, speed=80.0, hard=0.7,
+    timesteps_alone=3_145_728, cars_alone=128, beside_races=3, episode=300, speed=80.0, hard=0.7,
     off_line=(-4.0, -1.5), batch_size=2048, ent_coef=0.004, mirror=True,
     grip=[0.85, 1.0],
 )  # fmt: skip
@@ -79,7 +81,7 @@ def reward_in_races(off_line: float) -> dict[str, float]:
 parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
 parser.add_argument("--track", nargs="+", default=["aalborg"], help="one, or several")
 parser.add_argument("--alone", type=int, help="timesteps without other cars")
-parser.add_argument("--robots", type=int, default=3_600_000, help="timesteps in races")
+parser.add_argument("--robots", type=int, default=6_000_000, help="timesteps in races")
 parser.add_argument("--driver", type=Path, help="model that drives alone, to go on from")
 parser.add_argument("--ancestor", type=Path, help="model.zip of a racer from which to go on")
 parser.add_argument("--races", type=int, default=16, help="held at once")
@@ -88,21 +90,22 @@ parser.add_argument("--threads", type=int, help="default: one per core")
 parser.add_argument("--folder", type=Path, default=Path("logs/racer"))
 
 
-def make_model(
-    env: VecEnv, args: argparse.Namespace, settings: Settings, n_steps: int, gamma: float,
-    policy: type[BoundedPolicy] = BoundedPolicy, **policy_kwargs: Any,
-) -> PPO:  # fmt: skip
+def make_model(env: VecEnv, seed: int, n_steps: int, gamma: float, settings: Settings) -> PPO:
     """Make the learner of a stage."""
     return PPO(
-        policy,
+        BoundedPolicy,
         env,
         learning_rate=1e-3,
         n_steps=n_steps,
         batch_size=settings.batch_size or n_steps * env.num_envs // 4,
         gamma=gamma,
         ent_coef=settings.ent_coef,
-        policy_kwargs={"net_arch": [128, 128], "activation_fn": nn.ReLU, **policy_kwargs},
-        seed=args.seed,
+        policy_kwargs={
+            "net_arch": [128, 128],
+            "activation_fn": nn.ReLU,
+            "log_std_init": [-1.0, -0.3],  # steering, pedal
+        },
+        seed=seed,
         device="cpu",
     )
 
@@ -117,10 +120,12 @@ def callbacks(
     return [RecordCallback(asked), *learning, every]
 
 
-def cars_alone(args: argparse.Namespace, env_kwargs: dict, settings: Settings) -> TorcsVecEnv:
+def cars_alone(
+    number: int, args: argparse.Namespace, env_kwargs: dict, settings: Settings
+) -> TorcsVecEnv:
     """Make cars that begin anywhere on the road, many of them where others left it before."""
     cars = TorcsVecEnv(
-        settings.cars_alone,
+        number,
         threads=args.threads,
         reward=reward_alone(settings.off_line[0]),
         start="random",
@@ -165,39 +170,34 @@ def cars_in_races(args: argparse.Namespace, env_kwargs: dict, settings: Settings
     )
 
 
-def learn_alone(args: argparse.Namespace, env_kwargs: dict, settings: Settings) -> PPO:
-    """Learn to drive where there is nobody."""
-    cars = mirrored(cars_alone(args, env_kwargs, settings), settings)
-    # Steering, pedal.
-    model = make_model(cars, args, settings, n_steps=128, gamma=0.985, log_std_init=[-1.0, -0.3])
+def learn_alone(args: argparse.Namespace, env_kwargs: dict, settings: Settings) -> dict:
+    """Learn to drive where there is nobody, and return the policy's weights."""
+    cars = mirrored(cars_alone(settings.cars_alone, args, env_kwargs, settings), settings)
+    model = make_model(cars, args.seed, n_steps=128, gamma=0.985, settings=settings)
     timesteps = args.alone or settings.timesteps_alone
     model.learn(timesteps, callback=callbacks(env_kwargs, args, "alone", 0.012, 0.003))
     cars.close()
-    model.save(args.folder / "driver")
-    return model
+    return model.policy.state_dict()
 
 
-def racer_of(driver: PPO, cars: VecEnv, args: argparse.Namespace, settings: Settings) -> PPO:
+def weights_of(path: Path) -> dict:
+    """Return the policy's weights in a model file."""
+    return PPO.load(path, device="cpu").policy.state_dict()
+
+
+def begin_to_race(weights: dict) -> None:
     """
-    Make a learner that does what a driver does, and learns what to do otherwise near others.
+    Let a policy that has never met a car see others without fright.
 
-    It sees rivals last, after what the driver sees. A racer goes on as it is.
+    Alone it saw zeros for rivals, so the weights of theirs are those that it was born with. A
+    driver that never saw them has none. Rivals come last.
     """
-    # Damage comes seldom and in heaps, so that short rollouts would lead astray. To follow a slower
-    # car costs little at once, and much in the end, so it looks further ahead.
-    stage: dict[str, Any] = {"n_steps": 256, "gamma": 0.99, "policy": ResidualPolicy}
-    # It has to try things: who never brakes does not find out that it ends a long contact.
-    tries = {"log_std_init": [-2.0, -0.7]}
-    if isinstance(driver.policy, ResidualPolicy):
-        racer = make_model(cars, args, settings, **stage, **{**driver.policy_kwargs, **tries})
-        weights = driver.policy.state_dict()
-        racer.policy.load_state_dict({**weights, "log_std": racer.policy.log_std.detach()})
-        return racer
-    (seen,), (of_driver,) = cars.observation_space.shape, driver.observation_space.shape
-    layers = {"gate_features": seen - of_driver, "driver_arch": driver.policy_kwargs["net_arch"]}
-    racer = make_model(cars, args, settings, **stage, **layers, **tries)
-    racer.policy.follow(driver.policy)
-    return racer
+    features = feature_slices(SENSORS)
+    seen = min(where.start for name, where in features.items() if "rivals" in name)
+    missing = max(where.stop for where in features.values()) - seen
+    for net in ("policy_net", "value_net"):
+        name = f"mlp_extractor.{net}.0.weight"
+        weights[name] = nn.functional.pad(weights[name][:, :seen], (0, missing))
 
 
 def main() -> None:
@@ -206,15 +206,27 @@ def main() -> None:
     settings = ALL_ROADS if several else ONE_TRACK
     env_kwargs = {
         "track": args.track if several else args.track[0],
-        "sensors": SENSORS, "range_finders": "narrow", "action": "pedal",
-        "gearbox": "road_speed", "action_repeat": 5,
+        "sensors": list(SENSORS), "range_finders": "narrow", "action": "pedal",
+        "gearbox": "road_speed", "action_repeat": 5, "unstick": True, "keep_distance": True,
     }  # fmt: skip
-    given = args.ancestor or args.driver
-    driver = PPO.load(given, device="cpu") if given else learn_alone(args, env_kwargs, settings)
+    if args.ancestor is not None:
+        weights = weights_of(args.ancestor)
+    else:
+        driver = args.driver
+        weights = weights_of(driver) if driver else learn_alone(args, env_kwargs, settings)
+        begin_to_race(weights)
 
-    env_kwargs |= {"sensors": [*SENSORS, "rivals"], "unstick": True, "keep_distance": True}
-    cars = mirrored(cars_in_races(args, env_kwargs, settings), settings)
-    model = racer_of(driver, cars, args, settings)
+    # Some cars stay alone, for the pace: in races they are seldom free to drive at their own.
+    beside = cars_alone(settings.beside_races * args.races, args, env_kwargs, settings)
+    cars = mirrored(JoinedVecEnv([cars_in_races(args, env_kwargs, settings), beside]), settings)
+    # Damage comes seldom and in heaps, so that short rollouts would lead astray. To follow a slower
+    # car costs little at once, and much in the end, so it looks further ahead.
+    model = make_model(cars, args.seed, n_steps=256, gamma=0.99, settings=settings)
+    model.policy.load_state_dict(weights)
+    # It has become sure of what to do, and has to try things again: who never brakes does not find
+    # out that it ends a long contact.
+    with th.no_grad():
+        model.policy.log_std.copy_(th.tensor([-2.0, -0.7]))
     model.learn(args.robots, callback=callbacks(env_kwargs, args, "races", 0.01, 0.002))
     cars.close()
     model.save(args.folder / "model")

@@ -2,7 +2,6 @@
 
 from sb3_torcs.policies.bounded import BoundedPolicy
 from sb3_torcs.policies.export import export_actor
-from sb3_torcs.policies.residual import ResidualPolicy
 from sb3_torcs.policies.split_head import SplitHeadPolicy
 
-__all__ = ["BoundedPolicy", "ResidualPolicy", "SplitHeadPolicy", "export_actor"]
+__all__ = ["BoundedPolicy", "SplitHeadPolicy", "export_actor"]
