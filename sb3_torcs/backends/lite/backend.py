@@ -109,6 +109,7 @@ class LiteBackend:
 
     def reset(self, rng: np.random.Generator, start: Start | None) -> CarState:
         """Begin an episode; see :class:`~sb3_torcs.backends.base.Backend`."""
+        del rng  # the track is drawn already, and nothing else is by chance
         self._flying = start is not None
         track = self.track
         if start is None:
