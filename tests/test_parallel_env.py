@@ -144,6 +144,8 @@ def test_a_wrong_action_drives_nobody(make, actions, message):
         ({"agents": 30}, "agents is 30, with 0 opponents"),
         ({"max_episode_steps": 0}, "max_episode_steps is 0"),
         ({"opponents": "bt"}, "opponents is 'bt'; expected a list"),
+        ({"backend": "scr"}, "backend is 'scr', which is for a race of one agent"),
+        ({"render_mode": "rgb_array"}, "render_mode is for Torcs-v0"),
     ],
 )
 def test_a_wrong_option_is_told(make, options, message):

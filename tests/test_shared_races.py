@@ -257,8 +257,26 @@ class TestMistakes:
             TorcsVecEnv(1, agents)
 
     def test_controls_that_arrive_late(self):
-        with pytest.raises(InvalidOption, match="delay is for a race of one agent"):
+        with pytest.raises(InvalidOption, match="delay is 3, which is for a race of one agent"):
             make_race(2, delay=3)
+
+    @pytest.mark.parametrize(
+        "option",
+        [
+            {"backend": "scr"}, {"host": "localhost"}, {"port": 3001}, {"grip": 0.9},
+            {"mass": (0.9, 1.1)}, {"picture": "game"}, {"view": "tv"}, {"boards": False},
+            {"render_size": (64, 48)},
+        ],
+    )  # fmt: skip
+    def test_options_of_a_race_of_one_agent(self, option):
+        (name,) = option
+        with pytest.raises(InvalidOption, match=f"{name} is .*, which is for a race of one agent"):
+            TorcsVecEnv(1, 2, **option)
+
+    def test_their_usual_values_are_no_mistake(self, make):
+        shown = {"picture": "above", "view": "behind", "boards": True, "render_size": [640, 480]}
+        usual = {"backend": "native", "host": None, "port": None, "grip": 1.0, "mass": 1.0}
+        assert make(1, 2, **shown, **usual).num_envs == 2
 
     def test_worlds_with_one_car(self):
         with pytest.raises(InvalidOption, match=r"TorcsLite-v0 has one car in each race"):

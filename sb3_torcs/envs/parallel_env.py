@@ -54,6 +54,11 @@ class TorcsParallelEnv(ParallelEnv[str, Observation, Action]):
             raise InvalidOption(
                 f"max_episode_steps is {max_episode_steps!r}; expected a whole number >= 1, or None"
             )
+        if options.pop("render_mode", None) is not None:
+            raise InvalidOption(
+                "render_mode is for Torcs-v0; `sb3-torcs race --video FILE.mp4` shows a race of "
+                "several agents"
+            )
         options.setdefault("flagged", options.get("laps") is not None)
         envs = make_race(agents, **options)
         self.possible_agents = [f"agent_{number}" for number in range(agents)]

@@ -23,6 +23,13 @@ from sb3_torcs.torcs.starting_list import guests_of, starting_list
 __all__ = ["RaceCarEnv", "make_grid", "make_race", "make_shared_race"]
 
 
+OF_ONE_AGENT = {
+    "backend": "native", "host": None, "port": None, "delay": 0, "grip": 1.0, "mass": 1.0,
+    "picture": "above", "view": "behind", "boards": True, "render_size": (640, 480),
+}  # fmt: skip
+"""Options of ``Torcs-v0`` that races of several agents do not have, and their usual values."""
+
+
 class RaceCarEnv(RacingEnv):
     """
     The environment of one agent of a race. It is reset alone, and stepped with the others.
@@ -120,15 +127,27 @@ def make_race(
     :param flagged: whether agents are flagged off when the winner has finished, as robots are
     :param options: of :class:`~sb3_torcs.envs.racing.RacingEnv`
     :return: one environment for each agent
+    :raises InvalidOption: if an option is for a race of one agent, or has a wrong value
     """
-    if options.pop("delay", 0) != 0:
-        raise InvalidOption("delay is for a race of one agent; leave it out")
+    options = _of_several_agents(options)
     race = make_shared_race(
         agents, track, car, opponents, grid_place, sensor_noise=sensor_noise,
         action_repeat=options.get("action_repeat", 5), range_finders=range_finders,
         gearbox=used_gearbox(gearbox, action), laps=laps, flagged=flagged,
     )  # fmt: skip
     return [RaceCarEnv(seat, action=action, laps=laps, **options) for seat in race.seats]
+
+
+def _of_several_agents(options: dict[str, Any]) -> dict[str, Any]:
+    """Take out the options of a race of one agent, which have to have their usual values."""
+    for name, usual in OF_ONE_AGENT.items():
+        given = options.get(name, usual)
+        if (tuple(given) if isinstance(given, list) else given) != usual:
+            raise InvalidOption(
+                f"{name} is {given!r}, which is for a race of one agent against robots; leave it "
+                "out"
+            )
+    return {name: given for name, given in options.items() if name not in OF_ONE_AGENT}
 
 
 def make_shared_race(
