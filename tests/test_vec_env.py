@@ -233,6 +233,16 @@ def test_an_info_is_used_like_a_dict(make):
     info["episode"] = 1
     assert info.pop("episode") == 1
     assert type(pickle.loads(pickle.dumps(info))) is dict
+    for joined in (info | {"laps": -1}, {"laps": 0, "a": 1} | info, info | info):
+        assert type(joined) is dict
+    assert (info | {"laps": -1}) == {**copy, "laps": -1}
+    assert ({"laps": -1, "a": 1} | info) == {"a": 1, **copy}
+    before = info
+    info |= {"episode": 2}
+    assert info is before
+    assert info.pop("episode") == 2
+    with pytest.raises(TypeError):
+        info | 1
     with pytest.raises(KeyError):
         info["episode"]
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, MutableMapping, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, Self
 
 import gymnasium as gym
 import numpy as np
@@ -72,6 +72,16 @@ class RaceInfo(MutableMapping[str, Any]):
 
     def __delitem__(self, name: str) -> None:
         del self._made()[name]
+
+    def __or__(self, other: Mapping[str, Any]) -> dict[str, Any]:
+        return self._made() | dict(other) if isinstance(other, Mapping) else NotImplemented
+
+    def __ror__(self, other: Mapping[str, Any]) -> dict[str, Any]:
+        return dict(other) | self._made() if isinstance(other, Mapping) else NotImplemented
+
+    def __ior__(self, other: Mapping[str, Any] | Iterable[tuple[str, Any]]) -> Self:
+        self._made().update(other)
+        return self
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._made())
