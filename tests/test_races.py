@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 
+from sb3_torcs.agents.models import find_model
 from sb3_torcs.agents.pilots import Crew
 from sb3_torcs.agents.robots import race as robots_race
 from sb3_torcs.agents.scripted import ScriptedDriver
@@ -132,6 +133,23 @@ class TestGrid:
 def test_a_driver_that_cannot_take_part(drivers, message, game):
     with pytest.raises(InvalidOption, match=message):
         find_entrants(drivers, game)
+
+
+def test_models_of_one_file_name_are_told_apart_by_their_folders(game, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shipped = find_model("ddpg-roads").read_bytes()
+    paths = ["r1/model.zip", "a/r2/model.zip", "b/r2/model.zip", "bt.zip", "r1/other.zip"]
+    paths += ["c/run/best_model.zip", "d/run/best_model.zip", "r1/ddpg-roads.zip"]
+    for path in paths:
+        (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / path).write_bytes(shipped)
+    entrants = find_entrants([*paths, "bt", "ddpg-roads"], game)
+    assert [entrant.name for entrant in entrants] == [
+        "r1/model", "a/r2/model", "b/r2/model", f"{tmp_path.name}/bt", "other",
+        "c/run", "d/run", "r1/ddpg-roads", "bt", "ddpg-roads",
+    ]  # fmt: skip
+    with pytest.raises(InvalidOption, match=r"driver 'r1/model\.zip' is named twice"):
+        find_entrants(["r1/model.zip", "a/../r1/model", "bt"], game)
 
 
 def test_the_error_is_one_wherever_robots_and_agents_can_be_named(capsys, game):
