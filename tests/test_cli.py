@@ -337,6 +337,34 @@ def test_an_evaluation_takes_any_argument_of_the_environment(capsys):
     assert "--env-kwargs: unknown env_kwargs: argument 'dely'; did you mean 'delay'?" in err
 
 
+@pytest.mark.parametrize(("setting", "advice"), [
+    ("max_episode_steps=10", "the time limit follows from the laps; type --laps L instead"),
+    ("laps=2", "type --laps 2 instead"),
+    ("track=alpine-1", "type --track alpine-1 instead"),
+    ("car=car1-ow1", "type --car car1-ow1 instead"),
+    ("action_repeat=2", "type --action-repeat 2 instead"),
+    ("range_finders=scr", "type --range-finders scr instead"),
+])  # fmt: skip
+def test_an_argument_that_has_an_option_is_given_by_it(capsys, setting, advice):
+    """One of the two would be dropped without a word."""
+    words = ["evaluate", "scripted", *LITE, "--laps", "1", "--env-kwargs", "delay=2", setting]
+    status, out, err = run(capsys, *words)
+    assert (status, out, err.count("\n")) == (2, "", 1)
+    assert f"--env-kwargs has {setting}" in err
+    assert advice in err
+
+
+def test_without_a_whole_lap_there_are_figures_and_no_report(capsys, tmp_path, plain):
+    """The exit status is 0 however the driver drove."""
+    page = tmp_path / "rep.html"
+    words = ["evaluate", str(plain), *LITE, "--laps", "1", "--report", str(page)]
+    status, out, err = run(capsys, *words, "--json")
+    assert (status, json.loads(out)["episodes"][0]["laps"]) == (0, 0)
+    assert err.endswith("sb3-torcs: no report: nobody drove a whole lap of aalborg\n")
+    assert not page.exists()
+    assert "report:" not in run(capsys, *words)[1]
+
+
 @pytest.mark.parametrize("words", ["delay", "=3", "delay=[3"])
 def test_an_argument_without_a_value_is_refused(words):
     with pytest.raises(argparse.ArgumentTypeError, match=r"expected NAME=VALUE, e\.g\. delay=2"):
@@ -915,3 +943,21 @@ def test_a_negative_seed_is_refused(capsys, verb):
         main([*verb, "--seed", "-1"])
     assert caught.value.code == 2
     assert "expected a whole number >= 0" in capsys.readouterr().err
+
+
+def test_a_training_without_environments_for_evaluations_is_refused(capsys, tmp_path):
+    words = ["train", "--timesteps", "100", "--folder", str(tmp_path), "--", "--n-eval-envs", "0"]
+    assert run(capsys, *words) == (2, "", "sb3-torcs: --n-eval-envs is 0; expected at least 1\n")
+
+
+def test_a_wrapper_that_lacks_an_argument_is_told_with_its_entry(capsys, tmp_path):
+    file = tmp_path / "own.yml"
+    wrapper = "gymnasium.wrappers.TransformReward"
+    file.write_text(
+        f"TorcsLite-v0: {{n_timesteps: 60, policy: MlpPolicy, env_wrapper: {wrapper}}}\n"
+    )
+    words = ["train", "--algo", "sac", "--conf-file", str(file), "--folder", str(tmp_path / "logs")]
+    status, _, err = run(capsys, *words)
+    assert (status, err.count("\n")) == (2, 1)
+    assert "entry 'TorcsLite-v0': an env_wrapper does not go around the car" in err
+    assert "give its arguments below its dotted path" in err

@@ -234,13 +234,13 @@ def test_the_budget_may_be_written_as_people_do(steps):
 
 def test_a_schedule_must_be_one_that_the_zoo_reads(tmp_path):
     said = complaint(tmp_path, {"learning_rate": "abc"})
-    assert said == "learning_rate is 'abc'; expected a number, or lin_NUMBER to fall to 0"
+    assert said == "learning_rate is 'abc'; expected a number >= 0, or lin_NUMBER to fall to 0"
     accepted({"learning_rate": "lin_1e-3"})
     accepted({"learning_rate": "0.001"})
 
 
 @pytest.mark.parametrize(("key", "value", "expected"), [
-    ("learning_rate", float("nan"), "a number, or lin_NUMBER to fall to 0"),
+    ("learning_rate", float("nan"), "a number >= 0, or lin_NUMBER to fall to 0"),
     ("batch_size", 1.5, "a whole number >= 1, e.g. 64"),
     ("n_envs", 0, "a whole number >= 1, e.g. 64"),
     ("buffer_size", "1e5", "a whole number >= 1, e.g. 64"),
@@ -291,3 +291,20 @@ def test_another_script_is_told(words):
     done = zoo_script(*words)
     assert done.returncode == 1
     assert done.stderr.startswith("the RL Zoo has no script '")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"frame_stack": 0}, "frame_stack is 0; expected a whole number >= 1"),
+        ({"learning_rate": -1}, "learning_rate is -1; expected a number >= 0"),
+        ({"noise_type": "foo"}, "noise_type is 'foo'; expected one of normal, ornstein-uhlenbeck"),
+        ({"policy": "CnnPolicy"}, "sees pictures or a dict, .* use MlpPolicy"),
+        ({"policy": "MultiInputPolicy"}, "sees pictures or a dict, .* use MlpPolicy"),
+    ],
+)
+def test_what_would_end_a_training_at_its_begin_is_told(change, message):
+    path = zoo.config_file("sac")
+    entry = {**zoo.read_entry(path, "Torcs-v0"), **change}
+    with pytest.raises(ZooConfigError, match=message):
+        zoo.check_entry(entry, "sac", "Torcs-v0", zoo.Place(path, "Torcs-v0"))

@@ -35,6 +35,9 @@ FILES = {
 }  # fmt: skip
 """Endings of what can be written of a drive."""
 
+OPTIONS = ("track", "car", "laps", "action_repeat", "range_finders")
+"""Arguments of the environment that have an option of their own."""
+
 HEADERS = ("episode", "laps", "lap times s", "distance m", "end", "damage", "return")
 
 DESCRIPTION = """\
@@ -104,11 +107,10 @@ def run(args: argparse.Namespace) -> int:
     else:
         print(f"{recorder.env_id}, {', '.join(recorder.names().values())}")
         print(table(HEADERS, [_row(number, episode) for number, episode in enumerate(result, 1)]))
-    if "report" in files:  # last: it is an error if there is no whole lap
-        from sb3_torcs.evaluation.comparing import report_of
-
-        track = recorder.get_wrapper_attr("backend").track  # which may be of somebody's own file
-        report_of(log.frame(), track).save(files["report"])
+    if "report" in files and not _reported(files["report"], recorder, log):
+        print(f"sb3-torcs: no report: nobody drove a whole lap of {recorder.names()['track']}",
+            file=sys.stderr)  # fmt: skip
+        del files["report"]
     for what, path in files.items():
         if not args.json:
             print(f"{what}: {path}")
@@ -149,6 +151,19 @@ def _write(files: Mapping[str, Path], recorder: Recorder, log: DriveLog, model: 
     recorder.close()
 
 
+def _reported(path: Path, recorder: Recorder, log: DriveLog) -> bool:
+    """Make the lap report, unless there is no whole lap; return whether it was made."""
+    from sb3_torcs.evaluation.comparing import report_of
+    from sb3_torcs.telemetry.laps import drives_of
+
+    frame = log.frame()
+    if not any(drive.laps for drive in drives_of(frame)):
+        return False
+    track = recorder.get_wrapper_attr("backend").track  # which may be of somebody's own file
+    report_of(frame, track).save(path)
+    return True
+
+
 def _ticks_wanted(files: Mapping[str, Path], *kinds: str) -> bool:
     """Whether one of the files is made of control ticks, and not of timesteps."""
     return any(kind in files and files[kind].suffix.lower() != ".csv" for kind in kinds)
@@ -170,6 +185,7 @@ def _drive(args: argparse.Namespace, *, ticks: bool) -> tuple[list[Episode], Rec
     from sb3_torcs.telemetry import DriveLog
     from sb3_torcs.training.zoo import check_env_kwargs, check_racing
 
+    _check_options(dict(args.env_kwargs))
     record = told_record(args.model)
     env_id = args.env
     if env_id is None:
@@ -185,6 +201,25 @@ def _drive(args: argparse.Namespace, *, ticks: bool) -> tuple[list[Episode], Rec
     log = log_drives(env, driver_name(args.model)) if ticks else DriveLog()
     result = evaluate(env, driver, episodes=args.episodes, seed=args.seed)
     return result, recorder, log
+
+
+def _check_options(env_kwargs: Mapping[str, Any]) -> None:
+    """Refuse what has an option of its own: one of the two would be dropped."""
+    from sb3_torcs.errors import InvalidOption
+    from sb3_torcs.training.zoo import TIME_LIMIT
+
+    for name, value in env_kwargs.items():
+        if name == TIME_LIMIT:
+            raise InvalidOption(
+                f"--env-kwargs has {name}={value}, but the time limit follows from the laps; "
+                "type --laps L instead"
+            )
+        if name in OPTIONS:
+            option = f"--{name.replace('_', '-')}"
+            raise InvalidOption(
+                f"--env-kwargs has {name}={value}, for which there is an option; type "
+                f"{option} {value} instead"
+            )
 
 
 def environment_kwargs(args: argparse.Namespace, record: TrainingRecord) -> dict[str, Any]:

@@ -13,7 +13,13 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
-from sb3_torcs.errors import InvalidOption, OutputNotWritable, WorkerLost
+from sb3_torcs.errors import (
+    InvalidOption,
+    ModelMismatch,
+    OutputNotWritable,
+    WorkerLost,
+    ZooConfigError,
+)
 from sb3_torcs.files import writable_folder
 from sb3_torcs.signals import answered
 
@@ -127,7 +133,14 @@ def train_run(options: TrainOptions) -> Run:
     entry, changed = _entry(options)
     # Made once, so that a mistake is reported before anything starts.
     with contextlib.closing(gym.make(options.env, **changed["env_kwargs"])) as env:
-        resume = _resumed(options, entry, wrapped(env, changed, trust=True), changed)
+        try:
+            driven = wrapped(env, changed, trust=True)
+        except ModelMismatch as error:
+            raise ZooConfigError(
+                f"entry '{options.entry or options.env}': an env_wrapper does not go around the "
+                f"car ({error.__cause__ or error}); give its arguments below its dotted path"
+            ) from error
+        resume = _resumed(options, entry, driven, changed)
     folder = writable_folder(options.folder)
     tensorboard = _for_tensorboard(options.tensorboard or folder / "tensorboard")
     wanted = options.timesteps or zoo.timesteps(changed)
@@ -183,6 +196,7 @@ def _changes(zoo_args: Sequence[str]) -> dict[str, Any]:
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     parser.add_argument("-params", "--hyperparams", nargs="+", action=StoreDict, default={})
     parser.add_argument("--env-kwargs", nargs="+", action=StoreDict)
+    parser.add_argument("--n-eval-envs", type=int, default=1)
     try:
         known, _ = parser.parse_known_args(zoo_args)
     except Exception as error:  # values are evaluated, which can raise anything
@@ -190,6 +204,8 @@ def _changes(zoo_args: Sequence[str]) -> dict[str, Any]:
             f"'{shlex.join(zoo_args)}' cannot be read ({error}); values are Python, e.g. "
             "--hyperparams gamma:0.98 \"learning_rate:'lin_0.001'\""
         ) from error
+    if known.n_eval_envs < 1:
+        raise InvalidOption(f"--n-eval-envs is {known.n_eval_envs}; expected at least 1")
     if known.env_kwargs is None:
         return dict(known.hyperparams)
     return {**known.hyperparams, "env_kwargs": known.env_kwargs}

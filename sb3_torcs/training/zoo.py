@@ -11,7 +11,6 @@ import importlib.util
 import inspect
 import multiprocessing
 import os
-import re
 import signal
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -21,11 +20,18 @@ import gymnasium as gym
 import yaml
 
 from sb3_torcs.agents.model_algorithm import SBX, algorithm_class
-from sb3_torcs.car import is_count, is_number
+from sb3_torcs.car import is_count
 from sb3_torcs.errors import InvalidOption, ZooConfigError, near_miss
 from sb3_torcs.files import read_yaml
 from sb3_torcs.sensors import look_both_ways, range_finder_angles
-from sb3_torcs.training.zoo_data import as_data, check_class, check_data, check_jax
+from sb3_torcs.training.zoo_data import (
+    as_data,
+    check_class,
+    check_data,
+    check_jax,
+    check_numbers,
+    check_sight,
+)
 
 __all__ = [
     "TIME_LIMIT",
@@ -187,10 +193,12 @@ def check_entry(entry: Entry, algo: str, env_id: str, place: Place, *, trust: bo
     for key in REQUIRED:
         if key not in entry:
             raise ZooConfigError(f"{place}: key '{key}' is missing")
-    _check_numbers(entry, place)
+    check_numbers(entry, str(place))
     constructor = (_arguments(algorithm) or set()) - set(GIVEN_BY_ZOO)
     _check_keys(entry, ZOO_KEYS | constructor, "key", place)
     policy = _policy(entry["policy"], algorithm, place)
+    if env_id in OURS and not entry.get("env_wrapper"):
+        check_sight(entry["policy"], env_id, str(place))
     _check_call("policy_kwargs", policy, entry.get("policy_kwargs"), place, GIVEN_BY_POLICY_OWNER)
     if algo.startswith(SBX):
         check_jax(policy, entry.get("policy_kwargs"), str(place))
@@ -296,58 +304,6 @@ def timesteps(entry: Entry) -> int:
     :return: its ``n_timesteps``
     """
     return int(float(entry["n_timesteps"]))
-
-
-def _is_budget(value: Any) -> bool:
-    try:
-        return not isinstance(value, bool) and 1.0 <= float(value) < float("inf")
-    except (TypeError, ValueError):
-        return False
-
-
-def _is_schedule(value: Any) -> bool:
-    if isinstance(value, str):
-        return bool(re.fullmatch(r"(lin_)?[\d.]+(e[+-]?\d+)?", value))
-    return value is None or is_number(value)
-
-
-def _is_share(value: Any) -> bool:
-    return is_number(value) and 0.0 <= value <= 1.0
-
-
-NUMBERS: tuple[tuple[tuple[str, ...], Callable[[Any], bool], str], ...] = (
-    (("n_timesteps",), _is_budget, "a number >= 1"),
-    (
-        ("learning_rate", "clip_range", "clip_range_vf", "delta_std"),
-        _is_schedule,
-        "a number, or lin_NUMBER to fall to 0",
-    ),
-    (
-        ("n_envs", "batch_size", "buffer_size", "n_steps", "n_epochs", "policy_delay"),
-        is_count,
-        "a whole number >= 1, e.g. 64",
-    ),
-    (("gamma", "tau", "gae_lambda"), _is_share, "a number from 0 to 1, e.g. 0.005"),
-    (
-        ("learning_starts",),
-        lambda value: is_count(value) or value == 0,
-        "a whole number >= 1, or 0",
-    ),
-    (
-        ("gradient_steps",),
-        lambda value: is_count(value) or value == -1,
-        "a whole number >= 1, or -1",
-    ),
-)
-"""Numbers that are read, or used, only when the training has begun: keys, rule, and its words."""
-
-
-def _check_numbers(entry: Entry, place: Place) -> None:
-    """Make sure that numbers have values with which a training can run."""
-    for keys, good, words in NUMBERS:
-        for key in keys:
-            if key in entry and not good(entry[key]):
-                raise ZooConfigError(f"{place}: {key} is {entry[key]!r}; expected {words}")
 
 
 def _env_class(env_id: str) -> Callable[..., Any]:

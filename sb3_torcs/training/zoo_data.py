@@ -1,4 +1,4 @@
-"""Hyperparameter files as plain data: no string is evaluated, classes are of known kinds."""
+"""Values of hyperparameter files: no string is evaluated; classes, numbers and policies that fit."""
 
 from __future__ import annotations
 
@@ -6,15 +6,26 @@ import ast
 import contextlib
 import copy
 import importlib
+import re
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import gymnasium as gym
 from torch.nn.modules import activation
 
+from sb3_torcs.car import is_count, is_number
 from sb3_torcs.errors import ZooConfigError
 
-__all__ = ["EVALUATED", "as_data", "check_class", "check_data", "check_jax", "plain_python"]
+__all__ = [
+    "EVALUATED",
+    "as_data",
+    "check_class",
+    "check_data",
+    "check_jax",
+    "check_numbers",
+    "check_sight",
+    "plain_python",
+]
 
 EVALUATED = (
     "monitor_kwargs", "normalize", "policy_kwargs", "replay_buffer_class", "replay_buffer_kwargs",
@@ -105,6 +116,88 @@ def check_jax(policy: Any, policy_kwargs: Any, place: str) -> None:
             f"{place}: {named} is of PyTorch, and SBX computes with JAX; the shipped entries for "
             "it are those of sac, tqc and crossq; for others give a file of your own: --conf-file"
         )
+
+
+def check_sight(policy: Any, env_id: str, place: str) -> None:
+    """
+    Make sure that a policy can read one row of numbers.
+
+    :param policy: its alias or dotted path
+    :param env_id: of one of our environments
+    :param place: where it stands, for the message
+    :raises ZooConfigError: if it is SB3's policy for pictures, or for several observations
+    """
+    if str(policy).startswith(("Cnn", "MultiInput")):
+        raise ZooConfigError(
+            f"{place}: policy is {policy}, which sees pictures or a dict, and {env_id} gives one "
+            f"row of numbers; use {str(policy).replace('Cnn', 'Mlp').replace('MultiInput', 'Mlp')}"
+        )
+
+
+def _is_budget(value: Any) -> bool:
+    try:
+        return not isinstance(value, bool) and 1.0 <= float(value) < float("inf")
+    except (TypeError, ValueError):
+        return False
+
+
+def _is_schedule(value: Any) -> bool:
+    if isinstance(value, str):
+        return bool(re.fullmatch(r"(lin_)?[\d.]+(e[+-]?\d+)?", value))
+    return value is None or (is_number(value) and value >= 0.0)
+
+
+def _is_share(value: Any) -> bool:
+    return is_number(value) and 0.0 <= value <= 1.0
+
+
+NOISE_TYPES = (None, "normal", "ornstein-uhlenbeck")
+
+NUMBERS: tuple[tuple[tuple[str, ...], Callable[[Any], bool], str], ...] = (
+    (("n_timesteps",), _is_budget, "a number >= 1"),
+    (
+        ("learning_rate", "clip_range", "clip_range_vf", "delta_std"),
+        _is_schedule,
+        "a number >= 0, or lin_NUMBER to fall to 0",
+    ),
+    (
+        ("n_envs", "batch_size", "buffer_size", "n_steps", "n_epochs", "policy_delay"),
+        is_count,
+        "a whole number >= 1, e.g. 64",
+    ),
+    (
+        ("frame_stack",),
+        lambda value: value is None or is_count(value),
+        "a whole number >= 1, e.g. 4",
+    ),
+    (("gamma", "tau", "gae_lambda"), _is_share, "a number from 0 to 1, e.g. 0.005"),
+    (("noise_type",), lambda value: value in NOISE_TYPES, f"one of {', '.join(NOISE_TYPES[1:])}"),
+    (
+        ("learning_starts",),
+        lambda value: is_count(value) or value == 0,
+        "a whole number >= 1, or 0",
+    ),
+    (
+        ("gradient_steps",),
+        lambda value: is_count(value) or value == -1,
+        "a whole number >= 1, or -1",
+    ),
+)
+"""Numbers that are read, or used, only when the training has begun: keys, rule, and its words."""
+
+
+def check_numbers(entry: Mapping[str, Any], place: str) -> None:
+    """
+    Make sure that numbers have values with which a training can run.
+
+    :param entry: of a hyperparameter file
+    :param place: where it stands, for the message
+    :raises ZooConfigError: for the first one that has not
+    """
+    for keys, good, words in NUMBERS:
+        for key in keys:
+            if key in entry and not good(entry[key]):
+                raise ZooConfigError(f"{place}: {key} is {entry[key]!r}; expected {words}")
 
 
 def plain_python(text: str) -> Any:
