@@ -1,4 +1,4 @@
-"""Values of hyperparameter files: no string is evaluated; classes, numbers and policies that fit."""
+"""Values in hyperparameter files: no string is evaluated, and each is one that fits its key."""
 
 from __future__ import annotations
 
