@@ -15,6 +15,9 @@ SHIPPED = sorted(zoo.shipped_folder().glob("*.yml"))
 ENTRIES = [(path, name) for path in SHIPPED for name in zoo.read_config(path)]
 MODULE = "stable_baselines3.common.callbacks"
 MINIMAL = {"n_timesteps": 100, "policy": "MlpPolicy"}
+STACK = "gymnasium.wrappers.FrameStackObservation"
+FLAT = "gymnasium.wrappers.FlattenObservation"
+RATE = "a number >= 0 (for YAML 1e-3 is text, and 1.0e-3 a number), or lin_NUMBER to fall to 0"
 
 
 def complaint(tmp_path, entry, algo="ddpg", env_id="TorcsLite-v0"):
@@ -234,13 +237,14 @@ def test_the_budget_may_be_written_as_people_do(steps):
 
 def test_a_schedule_must_be_one_that_the_zoo_reads(tmp_path):
     said = complaint(tmp_path, {"learning_rate": "abc"})
-    assert said == "learning_rate is 'abc'; expected a number >= 0, or lin_NUMBER to fall to 0"
+    assert said == f"learning_rate is 'abc'; expected {RATE}"
+    assert complaint(tmp_path, {"learning_rate": "1e-3"}).endswith(RATE)
     accepted({"learning_rate": "lin_1e-3"})
-    accepted({"learning_rate": "0.001"})
+    accepted({"learning_rate": 0.001})
 
 
 @pytest.mark.parametrize(("key", "value", "expected"), [
-    ("learning_rate", float("nan"), "a number >= 0, or lin_NUMBER to fall to 0"),
+    ("learning_rate", float("nan"), RATE),
     ("batch_size", 1.5, "a whole number >= 1, e.g. 64"),
     ("n_envs", 0, "a whole number >= 1, e.g. 64"),
     ("buffer_size", "1e5", "a whole number >= 1, e.g. 64"),
@@ -299,12 +303,30 @@ def test_another_script_is_told(words):
         ({"frame_stack": 0}, "frame_stack is 0; expected a whole number >= 1"),
         ({"learning_rate": -1}, "learning_rate is -1; expected a number >= 0"),
         ({"noise_type": "foo"}, "noise_type is 'foo'; expected one of normal, ornstein-uhlenbeck"),
-        ({"policy": "CnnPolicy"}, "sees pictures or a dict, .* use MlpPolicy"),
-        ({"policy": "MultiInputPolicy"}, "sees pictures or a dict, .* use MlpPolicy"),
+        ({"noise_type": "normal"}, "needs a noise_std, and that is None; expected a number >= 0"),
+        ({"noise_type": "normal", "noise_std": -0.1}, "that is -0.1; expected a number >= 0"),
+        ({"policy": "CnnPolicy"}, "reads pictures, .* gives rows of numbers; use MlpPolicy"),
+        ({"policy": "MultiInputPolicy"}, "reads dicts, .* gives rows of numbers; use MlpPolicy"),
+        ({"policy": "stable_baselines3.sac.policies.CnnPolicy"}, "use MlpPolicy"),
+        ({"env_wrapper": [{STACK: {"stack_size": 2}}, FLAT], "policy": "CnnPolicy"}, "use Mlp"),
+        ({"env_wrapper": STACK}, "'stack_size'.*give its arguments below its dotted path"),
     ],
 )
 def test_what_would_end_a_training_at_its_begin_is_told(change, message):
     path = zoo.config_file("sac")
     entry = {**zoo.read_entry(path, "Torcs-v0"), **change}
+
+    def begin():
+        place = zoo.Place(path, "Torcs-v0")
+        zoo.check_entry(entry, "sac", "Torcs-v0", place)
+        zoo.made(entry, "Torcs-v0", place)
+
     with pytest.raises(ZooConfigError, match=message):
-        zoo.check_entry(entry, "sac", "Torcs-v0", zoo.Place(path, "Torcs-v0"))
+        begin()
+
+
+def test_an_algorithm_without_action_noise_is_told(tmp_path):
+    noise = {"noise_type": "normal", "noise_std": 0.1}
+    accepted(noise)
+    said = complaint(tmp_path, noise, algo="ppo")
+    assert said.startswith("noise_type is 'normal', and ppo takes no action noise; remove it")

@@ -18,7 +18,6 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import yaml
 
 from sb3_torcs.agents.model_algorithm import SBX
@@ -266,7 +265,7 @@ def _trials(
     if said.get("final_tracks") is not None:
         chosen = _tracks(said["final_tracks"], f"{file}: final_tracks")
         final_tracks = _united(eval_tracks, chosen)
-    gym.make(env_id, **env_kwargs).close()
+    zoo.made(entry, env_id, place).close()
     for seed in seeds:
         yield Trial(
             slug(said["name"]), variant, seed, algo, env_id, copy.deepcopy(entry), interval,

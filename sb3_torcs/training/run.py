@@ -15,10 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 from sb3_torcs.errors import (
     InvalidOption,
-    ModelMismatch,
     OutputNotWritable,
     WorkerLost,
-    ZooConfigError,
 )
 from sb3_torcs.files import writable_folder
 from sb3_torcs.signals import answered
@@ -27,6 +25,7 @@ __all__ = ["Run", "TrainOptions", "going_on", "train", "train_run"]
 
 if TYPE_CHECKING:
     from sb3_torcs.training.manager import Manager
+    from sb3_torcs.training.zoo import Place
 
 EVALUATIONS = 40  # of a whole training, unless --eval-freq says otherwise
 SHORTEST_EVAL_FREQ = 1000  # timesteps
@@ -119,9 +118,6 @@ def train_run(options: TrainOptions) -> Run:
     :raises InvalidOption: if the arguments for the zoo cannot be read, or would move the model
     :raises OutputNotWritable: if a folder cannot be written
     """
-    import gymnasium as gym
-
-    from sb3_torcs.agents.wrapping import wrapped
     from sb3_torcs.training import zoo
 
     for word in options.zoo_args:
@@ -130,17 +126,9 @@ def train_run(options: TrainOptions) -> Run:
                 f"'{word}' after -- is refused: sb3-torcs would not find the model; before -- "
                 "there are --algo, --env, --timesteps, --folder and --conf-file"
             )
-    entry, changed = _entry(options)
-    # Made once, so that a mistake is reported before anything starts.
-    with contextlib.closing(gym.make(options.env, **changed["env_kwargs"])) as env:
-        try:
-            driven = wrapped(env, changed, trust=True)
-        except ModelMismatch as error:
-            raise ZooConfigError(
-                f"entry '{options.entry or options.env}': an env_wrapper does not go around the "
-                f"car ({error.__cause__ or error}); give its arguments below its dotted path"
-            ) from error
-        resume = _resumed(options, entry, driven, changed)
+    entry, changed, place = _entry(options)
+    with contextlib.closing(zoo.made(changed, options.env, place)) as env:
+        resume = _resumed(options, entry, env, changed)
     folder = writable_folder(options.folder)
     tensorboard = _for_tensorboard(options.tensorboard or folder / "tensorboard")
     wanted = options.timesteps or zoo.timesteps(changed)
@@ -169,12 +157,12 @@ def _for_tensorboard(folder: str | Path) -> Path:
     return path
 
 
-def _entry(options: TrainOptions) -> tuple[dict[str, Any], dict[str, Any]]:
+def _entry(options: TrainOptions) -> tuple[dict[str, Any], dict[str, Any], Place]:
     """
     Read and check the hyperparameters.
 
     :param options: what to train
-    :return: the entry, before and after the changes of the zoo's arguments
+    :return: the entry, before and after the changes of the zoo's arguments, and where it stands
     """
     from sb3_torcs.training import zoo
 
@@ -185,8 +173,9 @@ def _entry(options: TrainOptions) -> tuple[dict[str, Any], dict[str, Any]]:
     if options.track is not None:
         entry["env_kwargs"] = {**(entry.get("env_kwargs") or {}), "track": options.track}
     changed = {**entry, **_changes(options.zoo_args)}
-    zoo.check_entry(changed, options.algo, options.env, zoo.Place(path, name), trust=options.trust)
-    return entry, {**changed, "env_kwargs": changed.get("env_kwargs") or {}}
+    place = zoo.Place(path, name)
+    zoo.check_entry(changed, options.algo, options.env, place, trust=options.trust)
+    return entry, {**changed, "env_kwargs": changed.get("env_kwargs") or {}}, place
 
 
 def _changes(zoo_args: Sequence[str]) -> dict[str, Any]:

@@ -20,8 +20,9 @@ import gymnasium as gym
 import yaml
 
 from sb3_torcs.agents.model_algorithm import SBX, algorithm_class
+from sb3_torcs.agents.wrapping import wrapped
 from sb3_torcs.car import is_count
-from sb3_torcs.errors import InvalidOption, ZooConfigError, near_miss
+from sb3_torcs.errors import InvalidOption, ModelMismatch, ZooConfigError, near_miss
 from sb3_torcs.files import read_yaml
 from sb3_torcs.sensors import look_both_ways, range_finder_angles
 from sb3_torcs.training.zoo_data import (
@@ -29,6 +30,7 @@ from sb3_torcs.training.zoo_data import (
     check_class,
     check_data,
     check_jax,
+    check_noise,
     check_numbers,
     check_sight,
 )
@@ -42,6 +44,7 @@ __all__ = [
     "check_racing",
     "check_registered",
     "config_file",
+    "made",
     "read_config",
     "read_entry",
     "timesteps",
@@ -196,9 +199,8 @@ def check_entry(entry: Entry, algo: str, env_id: str, place: Place, *, trust: bo
     check_numbers(entry, str(place))
     constructor = (_arguments(algorithm) or set()) - set(GIVEN_BY_ZOO)
     _check_keys(entry, ZOO_KEYS | constructor, "key", place)
+    check_noise(entry, "action_noise" in constructor, algo, str(place))
     policy = _policy(entry["policy"], algorithm, place)
-    if env_id in OURS and not entry.get("env_wrapper"):
-        check_sight(entry["policy"], env_id, str(place))
     _check_call("policy_kwargs", policy, entry.get("policy_kwargs"), place, GIVEN_BY_POLICY_OWNER)
     if algo.startswith(SBX):
         check_jax(policy, entry.get("policy_kwargs"), str(place))
@@ -208,6 +210,32 @@ def check_entry(entry: Entry, algo: str, env_id: str, place: Place, *, trust: bo
     check_env_kwargs(entry.get("env_kwargs"), env_id, place)
     _check_wrappers(entry, place)
     _check_symmetric(entry, place)
+
+
+def made(entry: Entry, env_id: str, place: Place) -> gym.Env[Any, Any]:
+    """
+    Make one environment of a training, so that a mistake is reported before anything starts.
+
+    :param entry: that :func:`check_entry` has seen
+    :param env_id: a registered environment
+    :param place: where the entry stands
+    :return: the environment within its wrappers; whoever calls closes it
+    :raises ZooConfigError: if a wrapper does not go around it, or the policy cannot read it
+    """
+    env = gym.make(env_id, **(entry.get("env_kwargs") or {}))
+    try:
+        env = wrapped(env, entry, trust=True)
+        check_sight(entry["policy"], env.observation_space, str(place))
+    except ModelMismatch as error:
+        env.close()
+        raise ZooConfigError(
+            f"{place}: an env_wrapper does not go around the car ({error.__cause__ or error}); "
+            "give its arguments below its dotted path"
+        ) from error
+    except ZooConfigError:
+        env.close()
+        raise
+    return env
 
 
 def _check_symmetric(entry: Entry, place: Place) -> None:

@@ -22,6 +22,7 @@ __all__ = [
     "check_class",
     "check_data",
     "check_jax",
+    "check_noise",
     "check_numbers",
     "check_sight",
     "plain_python",
@@ -118,19 +119,28 @@ def check_jax(policy: Any, policy_kwargs: Any, place: str) -> None:
         )
 
 
-def check_sight(policy: Any, env_id: str, place: str) -> None:
+def check_sight(policy: Any, space: gym.Space[Any], place: str) -> None:
     """
-    Make sure that a policy can read one row of numbers.
+    Make sure that a policy of SB3 can read an environment's observations.
 
     :param policy: its alias or dotted path
-    :param env_id: of one of our environments
-    :param place: where it stands, for the message
-    :raises ZooConfigError: if it is SB3's policy for pictures, or for several observations
+    :param space: of the observations
+    :param place: where the policy stands, for the message
+    :raises ZooConfigError: if it reads pictures, dicts or rows of numbers, and gets another kind
     """
-    if str(policy).startswith(("Cnn", "MultiInput")):
+    from stable_baselines3.common.preprocessing import is_image_space
+
+    _, dotted, name = str(policy).rpartition(".")
+    kinds = {"Cnn": "pictures", "MultiInput": "dicts", "Mlp": "rows of numbers"}
+    needs = next((kind for kind in kinds if kind in name), None)
+    gets = "MultiInput" if isinstance(space, gym.spaces.Dict) else "Mlp"
+    if needs == "Cnn" and is_image_space(space):
+        gets = "Cnn"
+    if needs is not None and needs != gets:
+        other = f"{gets}Policy" if dotted else name.replace(needs, gets)
         raise ZooConfigError(
-            f"{place}: policy is {policy}, which sees pictures or a dict, and {env_id} gives one "
-            f"row of numbers; use {str(policy).replace('Cnn', 'Mlp').replace('MultiInput', 'Mlp')}"
+            f"{place}: policy is {policy}, which reads {kinds[needs]}, and the environment "
+            f"gives {kinds[gets]}; use {other}"
         )
 
 
@@ -143,7 +153,7 @@ def _is_budget(value: Any) -> bool:
 
 def _is_schedule(value: Any) -> bool:
     if isinstance(value, str):
-        return bool(re.fullmatch(r"(lin_)?[\d.]+(e[+-]?\d+)?", value))
+        return bool(re.fullmatch(r"lin_[\d.]+(e[+-]?\d+)?", value))
     return value is None or (is_number(value) and value >= 0.0)
 
 
@@ -151,14 +161,14 @@ def _is_share(value: Any) -> bool:
     return is_number(value) and 0.0 <= value <= 1.0
 
 
-NOISE_TYPES = (None, "normal", "ornstein-uhlenbeck")
+NOISE_TYPES = ("normal", "ornstein-uhlenbeck")
 
 NUMBERS: tuple[tuple[tuple[str, ...], Callable[[Any], bool], str], ...] = (
     (("n_timesteps",), _is_budget, "a number >= 1"),
     (
         ("learning_rate", "clip_range", "clip_range_vf", "delta_std"),
         _is_schedule,
-        "a number >= 0, or lin_NUMBER to fall to 0",
+        "a number >= 0 (for YAML 1e-3 is text, and 1.0e-3 a number), or lin_NUMBER to fall to 0",
     ),
     (
         ("n_envs", "batch_size", "buffer_size", "n_steps", "n_epochs", "policy_delay"),
@@ -171,7 +181,6 @@ NUMBERS: tuple[tuple[tuple[str, ...], Callable[[Any], bool], str], ...] = (
         "a whole number >= 1, e.g. 4",
     ),
     (("gamma", "tau", "gae_lambda"), _is_share, "a number from 0 to 1, e.g. 0.005"),
-    (("noise_type",), lambda value: value in NOISE_TYPES, f"one of {', '.join(NOISE_TYPES[1:])}"),
     (
         ("learning_starts",),
         lambda value: is_count(value) or value == 0,
@@ -198,6 +207,36 @@ def check_numbers(entry: Mapping[str, Any], place: str) -> None:
         for key in keys:
             if key in entry and not good(entry[key]):
                 raise ZooConfigError(f"{place}: {key} is {entry[key]!r}; expected {words}")
+
+
+def check_noise(entry: Mapping[str, Any], exploring: bool, algo: str, place: str) -> None:
+    """
+    Make sure that the zoo can build the action noise of an entry.
+
+    :param entry: of a hyperparameter file
+    :param exploring: whether the algorithm takes an action noise
+    :param algo: as the zoo calls it
+    :param place: where the entry stands, for the message
+    :raises ZooConfigError: if it cannot
+    """
+    kind: Any = entry.get("noise_type")
+    deviation: Any = entry.get("noise_std")
+    if kind is None:
+        return
+    if not exploring:
+        raise ZooConfigError(
+            f"{place}: noise_type is {kind!r}, and {algo} takes no action noise; remove it, or use "
+            "ddpg, td3, sac or tqc"
+        )
+    if not isinstance(kind, str) or not any(known in kind for known in NOISE_TYPES):
+        raise ZooConfigError(
+            f"{place}: noise_type is {kind!r}; expected one of {', '.join(NOISE_TYPES)}"
+        )
+    if not is_number(deviation) or deviation < 0.0:
+        raise ZooConfigError(
+            f"{place}: noise_type needs a noise_std, and that is {deviation!r}; expected a number "
+            ">= 0, e.g. 0.1"
+        )
 
 
 def plain_python(text: str) -> Any:
