@@ -13,7 +13,7 @@ from gymnasium import spaces
 from rl_zoo3.utils import ALGOS
 from stable_baselines3 import DDPG, PPO, SAC
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
 import sb3_torcs  # noqa: F401  registers the environments
 from sb3_torcs.agents import model_record, models
@@ -285,6 +285,19 @@ def test_a_model_of_another_observation_layout_is_refused_with_both_named(env, t
     message = str(caught.value)
     assert "observations (65,) float32 within [-1, 1], but TorcsLite-v0 has (29,)" in message
     assert "sb3-torcs train --env TorcsLite-v0" in message
+
+
+def test_a_model_of_stacked_frames_without_a_record_is_told_what_to_write(env, tmp_path):
+    """What it sees is four times as long; with the line in config.yml, it drives."""
+    stacked = VecFrameStack(DummyVecEnv([lambda: gym.make("TorcsLite-v0")]), 4)
+    PPO("MlpPolicy", stacked, **SMALL).save(tmp_path / "m.zip")
+    stacked.close()
+    with pytest.raises(ModelMismatch) as caught:
+        models.load_driver(tmp_path / "m.zip", env)
+    config = tmp_path / "config.yml"
+    assert f"write 'frame_stack: 4' into '{config}'" in str(caught.value)
+    config.write_text("frame_stack: 4\n")
+    models.load_driver(tmp_path / "m.zip", env)
 
 
 def test_the_statistics_beside_a_model_are_applied(saved, env):

@@ -298,12 +298,30 @@ def check_spaces(
             continue
         record = training_record(model)
         hint = f" (it was trained on {record.env_id})" if record.env_id else ""
-        name = env.spec.id if env.spec else "the environment"
-        raise ModelMismatch(
-            f"'{model}'{hint} has {what} {_layout(has)}, but {name} has {_layout(needs)}; give the "
-            "--env that it was trained on, or train a model for this one: sb3-torcs train "
+        name = env.spec.id if env.spec else "Torcs-v0"  # cars of one race have no spec
+        advice = (
+            "give the --env that it was trained on, or train a model for this one: sb3-torcs train "
             f"--env {name}"
         )
+        frames_seen = _frames_seen(has, needs) if what == "observations" else None
+        if frames_seen is not None and not record.known:
+            advice = (
+                f"if it sees {frames_seen} observations at once, write 'frame_stack: {frames_seen}'"
+                f" into '{model.parent / 'config.yml'}', as the zoo does"
+            )
+        raise ModelMismatch(
+            f"'{model}'{hint} has {what} {_layout(has)}, but {name} has {_layout(needs)}; {advice}"
+        )
+
+
+def _frames_seen(has: spaces.Space[Any], needs: spaces.Space[Any]) -> int | None:
+    """Say how many observations of one space come to the other, if they do."""
+    if not (isinstance(has, spaces.Box) and isinstance(needs, spaces.Box)):
+        return None
+    if len(has.shape) != 1 or len(needs.shape) != 1:
+        return None
+    frames, rest = divmod(has.shape[0], needs.shape[0])
+    return frames if rest == 0 and frames > 1 and stacked_space(needs, frames) == has else None
 
 
 def check_resumable(

@@ -90,8 +90,8 @@ def run(args: argparse.Namespace) -> int:
     seconds = time.monotonic() - begun
     if ghost is None:
         raise InvalidOption(
-            f"no whole race was found in {state.rollouts} rollouts, {seconds:.0f} s; "
-            "give more --seconds or more --rollouts"
+            f"the search ended before its first race of its own was whole ({state.rollouts} "
+            f"rollouts, {seconds:.0f} s), so no ghost is kept; give more --seconds or --rollouts"
         )
     ghost.write(out)
     standing, *flying = ghost.lap_times
