@@ -125,6 +125,7 @@ def test_a_race_that_is_lost_ends_for_all(make, monkeypatch):
     ("actions", "message"),
     [
         ({"agent_0": GAS}, "no action of agent_1"),
+        (None, "no action of agent_0, agent_1"),
         ({"agent_0": GAS, "agent_1": GAS * np.nan}, "agent_1: steering is nan"),
     ],
 )

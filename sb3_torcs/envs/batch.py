@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -347,7 +347,7 @@ class Batch:
             fits = asked.shape == (len(self.envs), len(low))
             if fits and read_actions(np.ascontiguousarray(asked), low, high, controls):
                 return controls
-        rows = list(asked)
+        rows = list(asked) if isinstance(asked, Iterable) else [asked]
         if len(rows) != len(self.envs):
             raise InvalidAction(
                 f"{len(rows)} actions for {len(self.envs)} races; expected shape "

@@ -141,7 +141,8 @@ class TorcsParallelEnv(ParallelEnv[str, Observation, Action]):
         return answers
 
     def _hold(self, racing: Mapping[str, RaceCarEnv], actions: Mapping[str, Action]) -> None:
-        missing = [name for name in racing if name not in actions]
+        given = actions if isinstance(actions, Mapping) else ()
+        missing = [name for name in racing if name not in given]
         if missing:
             raise InvalidAction(f"no action of {', '.join(missing)}; give one of each in `agents`")
         controls = {}

@@ -107,7 +107,7 @@ class TorcsVectorEnv(SyncVectorEnv):
         """
         if self.closed:
             raise EnvClosed("step after close; make new environments with gym.make_vec")
-        rows = list(actions)
+        rows = list(actions) if isinstance(actions, Iterable) else [actions]
         if len(rows) != self.num_envs:
             raise InvalidAction(
                 f"{len(rows)} actions for {self.num_envs} races; expected shape "
