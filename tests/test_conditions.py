@@ -244,7 +244,7 @@ def test_a_world_that_cannot_change_says_so(oval):
 def test_conditions_of_a_training_are_those_of_its_environments_alone(game):
     """They begin with the next episode; what was before comes back, also to the world."""
     del game
-    env = TorcsVecEnv(2, threads=1, track=["aalborg", "g-track-1"])
+    env = TorcsVecEnv(2, threads=1, track=["aalborg", "g-track-1"], mass=0.9)
     drawn = []
 
     class Grips(BaseCallback):
@@ -258,6 +258,7 @@ def test_conditions_of_a_training_are_those_of_its_environments_alone(game):
     model.learn(600, callback=[grip, Grips()])
     assert drawn
     assert {0.7 <= each.grip <= 0.8 for each in drawn[-2:]} == {True}
+    assert {each.mass for each in drawn} == {0.9}  # what the callback does not name stays
     env.reset()
     conditions = env.env_method("get_wrapper_attr", "conditions")
     assert [each.grip for each in conditions] == [1.0, 1.0]

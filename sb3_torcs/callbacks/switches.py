@@ -122,7 +122,8 @@ class ConditionsCallback(_SwitchUser):
     Change the conditions of training episodes; evaluations keep theirs.
 
     An agent that learned with less grip than it will have keeps a margin. The first episode begins
-    before any callback is called, so it keeps the environment's conditions.
+    before any callback is called, so it keeps the environment's conditions, as all episodes do with
+    what is left out here.
 
     :param delay: control ticks until an action arrives, or a pair of them between which each
         episode draws
@@ -135,16 +136,17 @@ class ConditionsCallback(_SwitchUser):
     def __init__(
         self,
         *,
-        delay: int | Sequence[int] = 0,
-        grip: float | Sequence[float] = 1.0,
-        mass: float | Sequence[float] = 1.0,
+        delay: int | Sequence[int] | None = None,
+        grip: float | Sequence[float] | None = None,
+        mass: float | Sequence[float] | None = None,
         verbose: int = 0,
     ) -> None:
         super().__init__(verbose)
-        checked_delay(delay)  # checked here, for a message of this process and not of a worker
-        for name, choice in (("grip", grip), ("mass", mass)):
-            checked_factor(name, choice)
-        self.conditions = {"delay": delay, "grip": grip, "mass": mass}
+        choices = {"delay": delay, "grip": grip, "mass": mass}
+        self.conditions = {name: made for name, made in choices.items() if made is not None}
+        for name, choice in self.conditions.items():
+            # checked here, for a message of this process and not of a worker
+            checked_delay(choice) if name == "delay" else checked_factor(name, choice)
 
     def _on_training_start(self) -> None:
         self._switches = [_Switch(self.training_env, "set_conditions", self.conditions)]
