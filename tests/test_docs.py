@@ -372,8 +372,9 @@ def check(args, monkeypatch):
         load_track(name, np.random.default_rng(0))
     if args.verb == "train":
         algo, env = args.algo or TrainOptions.algo, args.env or TrainOptions.env
-        entry = zoo.read_entry(zoo.config_file(algo, args.conf_file), args.entry or env)
-        assert env in gym.registry
+        file, name = zoo.config_file(algo, args.conf_file), args.entry or env
+        entry = zoo.read_entry(file, name)
+        zoo.made(entry, env, zoo.Place(file, name)).close()
         # The zoo gets SBX's algorithms only where it is installed.
         words = ["--algo", algo.removeprefix(SBX), "--env", env, *args.zoo_args]
         changed = parsed_by_the_zoo(["--gym-packages", "sb3_torcs", *words], monkeypatch)

@@ -51,6 +51,12 @@ def test_train_saves_a_model_that_evaluate_drives(monkeypatch, capsys, tmp_path)
     assert capsys.readouterr().out.startswith("episode 1: no whole lap;")
 
 
+def test_evaluate_drives_an_agent_as_it_was_trained(monkeypatch, capsys):
+    """With its own range finders, in its own world."""
+    run(monkeypatch, "evaluate.py", "ddpg-fallback", "--laps", "1")
+    assert "ended by laps" in capsys.readouterr().out
+
+
 @pytest.mark.slow
 def test_broken_tracks_are_refused_or_drive_what_is_written(monkeypatch, capsys, tmp_path):
     run(monkeypatch, "fuzz_tracks.py", "--tracks", "12", "--workers", "1", "--keep", str(tmp_path))

@@ -49,9 +49,10 @@ class ScrBackend:
     """
     One agent in the stock game with our driver module, or on any SCR server.
 
-    The server's sensors have six digits. Values that it does not send are computed: the position by
-    the track, the yaw rate by the turn during a step, laps and times by the lap clock. The best
-    lap time is that of any whole lap, also with a cut corner or a touched wall.
+    Our driver module sends all digits, other servers send six. Values that a server does not send
+    are computed: the position by the track, the yaw rate by the turn during a step, laps and times
+    by the lap clock. The best lap time is that of any whole lap, also with a cut corner or a touched
+    wall.
 
     :param track: ``"aalborg"``, ``"road/aalborg"``, or the path of a TORCS XML file; that of the
         server, if one is named

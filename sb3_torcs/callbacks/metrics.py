@@ -57,7 +57,7 @@ Each episode's row of ``monitor.csv`` then holds these, too. Monitor adds the tw
 default for the first is a tuple: hence the empty list. A ``best_lap_time`` of 0 is no whole lap.
 """
 
-ENDS = ("off_track", "backwards", "stuck", "damage", "lost", "laps", "time_limit")
+ENDS = ("off_track", "backwards", "stuck", "damage", "lost", "laps", "race", "time_limit")
 
 BRAKING = 0.05  # [-] of the pedal's travel; networks seldom give exactly 0
 SATURATED = 0.01  # [-] of an actuator's range: an action so near to a limit counts as at it

@@ -49,8 +49,8 @@ class TorcsEnv(RacingEnv):
     moves the whole field along the road, at the agent's speed.
 
     With ``backend="scr"`` the game runs in a process of its own and sends its sensors by the
-    protocol of the Simulated Car Racing championship. The drive is the same, with sensors of six
-    digits, and slower. With ``host`` the game is one that runs already.
+    protocol of the Simulated Car Racing championship. The drive is the same to the bit, and slower.
+    With ``host`` the game is one that runs already; other servers than ours send six digits.
 
     Units are SI and radians; left is positive.
 
