@@ -19,6 +19,7 @@ import sb3_torcs  # noqa: F401  registers the environments
 from sb3_torcs.agents import model_record, models
 from sb3_torcs.agents.scripted import ScriptedDriver
 from sb3_torcs.errors import InvalidOption, ModelMismatch, ModelNotTrusted, PackageMissing
+from sb3_torcs.training.resuming import check_resumable
 
 SMALL = {"device": "cpu", "seed": 0}
 
@@ -234,9 +235,7 @@ def learned(saved, env):
     model, path = saved
     zoo_record(path.parent)
     model.save_replay_buffer(path.parent / "replay_buffer.pkl")
-    return path, lambda env=env, algo="ddpg", n_envs=1: models.check_resumable(
-        path, env, algo, n_envs
-    )
+    return path, lambda env=env, algo="ddpg", n_envs=1: check_resumable(path, env, algo, n_envs)
 
 
 def test_what_belongs_together_is_gone_on_with(learned):

@@ -51,8 +51,8 @@ class ScrBackend:
 
     Our driver module sends all digits, other servers send six. Values that a server does not send
     are computed: the position by the track, the yaw rate by the turn during a step, laps and times
-    by the lap clock. The best lap time is that of any whole lap, also with a cut corner or a touched
-    wall.
+    by the lap clock. The best lap time is that of any whole lap, one with a cut corner or a touched
+    wall included.
 
     :param track: ``"aalborg"``, ``"road/aalborg"``, or the path of a TORCS XML file; that of the
         server, if one is named

@@ -214,8 +214,9 @@ def _resumed(
     """
     if options.resume is None:
         return None
-    from sb3_torcs.agents.models import check_resumable, find_model
+    from sb3_torcs.agents.models import find_model
     from sb3_torcs.agents.wrapping import frames_of
+    from sb3_torcs.training.resuming import check_resumable
 
     path = find_model(options.resume, prefer_last=True)
     n_envs, frames = changed.get("n_envs", 1), frames_of(changed)

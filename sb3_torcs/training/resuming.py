@@ -1,0 +1,75 @@
+"""Go on with a training from a saved model."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from sb3_torcs.agents.model_algorithm import check_same, told_algorithm
+from sb3_torcs.agents.model_file import as_mismatch, saved_data
+from sb3_torcs.agents.models import check_spaces, saved_spaces, training_record
+from sb3_torcs.errors import ModelMismatch, ModelNotTrusted
+from sb3_torcs.sensors import range_finder_angles
+from sb3_torcs.training.keeping import REPLAY_BUFFER
+
+__all__ = ["check_resumable"]
+
+
+def check_resumable(
+    model: Path,
+    env: gym.Env[Any, Any],
+    algo: str,
+    n_envs: int,
+    *,
+    frames: int | None = None,
+    trust: bool = False,
+) -> bool:
+    """
+    Make sure that a training can resume from a model.
+
+    :param model: the file; its replay buffer and its record lie beside it
+    :param env: that the training is to go on in
+    :param algo: that is to learn, as the zoo calls it
+    :param n_envs: number of environments in which it is to learn
+    :param frames: observations that it is to see at once
+    :param trust: accept a model without a record
+    :return: whether there is a replay buffer to resume with
+    :raises ModelMismatch: if they do not belong together
+    :raises ModelNotTrusted: if it has no record of a training
+    """
+    from stable_baselines3.common.save_util import load_from_pkl
+
+    data = saved_data(model)
+    record = training_record(model)
+    if record.driver_only:
+        raise ModelMismatch(
+            f"'{model}' holds what drives and not what learns: its critics and optimizers were "
+            "left out; train anew, with the hyperparameters in the config.yml beside it"
+        )
+    if not record.known and not trust:
+        raise ModelNotTrusted(
+            f"'{model}' does not tell that `sb3-torcs train` or the RL Zoo made it. To go on from "
+            "a model runs whatever code is pickled in it and in the replay buffer beside it; if "
+            "you know who made them, add --trust"
+        )
+    check_spaces(model, saved_spaces(model, trust=True), env, frames)
+    check_same(model, record.algo or told_algorithm(data), algo)
+    seen, angles = record.env_kwargs.get("range_finders", "scr"), "range_finder_angles"
+    sees = env.get_wrapper_attr(angles) if env.has_wrapper_attr(angles) else None
+    if record.env_id and sees is not None and not np.allclose(range_finder_angles(seen), sees):
+        raise ModelMismatch(
+            f"'{model}' has learned with range_finders {seen!r}, and would go on with others; give "
+            "the --env, --entry or --conf-file of before"
+        )
+    buffer = model.parent / REPLAY_BUFFER
+    if not buffer.is_file():
+        return False
+    said = f"'{buffer}' is no replay buffer that can be gone on with"
+    with as_mismatch(said, "remove it, or give"), buffer.open("rb") as file:
+        buffer = load_from_pkl(file)
+        if buffer.n_envs != n_envs:
+            raise ValueError(f"of {buffer.n_envs} cars at once, not {n_envs}")
+    return True
