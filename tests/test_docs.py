@@ -374,7 +374,7 @@ def check(args, monkeypatch):
         algo, env = args.algo or TrainOptions.algo, args.env or TrainOptions.env
         file, name = zoo.config_file(algo, args.conf_file), args.entry or env
         entry = zoo.read_entry(file, name)
-        zoo.made(entry, env, zoo.Place(file, name)).close()
+        zoo.checked_env(entry, env, zoo.Place(file, name)).close()
         # The zoo gets SBX's algorithms only where it is installed.
         words = ["--algo", algo.removeprefix(SBX), "--env", env, *args.zoo_args]
         changed = parsed_by_the_zoo(["--gym-packages", "sb3_torcs", *words], monkeypatch)

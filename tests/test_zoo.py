@@ -319,7 +319,7 @@ def test_what_would_end_a_training_at_its_begin_is_told(change, message):
     def begin():
         place = zoo.Place(path, "Torcs-v0")
         zoo.check_entry(entry, "sac", "Torcs-v0", place)
-        zoo.made(entry, "Torcs-v0", place)
+        zoo.checked_env(entry, "Torcs-v0", place)
 
     with pytest.raises(ZooConfigError, match=message):
         begin()

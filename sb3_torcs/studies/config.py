@@ -265,7 +265,7 @@ def _trials(
     if said.get("final_tracks") is not None:
         chosen = _tracks(said["final_tracks"], f"{file}: final_tracks")
         final_tracks = _united(eval_tracks, chosen)
-    zoo.made(entry, env_id, place).close()
+    zoo.checked_env(entry, env_id, place).close()
     for seed in seeds:
         yield Trial(
             slug(said["name"]), variant, seed, algo, env_id, copy.deepcopy(entry), interval,

@@ -127,7 +127,7 @@ def train_run(options: TrainOptions) -> Run:
                 "there are --algo, --env, --timesteps, --folder and --conf-file"
             )
     entry, changed, place = _entry(options)
-    with contextlib.closing(zoo.made(changed, options.env, place)) as env:
+    with contextlib.closing(zoo.checked_env(changed, options.env, place)) as env:
         resume = _resumed(options, entry, env, changed)
     folder = writable_folder(options.folder)
     tensorboard = _for_tensorboard(options.tensorboard or folder / "tensorboard")

@@ -43,8 +43,8 @@ __all__ = [
     "check_entry",
     "check_racing",
     "check_registered",
+    "checked_env",
     "config_file",
-    "made",
     "read_config",
     "read_entry",
     "timesteps",
@@ -212,7 +212,7 @@ def check_entry(entry: Entry, algo: str, env_id: str, place: Place, *, trust: bo
     _check_symmetric(entry, place)
 
 
-def made(entry: Entry, env_id: str, place: Place) -> gym.Env[Any, Any]:
+def checked_env(entry: Entry, env_id: str, place: Place) -> gym.Env[Any, Any]:
     """
     Make one environment of a training, so that a mistake is reported before anything starts.
 
