@@ -28,6 +28,7 @@ __all__ = [
     "ActionName",
     "GearboxName",
     "action_layout",
+    "action_rows",
     "automatic_gear",
     "checked_gearbox",
     "controls_from_action",
@@ -215,6 +216,33 @@ def controls_from_action(
             numbers[place] = min(max(number, low), high)
     # As Controls(...) does, without the call that a NamedTuple puts in front of it.
     return tuple.__new__(Controls, read(numbers))
+
+
+def action_rows(actions: Any, shape: tuple[int, ...]) -> npt.NDArray[np.floating]:
+    """
+    Make sure that there is an action for each of several environments.
+
+    :param actions: one row per environment
+    :param shape: (environments, numbers of an action)
+    :return: a copy
+    :raises InvalidAction: if the shape is another one or a value is not a number
+    """
+    try:
+        rows = np.array(actions)
+        rows = rows if rows.dtype.kind == "f" else rows.astype(np.float64)
+    except (TypeError, ValueError):
+        rows = np.empty(())
+    if rows.shape != shape:
+        raise InvalidAction(
+            f"actions have shape {rows.shape}; expected {shape}, as of model.predict(observations)"
+        )
+    if np.isnan(rows).any():
+        place = int(np.argwhere(np.isnan(rows))[0, 0])
+        raise InvalidAction(
+            f"the action of environment {place} has nan; a network that gives nan has diverged: "
+            "lower learning_rate or check the rewards and observations"
+        )
+    return rows
 
 
 def _numbers(action: Any, names: tuple[str, ...]) -> list[float]:

@@ -8,7 +8,7 @@ import pytest
 from stable_baselines3 import PPO
 from stable_baselines3.common.monitor import Monitor
 
-from sb3_torcs.errors import EnvClosed, InvalidOption
+from sb3_torcs.errors import EnvClosed, InvalidAction, InvalidOption
 from sb3_torcs.vec_env import JoinedVecEnv, TorcsVecEnv
 
 FAST = {"track": "aalborg", "max_episode_steps": 20}
@@ -97,3 +97,25 @@ def test_parts_have_equal_spaces(make):
         JoinedVecEnv(make((1, FAST), (1, {**FAST, "action": "pedal"})))
     with pytest.raises(InvalidOption, match="parts is empty"):
         JoinedVecEnv([])
+
+
+def test_parts_are_different_vector_environments(make):
+    (part,) = make((1, FAST))
+    for parts, place in (([1], 0), ([part, part], 1)):
+        with pytest.raises(InvalidOption, match=rf"parts\[{place}\] is .*; expected a vector"):
+            JoinedVecEnv(parts)
+
+
+@pytest.mark.parametrize(
+    ("actions", "message"),
+    [
+        (np.zeros((6, 3), np.float32), r"shape \(6, 3\); expected \(5, 3\)"),
+        (None, r"shape \(\); expected \(5, 3\)"),
+        (np.full((5, 3), [[0.0], [0.0], [0.0], [np.nan], [0.0]]), "environment 3 has nan"),
+    ],
+)
+def test_a_wrong_action_drives_nobody(joined, actions, message):
+    joined.reset()
+    with pytest.raises(InvalidAction, match=message):
+        joined.step(actions)
+    assert {car.time for car in joined.get_attr("car")} == {0.0}

@@ -15,11 +15,11 @@ from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.utils import set_random_seed
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 from toy import ToyRace
 
 from sb3_torcs.callbacks import MirrorCallback
-from sb3_torcs.errors import InvalidOption
+from sb3_torcs.errors import InvalidAction, InvalidOption
 from sb3_torcs.policies.mirror import (
     mirror_actions,
     mirror_half,
@@ -279,3 +279,30 @@ def test_cars_with_beams_to_one_side_have_no_mirror_image():
     with pytest.raises(InvalidOption, match=r"MirrorVecEnv needs range finders .* pass 'scr'"):
         MirrorVecEnv(envs)
     envs.close()
+
+
+@pytest.mark.parametrize("sensors", [["base"], ["base", "line"]])
+@pytest.mark.parametrize("frames", [2, 3, 4, 6])
+def test_stacked_frames_are_not_taken_for_other_sensors(sensors, frames):
+    """Three stacked observations have as many numbers as some choice of sensors."""
+    cars = VecFrameStack(TorcsVecEnv(2, env_id="TorcsLite-v0", sensors=sensors), frames)
+    with pytest.raises(InvalidOption, match="take out what changes their bounds or size"):
+        MirrorVecEnv(cars)
+    MirrorVecEnv(cars.venv).close()
+
+
+def test_normalized_observations_have_no_mirror_image():
+    cars = TorcsVecEnv(2, env_id="TorcsLite-v0")
+    with pytest.raises(InvalidOption, match=r"put it inside: VecNormalize\(MirrorVecEnv"):
+        MirrorVecEnv(VecNormalize(cars))
+    MirrorVecEnv(VecNormalize(cars, norm_obs=False)).close()
+
+
+def test_whole_numbers_drive_in_the_mirror_too():
+    cars = MirrorVecEnv(TorcsVecEnv(2, env_id="TorcsLite-v0"))
+    cars.reset()
+    cars.step([[1, 1, 0], [1, 1, 0]])
+    assert [car.steering for car in cars.get_attr("_controls")] == [1.0, -1.0]
+    with pytest.raises(InvalidAction, match=r"shape \(3,\); expected \(2, 3\)"):
+        cars.step(np.zeros(3))
+    cars.close()

@@ -6,11 +6,13 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from sb3_torcs.sensors import View
+
 
 class ToyRace(gym.Env[np.ndarray, np.ndarray]):
     """Random observations, ten timesteps an episode; the reward says which reward is set."""
 
-    observation_space = spaces.Box(-1.0, 1.0, (29,), np.float32)
+    observation_space = spaces.Box(View().low, View().high)
     action_space = spaces.Box(np.array([-1, 0, 0], np.float32), np.array([1, 1, 1], np.float32))
 
     def __init__(self, reward: str = "progress", start: str = "grid") -> None:

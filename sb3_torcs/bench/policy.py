@@ -19,6 +19,7 @@ from stable_baselines3.td3.policies import Actor, TD3Policy
 from sb3_torcs.policies import fast_matmul
 from sb3_torcs.policies.networks import LateActionQ
 from sb3_torcs.policies.split_head import SplitHeadPolicy
+from sb3_torcs.sensors import View
 
 __all__ = ["PlainSplitHeadPolicy", "SpacesOnly", "fill", "measure", "updater"]
 
@@ -119,7 +120,7 @@ class PlainSplitHeadPolicy(SplitHeadPolicy):
 class SpacesOnly(gym.Env[np.ndarray, np.ndarray]):
     """The spaces of a racing environment, and nothing behind them."""
 
-    observation_space = spaces.Box(-1.0, 1.0, (29,), np.float32)
+    observation_space = spaces.Box(View().low, View().high)
     action_space = spaces.Box(
         np.array([-1, 0, 0], np.float32), np.array([1, 1, 1], np.float32), dtype=np.float32
     )

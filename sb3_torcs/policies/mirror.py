@@ -65,21 +65,16 @@ def sensors_of(space: Any) -> tuple[Sensor, ...]:
     """
     Find the sensors of observations by their space.
 
-    Most choices of groups have a size of their own; the bounds tell the others apart.
+    Several choices of groups may have one size, and so may stacked frames: the bounds decide.
 
     :param space: of the observations, a ``Box``; or a :class:`~sb3_torcs.sensors.View`
     :return: rows of the sensor table; empty if the space is of no choice of groups
     """
-    low = np.asarray(getattr(space, "low", ()), np.float32)
-    views = choices_of_size(low.size) if low.ndim == 1 else ()
-    if len(views) > 1:
-        high = np.asarray(space.high, np.float32)
-        views = tuple(
-            view
-            for view in views
-            if np.array_equal(view.low, low) and np.array_equal(view.high, high)
-        )
-    return tuple(chain(*(GROUPS[name] for name in views[0].sensors))) if views else ()
+    low, high = (np.asarray(getattr(space, name, ()), np.float32) for name in ("low", "high"))
+    for view in choices_of_size(low.size) if low.ndim == 1 else ():
+        if np.array_equal(view.low, low) and np.array_equal(view.high, high):
+            return tuple(chain(*(GROUPS[name] for name in view.sensors)))
+    return ()
 
 
 def mirror_image(space: Any) -> MirrorImage:
@@ -94,7 +89,7 @@ def mirror_image(space: Any) -> MirrorImage:
     if not rows:
         raise InvalidOption(
             f"{space} is not of the observations of Torcs-v0 or TorcsLite-v0, whose mirror image "
-            "is known; take out what changes their bounds or size, as VecNormalize does"
+            "is known; take out what changes their bounds or size, as frame stacks do"
         )
     return _image(rows)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import accumulate
 from typing import Any
 
@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env.base_vec_env import (
     VecEnvStepReturn,
 )
 
+from sb3_torcs.actions import action_rows
 from sb3_torcs.errors import InvalidOption
 
 __all__ = ["JoinedVecEnv"]
@@ -29,12 +30,19 @@ class JoinedVecEnv(VecEnv):
     of cars that are alone. The environments of the first part come first.
 
     :param parts: vector environments with equal spaces; closed with this one
-    :raises InvalidOption: if there is none, or if their spaces differ
+    :raises InvalidOption: if there is none, if one is there twice, or if their spaces differ
     """
 
-    def __init__(self, parts: Sequence[VecEnv]) -> None:
+    def __init__(self, parts: Iterable[VecEnv]) -> None:
+        parts = tuple(parts)
         if not parts:
             raise InvalidOption("parts is empty; expected at least one vector environment")
+        for place, part in enumerate(parts):
+            if not isinstance(part, VecEnv) or part in parts[:place]:
+                raise InvalidOption(
+                    f"parts[{place}] is {part!r}; expected a vector environment of its own, e.g. "
+                    "TorcsVecEnv(races=8)"
+                )
         for name in ("observation_space", "action_space"):
             spaces = [getattr(part, name) for part in parts]
             for place, space in enumerate(spaces):
@@ -43,7 +51,7 @@ class JoinedVecEnv(VecEnv):
                         f"parts[{place}] has the {name} {space}, and parts[0] {spaces[0]}; make "
                         "all parts with the same sensors and action"
                     )
-        self.parts = tuple(parts)
+        self.parts = parts
         self._seats = [(part, i) for part in parts for i in range(part.num_envs)]
         ends = accumulate(part.num_envs for part in parts)
         self._places = [
@@ -68,9 +76,12 @@ class JoinedVecEnv(VecEnv):
         Take actions for the next timestep.
 
         :param actions: (n, actuators), steering first
+        :raises InvalidAction: if there is not one action per environment, or one is invalid; then
+            no car has been driven
         """
+        rows = action_rows(actions, (self.num_envs, *(self.action_space.shape or ())))
         for part, places in zip(self.parts, self._places, strict=True):
-            part.step_async(actions[places])
+            part.step_async(rows[places])
 
     def step_wait(self) -> VecEnvStepReturn:
         """

@@ -6,9 +6,11 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize, unwrap_vec_wrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
+from sb3_torcs.actions import action_rows
+from sb3_torcs.errors import InvalidOption
 from sb3_torcs.policies.mirror import check_angles, mirror_image
 
 __all__ = ["MirrorVecEnv"]
@@ -25,11 +27,18 @@ class MirrorVecEnv(VecEnvWrapper):
     In a file of hyperparameters: ``vec_env_wrapper: sb3_torcs.vec_env.MirrorVecEnv``.
 
     :param venv: of Torcs-v0 or TorcsLite-v0; the first car is not mirrored, the second is
-    :raises InvalidOption: if the range finders look further to one side than to the other
+    :raises InvalidOption: if the range finders look further to one side than to the other, or if
+        observations are stacked or normalized already
     """
 
     def __init__(self, venv: VecEnv) -> None:
         super().__init__(venv)
+        normalized = unwrap_vec_wrapper(venv, VecNormalize)
+        if normalized is not None and normalized.norm_obs:
+            raise InvalidOption(
+                "MirrorVecEnv is around VecNormalize, whose statistics differ between left and "
+                "right; put it inside: VecNormalize(MirrorVecEnv(venv))"
+            )
         for angles in venv.get_attr("range_finder_angles"):
             check_angles(angles, "MirrorVecEnv")
         order, signs = mirror_image(venv.observation_space)
@@ -48,10 +57,11 @@ class MirrorVecEnv(VecEnvWrapper):
         Take actions for the next timestep.
 
         :param actions: (n, actuators), steering first
+        :raises InvalidAction: if there is not one action per environment, or one is invalid
         """
-        actions = np.array(actions)
-        actions[1::2, 0] *= -1.0
-        self.venv.step_async(actions)
+        rows = action_rows(actions, (self.num_envs, *(self.action_space.shape or ())))
+        rows[1::2, 0] *= -1.0
+        self.venv.step_async(rows)
 
     def step_wait(self) -> VecEnvStepReturn:
         """
