@@ -40,6 +40,7 @@ __all__ = [
     "car_from_record",
     "checked_delay",
     "checked_factor",
+    "checked_flag",
     "checked_hard_starts",
     "checked_laps",
     "checked_recovery",
@@ -190,6 +191,20 @@ def checked_start_speed(speed: float) -> float:
     """
     allowed = f"0 to {MAX_START_SPEED:g} m/s"
     return _checked_from_zero("speed of random starts", speed, MAX_START_SPEED, allowed)
+
+
+def checked_flag(name: str, choice: bool) -> bool:
+    """
+    Check an option that is on or off.
+
+    :param name: of the option
+    :param choice: ``True`` or ``False``, NumPy's too
+    :return: the same
+    :raises InvalidOption: for anything else
+    """
+    if not isinstance(choice, (bool, np.bool_)):
+        raise InvalidOption(f"{name} is {choice!r}; expected True or False")
+    return bool(choice)
 
 
 def checked_hard_starts(share: float) -> float:

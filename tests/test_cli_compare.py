@@ -145,7 +145,7 @@ def test_in_a_notebook_the_report_shows_itself(saved):
 
 def test_drives_of_different_tracks_are_refused(saved, oval, tmp_path, capsys):
     other = tmp_path / "other.parquet"
-    drive(DriveLog(), oval, "cleo", track="aalborg").write(other)
+    drive(DriveLog(), oval, "cleo", track="aalborg").write(str(other))
     status, _, err = run(capsys, saved, other)
     assert status == 2
     assert "laps of different tracks cannot be compared: cleo on aalborg, and the others on" in err

@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -300,3 +301,29 @@ def test_a_training_that_was_killed_goes_on(tmp_path):
     words = words_of(tmp_path, buffer_size=200_000)
     assert main([*words, *resumed, "--timesteps", "30"]) == 0
     assert models.saved_timesteps(run_folder(tmp_path, 4) / "TorcsLite-v0.zip") == 30
+
+
+class Interrupted:
+    """A keeper that is interrupted while it saves."""
+
+    def __init__(self, times):
+        self.times, self.done = times, False
+
+    def keep(self):
+        for _ in range(self.times):
+            signal.raise_signal(signal.SIGINT)
+        self.done = True
+
+
+@pytest.mark.parametrize(("times", "saved"), [(0, True), (1, True), (2, False)])
+def test_only_a_second_interrupt_ends_the_saving_of_what_was_learned(
+    tmp_path, capsys, times, saved
+):
+    manager = zoo_training.Manager.__new__(zoo_training.Manager)
+    manager.files, manager.keeper = WholeFiles(tmp_path), Interrupted(times)
+    manager.files.aside.mkdir()
+    with nullcontext() if saved else pytest.raises(KeyboardInterrupt):
+        manager.save_trained_model(None)
+    assert manager.keeper.done is saved
+    assert ("Ctrl-C once more drops it" in capsys.readouterr().err) is (times > 0)
+    assert not manager.files.aside.exists()

@@ -235,7 +235,9 @@ def learned(saved, env):
     model, path = saved
     zoo_record(path.parent)
     model.save_replay_buffer(path.parent / "replay_buffer.pkl")
-    return path, lambda env=env, algo="ddpg", n_envs=1: check_resumable(path, env, algo, n_envs)
+    return path, lambda env=env, algo="ddpg", n_envs=1, **more: check_resumable(
+        path, env, algo, n_envs, **more
+    )
 
 
 def test_what_belongs_together_is_gone_on_with(learned):
@@ -255,6 +257,10 @@ def test_what_does_not_belong_together_is_not_gone_on_with(learned):
         pytest.raises(ModelMismatch, match="learned with range_finders 'scr'"),
     ):
         check(narrow)
+    with pytest.raises(
+        ModelMismatch, match="learned with frame_stack None, and would go on with 3"
+    ):
+        check(frames=3)
     with pytest.raises(ModelMismatch, match=r"replay_buffer.*of 1 cars at once, not 4.*remove it"):
         check(n_envs=4)
     buffer = path.parent / "replay_buffer.pkl"

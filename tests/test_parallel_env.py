@@ -121,6 +121,16 @@ def test_a_race_that_is_lost_ends_for_all(make, monkeypatch):
     env.step({name: GAS for name in env.agents})
 
 
+def test_a_refused_reset_leaves_the_race_as_it_is(make):
+    env = make(2)
+    env.reset(seed=0)
+    env.agents.remove("agent_0")
+    with pytest.raises(InvalidOption, match="speed is 1000"):
+        env.reset(options={"speed": 1000.0})
+    assert env.agents == ["agent_1"]
+    env.step({"agent_1": GAS})
+
+
 @pytest.mark.parametrize(
     ("actions", "message"),
     [
@@ -145,6 +155,9 @@ def test_a_wrong_action_drives_nobody(make, actions, message):
         ({"agents": 30}, "agents is 30, with 0 opponents"),
         ({"max_episode_steps": 0}, "max_episode_steps is 0"),
         ({"opponents": "bt"}, "opponents is 'bt'; expected a list"),
+        ({"opponents": None}, "opponents is None; expected a list"),
+        ({"flagged": "x"}, "flagged is 'x'; expected True or False"),
+        ({"sensor_noise": 0.01}, "sensor_noise is 0.01; expected True or False"),
         ({"backend": "scr"}, "backend is 'scr', which is for a race of one agent"),
         ({"render_mode": "rgb_array"}, "render_mode is for Torcs-v0"),
     ],

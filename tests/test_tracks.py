@@ -236,7 +236,7 @@ class TestCompactFile:
     def test_writing_and_reading_gives_the_same_numbers(self, name, tmp_path):
         track = load_track(name, np.random.default_rng(3))
         path = tmp_path / "copy.csv"
-        write_track_file(track, path, "Source: this test.\nTwo lines.")
+        write_track_file(track, str(path), "Source: this test.\nTwo lines.")
         copy = load_track(path)
         assert copy.segments == track.segments
         assert copy.grid == track.grid

@@ -25,7 +25,14 @@ from sb3_torcs.callbacks import DrivingMetricsCallback
 from sb3_torcs.car import CAR_RECORD, car_from_record
 from sb3_torcs.envs import batch
 from sb3_torcs.envs.torcs_lite import TorcsLiteEnv
-from sb3_torcs.errors import CarLost, EngineForked, EnvClosed, InvalidAction, InvalidOption
+from sb3_torcs.errors import (
+    CarLost,
+    EngineForked,
+    EnvClosed,
+    InvalidAction,
+    InvalidOption,
+    UnknownCar,
+)
 from sb3_torcs.vec_env import TorcsVecEnv, glance
 
 GAS = np.array([0.0, 1.0, 0.0], np.float32)
@@ -440,6 +447,21 @@ def test_a_list_of_time_limits_goes_round_the_races(make, game, agents):
     first, second, third = ([bool(end[race * agents]) for end in ends] for race in range(3))
     assert first == third == [False, True, False, True]
     assert second == [False, False, False, True]
+
+
+@pytest.mark.usefixtures("game")
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"opponents": None}, InvalidOption, "opponents is None; expected a list"),
+        ({"opponents": 5}, InvalidOption, "opponents is 5; expected a list"),
+        ({"sensor_noise": "off"}, InvalidOption, "sensor_noise is 'off'; expected True or False"),
+        ({"car": 5}, UnknownCar, "5"),
+    ],
+)
+def test_a_wrong_option_of_the_game_is_told(options, error, message):
+    with pytest.raises(error, match=message):
+        TorcsVecEnv(1, **options)
 
 
 @pytest.mark.usefixtures("game")

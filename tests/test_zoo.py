@@ -325,6 +325,12 @@ def test_what_would_end_a_training_at_its_begin_is_told(change, message):
         begin()
 
 
+def test_normalized_stacks_are_for_algorithms_without_a_replay_buffer(tmp_path):
+    both = {"normalize": True, "frame_stack": 2}
+    assert "cannot learn with both" in complaint(tmp_path, both, algo="sac")
+    accepted(both, algo="ppo")
+
+
 def test_an_algorithm_without_action_noise_is_told(tmp_path):
     noise = {"noise_type": "normal", "noise_std": 0.1}
     accepted(noise)

@@ -31,7 +31,7 @@ def race(
     laps: int,
     *,
     session: Session = "practice",
-    telemetry: Path | None = None,
+    telemetry: str | Path | None = None,
 ) -> list[RobotResult]:
     """
     Let robots drive a race by the engine.
@@ -49,7 +49,7 @@ def race(
         if telemetry is None:
             while not engine.ended:
                 engine.advance(TICKS_AT_ONCE)
-        elif telemetry.suffix.lower() == PARQUET:
+        elif (telemetry := Path(telemetry)).suffix.lower() == PARQUET:
             _log(engine, robots, track).write(telemetry)
         else:
             write_telemetry(telemetry, _rows(engine, robots))

@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterable, Sequence
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -119,7 +119,8 @@ def make_engine(
 
 def _for_each(choice: str | Sequence[str], agents: int) -> list[str]:
     """Repeat what is for all agents; a race of robots has it once."""
-    return [choice] * max(agents, 1) if isinstance(choice, str) else list(choice)
+    several = isinstance(choice, (list, tuple))
+    return list(choice) if several else [cast(str, choice)] * max(agents, 1)
 
 
 def load_race(

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from sb3_torcs.car import CarState, Controls
+from sb3_torcs.car import CarState, Controls, checked_flag
 from sb3_torcs.envs.unstick import freeing_controls, needs_freeing
-from sb3_torcs.errors import InvalidOption
 from sb3_torcs.rivals import needed_brake
 
 __all__ = ["Aids"]
@@ -22,10 +21,8 @@ class Aids:
     """
 
     def __init__(self, unstick: Any, keep_distance: Any) -> None:
-        for name, choice in (("unstick", unstick), ("keep_distance", keep_distance)):
-            if not isinstance(choice, bool):
-                raise InvalidOption(f"{name} is {choice!r}; expected True or False")
-        self.unstick, self.keep_distance = unstick, keep_distance
+        self.unstick = checked_flag("unstick", unstick)
+        self.keep_distance = checked_flag("keep_distance", keep_distance)
 
     def change(self, controls: Controls, car: CarState) -> Controls:
         """

@@ -40,6 +40,8 @@ def env_makers(races: int, agents: int, env_id: str, env_kwargs: dict[str, Any])
 def _has_guests(env_id: str, env_kwargs: dict[str, Any]) -> bool:
     """Whether agents are among the opponents, whom only a shared race can ask."""
     opponents = env_kwargs.get("opponents", ())
+    if not isinstance(opponents, (list, tuple)):
+        return False
     several = any(not isinstance(name, str) for name in opponents)
     return env_id == "Torcs-v0" and (several or bool(guests_of(opponents, find_game())))
 

@@ -12,7 +12,7 @@ from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
 from sb3_torcs.car import CarState, is_count
-from sb3_torcs.envs.starts import RESET_OPTIONS
+from sb3_torcs.envs.starts import RESET_OPTIONS, read_start
 from sb3_torcs.envs.torcs_race import RaceCarEnv, make_race
 from sb3_torcs.errors import EnvClosed, InvalidAction, InvalidOption
 
@@ -101,11 +101,14 @@ class TorcsParallelEnv(ParallelEnv[str, Observation, Action]):
         :param options: where the field starts, as of ``Torcs-v0``; the place is the first agent's.
             Other names are ignored: PettingZoo's tests hand over one
         :return: observations and infos
+        :raises InvalidOption: if no car can start so; then the race before goes on
         """
+        given = options if isinstance(options, Mapping) else {}
+        options = {name: given[name] for name in RESET_OPTIONS if name in given}
+        read_start(options, next(iter(self._envs.values())).track.length)  # before anything changes
         self._race.end()
         self.agents = list(self.possible_agents)
         self._steps = 0
-        options = {name: (options or {})[name] for name in RESET_OPTIONS if name in (options or {})}
         answers = {
             name: env.reset(seed=None if seed is None else seed + number, options=options)
             for number, (name, env) in enumerate(self._envs.items())

@@ -16,7 +16,7 @@ from sb3_torcs.backends.native import NativeBackend
 from sb3_torcs.backends.scr import ScrBackend
 from sb3_torcs.backends.seats import LoneSeat
 from sb3_torcs.backends.several import is_several, one_or_several
-from sb3_torcs.car import DEFAULT_CAR, StartName, is_count
+from sb3_torcs.car import DEFAULT_CAR, StartName, checked_flag, is_count
 from sb3_torcs.envs.racing import RacingEnv, RenderMode
 from sb3_torcs.envs.torcs_race import make_shared_race
 from sb3_torcs.errors import InvalidOption, near_miss
@@ -251,6 +251,7 @@ def _world(
     :param options: that all worlds have
     :raises InvalidOption: if an option is for another world
     """
+    checked_flag("sensor_noise", sensor_noise)
     if backend == "scr":
         if sensor_noise:
             raise InvalidOption(
@@ -317,8 +318,7 @@ def _window(size: Any, view: Any, boards: Any, picture: str) -> Window:
         raise InvalidOption(
             f"render_size is {size!r}; expected width and height in pixels, e.g. (640, 480)"
         )
-    if not isinstance(boards, (bool, np.bool_)):
-        raise InvalidOption(f"boards is {boards!r}; expected True or False")
+    checked_flag("boards", boards)
     window = Window((int(size[0]), int(size[1])), view, boards=bool(boards))
     for name, given, usual in (("view", view, Window.view), ("boards", boards, Window.boards)):
         if picture != "game" and given != usual:

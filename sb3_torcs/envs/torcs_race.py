@@ -12,7 +12,7 @@ from sb3_torcs.actions import ActionName, GearboxName, used_gearbox
 from sb3_torcs.backends.native import load_race
 from sb3_torcs.backends.seats import Grid, Seat, SeatWorld, SharedRace
 from sb3_torcs.backends.several import is_several, world_pool
-from sb3_torcs.car import DEFAULT_CAR, CarState, checked_laps
+from sb3_torcs.car import DEFAULT_CAR, CarState, checked_flag, checked_laps
 from sb3_torcs.envs.racing import RacingEnv
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.sensors import RangeFinderName, range_finder_angles
@@ -130,6 +130,8 @@ def make_race(
     :raises InvalidOption: if an option is for a race of one agent, or has a wrong value
     """
     options = _of_several_agents(options)
+    checked_flag("sensor_noise", sensor_noise)
+    checked_flag("flagged", flagged)
     race = make_shared_race(
         agents, track, car, opponents, grid_place, sensor_noise=sensor_noise,
         action_repeat=options.get("action_repeat", 5), range_finders=range_finders,
@@ -173,9 +175,8 @@ def make_shared_race(
     :param action_repeat: of the agents; opponents that are agents have to have the same
     :param shared: of all races, as of :func:`make_grid`
     """
-    several = not isinstance(opponents, str) and any(
-        is_several(field, "opponents") for field in opponents
-    )
+    listed = isinstance(opponents, (list, tuple))
+    several = listed and any(is_several(field, "opponents") for field in opponents)
     fields: Any = opponents if several else [opponents]
     choices = itertools.product(
         track if is_several(track) else [track],

@@ -132,7 +132,7 @@ class DriveLog:
         """Return all rows as a table of pandas, as :func:`read_drives` does of a file."""
         return self.table().to_pandas()
 
-    def write(self, path: Path) -> None:
+    def write(self, path: str | Path) -> None:
         """
         Write all rows to a Parquet file.
 
@@ -144,7 +144,7 @@ class DriveLog:
         table = self.table()
         floats = [field.name for field in table.schema if str(field.type) == "double"]
         others = [field.name for field in table.schema if field.name not in floats]
-        with whole_file(path) as aside:
+        with whole_file(Path(path)) as aside:
             # Bytes of one weight stand together, which compresses better.
             parquet.write_table(
                 table, aside, compression="zstd", use_dictionary=others,

@@ -200,7 +200,7 @@ def _surfaces(segment: Segment) -> tuple[Surface, ...]:
     return segment.road, segment.left, segment.right, segment.left_wall, segment.right_wall
 
 
-def write_track_file(track: Track, path: Path, comment: str = "") -> None:
+def write_track_file(track: Track, path: str | Path, comment: str = "") -> None:
     """
     Write a compact track file.
 
@@ -227,4 +227,4 @@ def write_track_file(track: Track, path: Path, comment: str = "") -> None:
     for segment in track.segments:
         names = [surface.name for surface in _surfaces(segment)]
         rows.writerow(["segment", *segment[:NUMBERS_PER_SEGMENT], *names])
-    path.write_text(text.getvalue(), encoding="utf-8")
+    Path(path).write_text(text.getvalue(), encoding="utf-8")

@@ -16,7 +16,9 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_torcs.car import is_count
 from sb3_torcs.errors import InvalidOption
 
-__all__ = ["REPLAY_BUFFER", "STATISTICS", "KeepCallback", "WholeFiles"]
+__all__ = ["REPLAY_BUFFER", "SAVING", "STATISTICS", "KeepCallback", "WholeFiles"]
+
+SAVING = "saving what was learned; Ctrl-C once more drops it\n"
 
 UNFINISHED = ".unfinished"
 REPLAY_BUFFER, STATISTICS = "replay_buffer.pkl", "vecnormalize.pkl"

@@ -13,11 +13,13 @@ import fcntl
 import io
 import locale
 import os
+import signal
 import sys
 import tempfile
 import types
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from types import FrameType
 from typing import Any, NamedTuple
 
 import rl_zoo3.train
@@ -34,7 +36,8 @@ import sb3_torcs  # noqa: F401  registers the environments
 from sb3_torcs.agents.model_algorithm import algorithm_class
 from sb3_torcs.agents.model_writing import RecordCallback, recipe
 from sb3_torcs.errors import InvalidOption, WorkerLost
-from sb3_torcs.training.keeping import KeepCallback, WholeFiles
+from sb3_torcs.signals import answered
+from sb3_torcs.training.keeping import SAVING, KeepCallback, WholeFiles
 from sb3_torcs.training.zoo import OURS
 from sb3_torcs.vec_env import TorcsVecEnv
 
@@ -254,13 +257,23 @@ class Manager(_Threaded):
 
     def save_trained_model(self, model: BaseAlgorithm) -> None:
         """
-        Keep the last model.
+        Keep the last model. A large replay buffer takes a minute: one Ctrl-C then ends nothing, but
+        a second one does.
 
         :param model: that was trained
         """
         del model  # which the callback knows
+        seen: list[int] = []
+
+        def note(number: int, frame: FrameType | None) -> None:
+            del frame
+            seen.append(number)
+            if len(seen) > 1:
+                raise KeyboardInterrupt
+            sys.stderr.write(SAVING)
+
         try:
-            with self._named_errors():
+            with self._named_errors(), answered(note, signal.SIGINT, signal.SIGTERM):
                 self.keeper.keep()
         finally:
             self.files.close()

@@ -11,6 +11,7 @@ import numpy as np
 from sb3_torcs.agents.model_algorithm import check_same, told_algorithm
 from sb3_torcs.agents.model_file import as_mismatch, saved_data
 from sb3_torcs.agents.models import check_spaces, saved_spaces, training_record
+from sb3_torcs.agents.wrapping import frames_of
 from sb3_torcs.errors import ModelMismatch, ModelNotTrusted
 from sb3_torcs.sensors import range_finder_angles
 from sb3_torcs.training.keeping import REPLAY_BUFFER
@@ -55,14 +56,24 @@ def check_resumable(
             "a model runs whatever code is pickled in it and in the replay buffer beside it; if "
             "you know who made them, add --trust"
         )
+    sees = frames_of(record.hyperparameters)
+    if record.known and sees != frames:
+        raise ModelMismatch(
+            f"'{model}' has learned with frame_stack {sees}, and would go on with {frames}; give "
+            "the --conf-file or the --hyperparams of before"
+        )
     check_spaces(model, saved_spaces(model, trust=True), env, frames)
     check_same(model, record.algo or told_algorithm(data), algo)
-    seen, angles = record.env_kwargs.get("range_finders", "scr"), "range_finder_angles"
-    sees = env.get_wrapper_attr(angles) if env.has_wrapper_attr(angles) else None
-    if record.env_id and sees is not None and not np.allclose(range_finder_angles(seen), sees):
+    finders, name = record.env_kwargs.get("range_finders", "scr"), "range_finder_angles"
+    angles = env.get_wrapper_attr(name) if env.has_wrapper_attr(name) else None
+    if (
+        record.env_id
+        and angles is not None
+        and not np.allclose(range_finder_angles(finders), angles)
+    ):
         raise ModelMismatch(
-            f"'{model}' has learned with range_finders {seen!r}, and would go on with others; give "
-            "the --env, --entry or --conf-file of before"
+            f"'{model}' has learned with range_finders {finders!r}, and would go on with others; "
+            "give the --env, --entry or --conf-file of before"
         )
     buffer = model.parent / REPLAY_BUFFER
     if not buffer.is_file():

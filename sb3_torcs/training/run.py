@@ -326,13 +326,15 @@ def _noted_interrupts() -> Iterator[list[int]]:
 
     A second Ctrl-C is ignored, so that the model can be saved; only a third one aborts that.
     """
+    from sb3_torcs.training.keeping import SAVING
+
     seen: list[int] = []
 
     def note(number: int, frame: FrameType | None) -> None:
         del frame
         seen.append(number)
         if len(seen) == 2:
-            sys.stderr.write("saving what was learned; Ctrl-C once more drops it\n")
+            sys.stderr.write(SAVING)
             return
         raise KeyboardInterrupt
 

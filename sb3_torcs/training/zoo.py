@@ -210,6 +210,11 @@ def check_entry(entry: Entry, algo: str, env_id: str, place: Place, *, trust: bo
     check_env_kwargs(entry.get("env_kwargs"), env_id, place)
     _check_wrappers(entry, place)
     _check_symmetric(entry, place)
+    if entry.get("normalize") and entry.get("frame_stack") and "buffer_size" in constructor:
+        raise ZooConfigError(
+            f"{place}: {algo} cannot learn with both normalize and frame_stack, since its replay "
+            "buffer keeps what is not normalized; take normalize away: observations are scaled"
+        )
 
 
 def checked_env(entry: Entry, env_id: str, place: Place) -> gym.Env[Any, Any]:
