@@ -331,3 +331,18 @@ def test_a_driver_alone_drives_the_same_and_learns_nothing(env, tmp_path, record
         np.testing.assert_array_equal(driver.predict(OBSERVATIONS, deterministic=True)[0], expected)
     with pytest.raises(InvalidAction, match="nan"):
         stock.learn(20)
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_a_driver_of_ppo_keeps_its_value_function_if_asked(env, tmp_path, kept):
+    """It drives the same without, and nothing stays of what the training saw last."""
+    model = trained(PPO, "MlpPolicy", env, n_steps=8, batch_size=8)
+    model.save(tmp_path / "whole.zip")
+    write_driver(tmp_path / "whole.zip", tmp_path / "driver.zip", value_function=kept)
+    stock = PPO.load(tmp_path / "driver.zip", env, device="cpu")
+    expected, _ = model.predict(OBSERVATIONS, deterministic=True)
+    for driver in (stock, models.load_driver(tmp_path / "driver.zip", env)):
+        np.testing.assert_array_equal(driver.predict(OBSERVATIONS, deterministic=True)[0], expected)
+    values = stock.policy.predict_values(th.as_tensor(OBSERVATIONS))
+    assert bool(values.isfinite().all()) is kept
+    assert stock._last_obs is None

@@ -22,7 +22,15 @@ from sb3_torcs.errors import ModelMismatch, ModelNotTrusted
 if TYPE_CHECKING:
     import torch as th
 
-__all__ = ["IDLE", "as_mismatch", "check_finite", "referenced_class", "saved_data", "saved_weights"]
+__all__ = [
+    "IDLE",
+    "VALUES",
+    "as_mismatch",
+    "check_finite",
+    "referenced_class",
+    "saved_data",
+    "saved_weights",
+]
 
 NEEDED_KEYS = ("observation_space", "action_space", "num_timesteps")
 
@@ -37,7 +45,10 @@ COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 PLAIN_GLOBALS = ("torch._utils _rebuild_tensor_v2", "collections OrderedDict")
 """What the index of weights names, beside types of storage; PyTorch itself would allow more."""
 
-IDLE = ("critic.", "critic_target.", "actor_target.", "critic_batch_norm")
+VALUES = ("value_net.", "mlp_extractor.value_net.")
+"""The value function of PPO, which a training can go on from."""
+
+IDLE = ("critic.", "critic_target.", "actor_target.", "critic_batch_norm", *VALUES)
 """Networks of a policy that only learning needs."""
 
 BROKEN = (

@@ -18,7 +18,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_torcs import __version__
-from sb3_torcs.agents.model_file import IDLE, saved_data, saved_weights
+from sb3_torcs.agents.model_file import IDLE, VALUES, saved_data, saved_weights
 from sb3_torcs.agents.model_policy import (
     plain,
     plain_policy,
@@ -36,6 +36,9 @@ from sb3_torcs.agents.model_record import (
 from sb3_torcs.errors import ModelNotTrusted
 
 __all__ = ["RecordCallback", "recipe", "write_driver", "write_record"]
+
+SEEN_LAST = ("_last_obs", "_last_original_obs", "_last_episode_starts", "ep_info_buffer")
+"""What a training saw last, of which SB3 keeps one per environment."""
 
 Recipe = Mapping[str, Any]
 
@@ -107,7 +110,7 @@ def write_record(model: BaseAlgorithm, asked: Recipe) -> None:
     setattr(model, RECORD, record)
 
 
-def write_driver(model: Path, driver: Path) -> None:
+def write_driver(model: Path, driver: Path, *, value_function: bool = True) -> None:
     """
     Write a small file of a model that can drive but not learn, with its record.
 
@@ -117,12 +120,16 @@ def write_driver(model: Path, driver: Path) -> None:
 
     :param model: the complete file
     :param driver: the file to write
+    :param value_function: whether to keep that of PPO, from which another training may go on
     :raises ModelMismatch: if the model cannot be read
     """
     data, weights = saved_data(model), saved_weights(model)
     data[RECORD] = {**_record_in(model, data), "driver_only": True}
+    for name in SEEN_LAST:
+        data.pop(name, None)
+    left_out = tuple(name for name in IDLE if name not in VALUES or not value_function)
     for name, tensor in weights.items():
-        if name.startswith(IDLE) and tensor.is_floating_point():
+        if name.startswith(left_out) and tensor.is_floating_point():
             tensor.fill_(float("nan"))
     with zipfile.ZipFile(model) as source, zipfile.ZipFile(driver, "w") as target:
         for name in source.namelist():
