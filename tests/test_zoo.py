@@ -45,7 +45,7 @@ def test_a_file_is_shipped_for_ddpg():
 @pytest.mark.parametrize(("path", "name"), ENTRIES, ids=lambda part: getattr(part, "stem", part))
 def test_everything_in_the_shipped_files_is_read_by_something(path, name):
     """A key that nothing reads, a class that does not import, an argument that is not there."""
-    env_id = name if name in gym.registry else "TorcsLite-v0"
+    env_id = name if name in gym.registry else "Torcs-v0"
     zoo.check_entry(zoo.read_entry(path, name), path.stem, env_id, zoo.Place(path, name))
 
 
