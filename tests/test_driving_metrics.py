@@ -110,6 +110,7 @@ def test_an_episode_is_logged_with_distance_laps_and_how_it_ended(oval):
         "driving/end_damage": 0.0,
         "driving/end_lost": 0.0,
         "driving/end_laps": 0.0,
+        "driving/end_race": 0.0,
         "driving/end_time_limit": 0.0,
     }
 
