@@ -56,6 +56,10 @@ car is, so that the motor has its power from the start.
 GEARS = 6
 """Forward gears of a car that says nothing else."""
 
+_DIVERGED = (
+    "a network that gives nan has diverged: lower learning_rate or check the rewards and "
+    "observations"
+)
 _FLOATS = "efd"  # codes of the dtypes that tolist() turns into Python's floats
 _COUNTS = {2: "two", 3: "three", 5: "five"}
 
@@ -210,8 +214,7 @@ def controls_from_action(
         if not low <= number <= high:
             if math.isnan(number):
                 raise InvalidAction(
-                    f"{names[place]} is nan, expected a number in its range; a network that gives "
-                    "nan has diverged: lower learning_rate or check the rewards and observations"
+                    f"{names[place]} is nan, expected a number in its range; {_DIVERGED}"
                 )
             numbers[place] = min(max(number, low), high)
     # As Controls(...) does, without the call that a NamedTuple puts in front of it.
@@ -238,10 +241,7 @@ def action_rows(actions: Any, shape: tuple[int, ...]) -> npt.NDArray[np.floating
         )
     if np.isnan(rows).any():
         place = int(np.argwhere(np.isnan(rows))[0, 0])
-        raise InvalidAction(
-            f"the action of environment {place} has nan; a network that gives nan has diverged: "
-            "lower learning_rate or check the rewards and observations"
-        )
+        raise InvalidAction(f"the action of environment {place} has nan; {_DIVERGED}")
     return rows
 
 

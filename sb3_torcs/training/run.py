@@ -13,11 +13,7 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
-from sb3_torcs.errors import (
-    InvalidOption,
-    OutputNotWritable,
-    WorkerLost,
-)
+from sb3_torcs.errors import InvalidOption, OutputNotWritable, WorkerLost
 from sb3_torcs.files import writable_folder
 from sb3_torcs.signals import answered
 

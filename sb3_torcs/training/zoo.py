@@ -6,6 +6,7 @@ entry by the same rules, and reports a key that nothing would read.
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import importlib.util
 import inspect
@@ -228,19 +229,18 @@ def checked_env(entry: Entry, env_id: str, place: Place) -> gym.Env[Any, Any]:
     :raises ZooConfigError: if a wrapper does not go around it, or the policy cannot read it
     """
     env = gym.make(env_id, **(entry.get("env_kwargs") or {}))
-    try:
-        env = wrapped(env, entry, trust=True)
-        check_sight(entry["policy"], env.observation_space, str(place))
-    except ModelMismatch as error:
-        env.close()
-        raise ZooConfigError(
-            f"{place}: an env_wrapper does not go around the car ({error.__cause__ or error}); "
-            "give its arguments below its dotted path"
-        ) from error
-    except ZooConfigError:
-        env.close()
-        raise
-    return env
+    with contextlib.ExitStack() as unless_checked:
+        unless_checked.callback(env.close)
+        try:
+            driven = wrapped(env, entry, trust=True)
+        except ModelMismatch as error:
+            raise ZooConfigError(
+                f"{place}: an env_wrapper does not go around the car ({error.__cause__ or error}); "
+                "give its arguments below its dotted path"
+            ) from error
+        check_sight(entry["policy"], driven.observation_space, str(place))
+        unless_checked.pop_all()
+    return driven
 
 
 def _check_symmetric(entry: Entry, place: Place) -> None:
