@@ -14,11 +14,43 @@ import yaml
 
 from sb3_torcs.errors import OutputNotWritable
 
-__all__ = ["read_yaml", "whole_file", "writable_file", "writable_folder"]
+__all__ = [
+    "listed",
+    "path_and_arguments",
+    "read_yaml",
+    "whole_file",
+    "writable_file",
+    "writable_folder",
+]
 
 MAX_LENGTH = 2**16  # [characters] PyYAML takes about a second for as many
 MAX_BRACKETS = 100  # open at once: PyYAML's time grows with their square
 MAX_NODES = 100_000  # after aliases are expanded
+
+
+def listed(value: Any) -> list[Any]:
+    """
+    Read a list in any of the RL Zoo's forms: callbacks, for one, or wrappers.
+
+    :param value: a list, a single item, or ``None``
+    :return: a new list
+    """
+    return list(value) if isinstance(value, list) else [] if value is None else [value]
+
+
+def path_and_arguments(item: Any) -> tuple[str, dict[str, Any]]:
+    """
+    Read a class and its arguments, in either of the RL Zoo's forms.
+
+    :param item: a dotted path, or ``{path: {argument: value}}``
+    :return: the path and the arguments
+    :raises ValueError: if it is neither
+    """
+    single = isinstance(item, dict) and len(item) == 1
+    path, arguments = next(iter(item.items())) if single else (item, {})
+    if not isinstance(path, str) or not isinstance(arguments, dict):
+        raise ValueError(f"{item!r:.80} is no dotted path, alone or with arguments")
+    return path, dict(arguments)
 
 
 def writable_folder(folder: str | Path) -> Path:

@@ -950,14 +950,18 @@ def test_a_training_without_environments_for_evaluations_is_refused(capsys, tmp_
     assert run(capsys, *words) == (2, "", "sb3-torcs: --n-eval-envs is 0; expected at least 1\n")
 
 
-def test_a_wrapper_that_lacks_an_argument_is_told_with_its_entry(capsys, tmp_path):
+@pytest.mark.parametrize(("wrapper", "says"), [
+    ("TransformReward", "an env_wrapper does not go around the car (TransformReward.__init__() "),
+    ("TransformReward", "; give its arguments below its dotted path"),
+    ("TimeAwareObservation", "shows a training's time limit, and a race has another"),
+])  # fmt: skip
+def test_a_wrapper_that_cannot_be_used_is_told_with_its_entry(capsys, tmp_path, wrapper, says):
     file = tmp_path / "own.yml"
-    wrapper = "gymnasium.wrappers.TransformReward"
-    file.write_text(
-        f"TorcsLite-v0: {{n_timesteps: 60, policy: MlpPolicy, env_wrapper: {wrapper}}}\n"
-    )
+    path = f"gymnasium.wrappers.{wrapper}"
+    file.write_text(f"TorcsLite-v0: {{n_timesteps: 60, policy: MlpPolicy, env_wrapper: {path}}}\n")
     words = ["train", "--algo", "sac", "--conf-file", str(file), "--folder", str(tmp_path / "logs")]
     status, _, err = run(capsys, *words)
     assert (status, err.count("\n")) == (2, 1)
-    assert "entry 'TorcsLite-v0': an env_wrapper does not go around the car" in err
-    assert "give its arguments below its dotted path" in err
+    assert f"{file}, entry 'TorcsLite-v0': " in err
+    assert says in err
+    assert not (tmp_path / "logs").exists()

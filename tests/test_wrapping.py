@@ -160,6 +160,7 @@ def test_a_wrapper_from_elsewhere_is_imported_only_if_it_is_trusted(tmp_path, mo
     ("gymnasium.wrappers.Nothing", PackageMissing, "does not import"),
     ("gymnasium.spaces.Box", ModelMismatch, "is not a gymnasium.Wrapper"),
     ("gymnasium.wrappers.RescaleAction", ModelMismatch, "does not go around the car"),
+    ("gymnasium.wrappers.TimeAwareObservation", ModelMismatch, "a race has another; train without"),
     (3, ModelMismatch, "env_wrapper of a training has 3; expected a dotted path"),
 ])  # fmt: skip
 def test_what_cannot_be_put_around_is_told(path, error, says):

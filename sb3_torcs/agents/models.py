@@ -95,15 +95,17 @@ class ModelDriver:
         :param deterministic: whether to choose without randomness
         :return: the action, and the state for the next call
         """
+        from sb3_torcs.policies.threads import one_thread
+
         if self.statistics is not None:
             observation = self.statistics.normalize_obs(observation)
-        if self.frames is None:
-            action, state = self.model.predict(observation, state, episode_start, deterministic)
-            return action, state
-        stack, state = (None, None) if state is None else state
-        stack = self._stacked(observation, stack, episode_start)
-        action, state = self.model.predict(stack, state, episode_start, deterministic)
-        return action, (stack, state)
+        with one_thread():
+            if self.frames is None:
+                return self.model.predict(observation, state, episode_start, deterministic)
+            stack, state = (None, None) if state is None else state
+            stack = self._stacked(observation, stack, episode_start)
+            action, state = self.model.predict(stack, state, episode_start, deterministic)
+            return action, (stack, state)
 
     def _stacked(
         self,

@@ -16,6 +16,7 @@ from gymnasium import spaces
 
 from sb3_torcs.agents.model_file import as_mismatch
 from sb3_torcs.errors import ModelMismatch, ModelNotTrusted, PackageMissing
+from sb3_torcs.files import listed, path_and_arguments
 
 __all__ = ["frames_of", "stacked_space", "unrebuilt", "wrapped"]
 
@@ -24,6 +25,9 @@ TRUSTED_PACKAGES = ("sb3_torcs", "gymnasium", "stable_baselines3", "sb3_contrib"
 
 LEFT_OUT = {"TimeLimit", "Monitor", "RecordVideo", "RecordEpisodeStatistics", "UninterruptedWorker"}
 """Wrappers that end or write down a training, and change nothing that is seen or done."""
+
+TIMED = {"TimeAwareObservation"}
+"""Wrappers that show how much of the time limit is over: a race has another one than a training."""
 
 PASSING_ON = {"MirrorVecEnv", "VecMonitor", "VecCheckNan", "VecNormalize", "VecVideoRecorder"}
 """Wrappers of vectors that leave a single car as it is, or whose statistics are kept with the
@@ -51,8 +55,13 @@ def wrapped(
         # In a training SB3's Monitor is here; some wrappers inspect the environment below them.
         env = gym.Wrapper(env)
     for path, kwargs in items:
-        if path.rpartition(".")[2] in LEFT_OUT:
+        name = path.rpartition(".")[2]
+        if name in LEFT_OUT:
             continue
+        if name in TIMED:
+            raise ModelMismatch(
+                f"{path} shows a training's time limit, and a race has another; train without it"
+            )
         wrapper = _imported(path, trust)
         with as_mismatch(f"the training's wrapper {path} does not go around the car", "give"):
             env = wrapper(env, **kwargs)
@@ -112,15 +121,13 @@ def unrebuilt(hyperparameters: Mapping[str, Any]) -> str | None:
 
 def _items(hyperparameters: Mapping[str, Any], key: str) -> Iterator[tuple[str, dict[str, Any]]]:
     """Read dotted paths and arguments in any of the zoo's forms."""
-    value = hyperparameters.get(key)
-    for item in value if isinstance(value, list) else [] if value is None else [value]:
-        single = isinstance(item, dict) and len(item) == 1
-        path, kwargs = next(iter(item.items())) if single else (item, {})
-        if not isinstance(path, str) or not isinstance(kwargs or {}, dict):
+    for item in listed(hyperparameters.get(key)):
+        try:
+            yield path_and_arguments(item)
+        except ValueError:
             raise ModelMismatch(
                 f"{key} of a training has {item!r}; expected a dotted path, or one with arguments"
-            )
-        yield path, dict(kwargs or {})
+            ) from None
 
 
 def _imported(path: str, trust: bool) -> Any:

@@ -12,6 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from sb3_torcs.bench.torcs import Figures
+from sb3_torcs.policies.threads import one_thread
 
 __all__ = ["training_rate", "training_share"]
 
@@ -90,8 +91,6 @@ def training_rate(steps: int) -> Figures:
 
 def _learn(env_id: str, steps: int) -> _TimedCallbacks:
     """Learn with a short warm-up and a small replay buffer, on one thread."""
-    import torch as th
-
     from sb3_torcs.training.manager import build
     from sb3_torcs.training.zoo import config_file, read_entry
 
@@ -100,9 +99,7 @@ def _learn(env_id: str, steps: int) -> _TimedCallbacks:
     entry.update(learning_starts=int(entry["batch_size"]), buffer_size=start + steps)
     entry.update(n_timesteps=start + steps)
     entry["callback"] = [own for own in entry["callback"] if AT_THE_BEGINNING not in own]
-    threads = th.get_num_threads()
-    th.set_num_threads(1)
-    try:
+    with one_thread():
         model, chosen, _ = build("ddpg", env_id, entry)
         env = _TimedVecEnv(model.env)
         model.env = env
@@ -110,6 +107,4 @@ def _learn(env_id: str, steps: int) -> _TimedCallbacks:
         with contextlib.redirect_stdout(io.StringIO()):
             model.learn(start + steps, callback=callbacks)
         env.close()
-    finally:
-        th.set_num_threads(threads)
     return callbacks

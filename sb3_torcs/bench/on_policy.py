@@ -10,12 +10,12 @@ import time
 from collections.abc import Iterator
 from typing import Any
 
-import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_torcs.bench.torcs import Figures
 from sb3_torcs.callbacks import LeanUpdatesCallback
+from sb3_torcs.policies.threads import one_thread
 from sb3_torcs.vec_env import TorcsVecEnv
 
 __all__ = ["ppo"]
@@ -102,11 +102,10 @@ def ppo(seconds: float) -> Figures:
 @contextlib.contextmanager
 def _on_two_cores() -> Iterator[None]:
     """Let this thread, and those that it starts, run on two cores, and PyTorch on one."""
-    cores, threads = os.sched_getaffinity(0), th.get_num_threads()
+    cores = os.sched_getaffinity(0)
     os.sched_setaffinity(0, sorted(cores)[:CORES])
-    th.set_num_threads(1)
     try:
-        yield
+        with one_thread():
+            yield
     finally:
         os.sched_setaffinity(0, cores)
-        th.set_num_threads(threads)

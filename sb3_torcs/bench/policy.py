@@ -19,6 +19,7 @@ from stable_baselines3.td3.policies import Actor, TD3Policy
 from sb3_torcs.policies import fast_matmul
 from sb3_torcs.policies.networks import LateActionQ
 from sb3_torcs.policies.split_head import SplitHeadPolicy
+from sb3_torcs.policies.threads import one_thread
 from sb3_torcs.sensors import View
 
 __all__ = ["PlainSplitHeadPolicy", "SpacesOnly", "fill", "measure", "updater"]
@@ -175,12 +176,10 @@ def measure(batch_size: int = 64, seconds: float = 10.0) -> dict[str, float | No
     :return: ``policy_updates_per_s``, ``policy_plain_updates_per_s`` and
         ``policy_fast_updates_per_s`` (``fast_matmul=True``; ``None`` where it is not supported)
     """
-    threads = th.get_num_threads()
-    th.set_num_threads(1)
     try:
-        return _measure(batch_size, seconds)
+        with one_thread():
+            return _measure(batch_size, seconds)
     finally:
-        th.set_num_threads(threads)
         fast_matmul.disable()
 
 

@@ -15,6 +15,7 @@ from sb3_torcs.bench.policy import SpacesOnly, fill
 from sb3_torcs.bench.torcs import Figures
 from sb3_torcs.policies import SplitHeadPolicy
 from sb3_torcs.policies.replay import sample_mirrored
+from sb3_torcs.policies.threads import one_thread
 from sb3_torcs.policies.updates import LeanUpdates
 from sb3_torcs.training.zoo import config_file, read_entry
 
@@ -39,12 +40,8 @@ def default_updates(seconds: float) -> Figures:
     :return: ``core_gflops``, ``ddpg_updates_per_s``, both of the best turn, and
         ``ddpg_update_gflop``
     """
-    threads = th.get_num_threads()
-    th.set_num_threads(1)
-    try:
+    with one_thread():
         return _measure(seconds)
-    finally:
-        th.set_num_threads(threads)
 
 
 def _measure(seconds: float) -> Figures:

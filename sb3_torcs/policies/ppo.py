@@ -29,6 +29,7 @@ from sb3_torcs.policies.flat import Slot
 from sb3_torcs.policies.fused import array
 from sb3_torcs.policies.layers import compiled
 from sb3_torcs.policies.optimizers import is_usual
+from sb3_torcs.policies.threads import one_thread
 
 __all__ = ["LeanPPO", "is_for"]
 
@@ -142,17 +143,15 @@ class LeanPPO:
 
     def train(self) -> None:
         """Update the networks as ``PPO.train`` does, in its order."""
-        model, threads = self.model, th.get_num_threads()
         self.policy.set_training_mode(True)
-        model._update_learning_rate(self.policy.optimizer)
-        th.set_num_threads(1)  # for each of the two networks
+        self.model._update_learning_rate(self.policy.optimizer)
         self._read_state()
-        try:
-            with ThreadPoolExecutor(1, initializer=th.set_num_threads, initargs=(1,)) as other:
-                figures = self._epochs(other if len(os.sched_getaffinity(0)) > 1 else None)
-        finally:
-            self._write_state()
-            th.set_num_threads(threads)
+        with one_thread():  # for each of the two networks
+            try:
+                with ThreadPoolExecutor(1, initializer=th.set_num_threads, initargs=(1,)) as other:
+                    figures = self._epochs(other if len(os.sched_getaffinity(0)) > 1 else None)
+            finally:
+                self._write_state()
         self._record(figures)
 
     def _epochs(self, other: Executor | None) -> list[list[Figures]]:

@@ -23,7 +23,7 @@ import yaml
 from sb3_torcs.agents.model_algorithm import SBX
 from sb3_torcs.agents.wrapping import unrebuilt
 from sb3_torcs.errors import StudyError, near_miss, with_new_names
-from sb3_torcs.files import read_yaml
+from sb3_torcs.files import listed, read_yaml
 from sb3_torcs.torcs.track_names import RANDOM_TRACK
 from sb3_torcs.tracks.catalogue import CATEGORIES, available_tracks, load_track
 from sb3_torcs.training import zoo
@@ -327,9 +327,8 @@ def _check_keys(mapping: Mapping[str, Any], known: Sequence[str], what: str) -> 
 
 def _by_path(callbacks: Any) -> dict[str, Any]:
     """Turn any of the zoo's forms of a list of callbacks into arguments by dotted path."""
-    items = callbacks if isinstance(callbacks, list) else [] if callbacks is None else [callbacks]
     result: dict[str, Any] = {}
-    for item in items:
+    for item in listed(callbacks):
         result.update({item: {}} if isinstance(item, str) else item)
     return {path: _with_new_names(path, arguments) for path, arguments in result.items()}
 

@@ -49,9 +49,7 @@ class Training:
     """
 
     def __init__(self, trial: Trial, checkpoint: Path | None = None) -> None:
-        th.set_num_threads(
-            1
-        )  # trials run side by side, so more threads of torch would slow them down
+        th.set_num_threads(1)  # trials run side by side: more threads of torch would slow them down
         self.trial = trial
         self.rows: list[Row] = []
         self.episodes = 0  # that have ended, in all training environments together

@@ -14,7 +14,7 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from sb3_torcs.errors import InvalidOption, OutputNotWritable, WorkerLost
-from sb3_torcs.files import writable_folder
+from sb3_torcs.files import listed, writable_folder
 from sb3_torcs.signals import answered
 
 __all__ = ["Run", "TrainOptions", "going_on", "train", "train_run"]
@@ -129,8 +129,7 @@ def train_run(options: TrainOptions) -> Run:
     tensorboard = _for_tensorboard(options.tensorboard or folder / "tensorboard")
     wanted = options.timesteps or zoo.timesteps(changed)
     if any(word.endswith("subproc") for word in options.zoo_args):
-        wrappers = entry.get("env_wrapper") or []
-        entry["env_wrapper"] = [*(wrappers if isinstance(wrappers, list) else [wrappers]), WORKER]
+        entry["env_wrapper"] = [*listed(entry.get("env_wrapper")), WORKER]
     if options.progress or options.pictures is not None:
         entry["callback"] = _with_display(options, entry.get("callback"))
     words = _zoo_words(options, wanted, changed["env_kwargs"])
@@ -252,8 +251,7 @@ def _with_display(options: TrainOptions, callbacks: Any) -> list[Any]:
     :param callbacks: of the entry, in any of the zoo's forms
     :return: as a list
     """
-    items = callbacks if isinstance(callbacks, list) else [] if callbacks is None else [callbacks]
-    items = list(items)
+    items = listed(callbacks)
     if options.pictures is not None:
         items.append({PICTURES: {"folder": str(writable_folder(options.pictures))}})
     if not options.progress:

@@ -24,7 +24,7 @@ from sb3_torcs.agents.model_algorithm import SBX, algorithm_class
 from sb3_torcs.agents.wrapping import wrapped
 from sb3_torcs.car import is_count
 from sb3_torcs.errors import InvalidOption, ModelMismatch, ZooConfigError, near_miss
-from sb3_torcs.files import read_yaml
+from sb3_torcs.files import listed, path_and_arguments, read_yaml
 from sb3_torcs.sensors import look_both_ways, range_finder_angles
 from sb3_torcs.training.zoo_data import (
     as_data,
@@ -234,8 +234,10 @@ def checked_env(entry: Entry, env_id: str, place: Place) -> gym.Env[Any, Any]:
         try:
             driven = wrapped(env, entry, trust=True)
         except ModelMismatch as error:
+            if error.__cause__ is None:
+                raise ZooConfigError(f"{place}: {error}") from error
             raise ZooConfigError(
-                f"{place}: an env_wrapper does not go around the car ({error.__cause__ or error}); "
+                f"{place}: an env_wrapper does not go around the car ({error.__cause__}); "
                 "give its arguments below its dotted path"
             ) from error
         check_sight(entry["policy"], driven.observation_space, str(place))
@@ -375,17 +377,15 @@ def _items(value: Any, key: str, place: Place) -> list[tuple[str, Mapping[str, A
     :param place: where it stands
     :return: dotted paths and their arguments
     """
-    items = value if isinstance(value, list) else [] if value is None else [value]
     result: list[tuple[str, Mapping[str, Any]]] = []
-    for item in items:
-        single = isinstance(item, dict) and len(item) == 1
-        path, arguments = next(iter(item.items())) if single else (item, {})
-        if not isinstance(path, str) or not isinstance(arguments, dict):
+    for item in listed(value):
+        try:
+            result.append(path_and_arguments(item))
+        except ValueError:
             raise ZooConfigError(
                 f"{place}: {key} has {item!r}; expected a dotted path, or one dotted path with "
                 "its arguments indented below it (check the indentation)"
-            )
-        result.append((path, arguments))
+            ) from None
     return result
 
 
