@@ -269,6 +269,7 @@ def test_a_symmetric_policy_needs_observations_that_have_a_mirror_image(tmp_path
     accepted({**symmetric, "env_kwargs": {"range_finders": "narrow"}, "normalize": False})
     accepted({**symmetric, **one_sided, "policy_kwargs": {"symmetric": False}})
     assert "whose middle is 0" in complaint(tmp_path, {**symmetric, "normalize": True})
+    assert "and frame_stack is 2" in complaint(tmp_path, {**symmetric, "frame_stack": 2})
     assert "set range_finders to scr or narrow" in complaint(tmp_path, {**symmetric, **one_sided})
 
 

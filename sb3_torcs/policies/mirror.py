@@ -88,8 +88,9 @@ def mirror_image(space: Any) -> MirrorImage:
     rows = sensors_of(space)
     if not rows:
         raise InvalidOption(
-            f"{space} is not of the observations of Torcs-v0 or TorcsLite-v0, whose mirror image "
-            "is known; take out what changes their bounds or size, as frame stacks do"
+            "the mirror image is known of observations of Torcs-v0 or TorcsLite-v0, not of others "
+            f"of shape {getattr(space, 'shape', None)}; take out what changes their bounds or "
+            "size, as frame stacks do"
         )
     return _image(rows)
 

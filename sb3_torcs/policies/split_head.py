@@ -256,7 +256,8 @@ def _check_symmetric(
     if symmetric and not ours:
         raise InvalidOption(
             "symmetric=True mirrors the sensors and actuators of Torcs-v0 and TorcsLite-v0, not "
-            f"{observation_space} and {action_space}; pass symmetric=False"
+            f"observations of shape {observation_space.shape} within other bounds and actions of "
+            f"shape {action_space.shape}; pass symmetric=False"
         )
 
 

@@ -255,6 +255,11 @@ def _check_symmetric(entry: Entry, place: Place) -> None:
             f"{place}: policy_kwargs has symmetric, which needs observations whose middle is 0, "
             "and normalize moves it; take one of them away: the observations are scaled already"
         )
+    if (entry.get("frame_stack") or 1) > 1:
+        raise ZooConfigError(
+            f"{place}: policy_kwargs has symmetric, which needs one observation at a time, and "
+            f"frame_stack is {entry['frame_stack']}; take one of them away"
+        )
     env_kwargs = entry.get("env_kwargs") or {}
     if not look_both_ways(range_finder_angles(env_kwargs.get("range_finders", "scr"))):
         raise ZooConfigError(
