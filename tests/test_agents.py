@@ -18,6 +18,7 @@ from sb3_torcs.evaluation.ladder import REFERENCE_FILE
 MAX_SIZE = 400_000  # [bytes]
 SECTIONS = ("## How it was made", "## What it drives", "## Limits")
 AGENTS = models.shipped_agents()
+ROOT = Path(__file__).parent.parent
 DRIVE = re.compile(r"\n(sb3-torcs evaluate .*)\n```\n\nLaps: ([\d., ]*) s\.")  # in a card
 RACE = re.compile(r"\n(sb3-torcs race .*) --races \d+\n```\n\nPlaces: ([\d, ]*)\.")
 LINE = re.compile(  # of the leaderboard: driver, flying lap, standing lap, how it was made
@@ -39,6 +40,20 @@ def test_it_is_small_and_has_a_card(name):
     assert sum(file.stat().st_size for file in files) <= MAX_SIZE
     for section in SECTIONS:
         assert section in card_of(name)
+
+
+@pytest.mark.parametrize("name", AGENTS)
+def test_the_page_of_the_agents_has_it(name):
+    """One row each: what it sees, by the record of its training, and how long it learned."""
+    (row,) = re.findall(
+        rf"^\| \[`{name}`\].*$", (ROOT / "docs" / "agents.md").read_text("utf-8"), re.M
+    )
+    _, _, _, sees, learned, _ = row.split("|")
+    record = models.training_record(models.AGENTS / name / "best_model.zip")
+    groups = [group for group in record.env_kwargs.get("sensors", ()) if group != "base"]
+    assert sees.partition(", the last")[0].strip() == (", ".join(groups) or "the 29 numbers")
+    told = card_of(name) + (ROOT / "LEADERBOARD.md").read_text("utf-8")
+    assert learned.replace("timesteps", "").strip() in told
 
 
 @pytest.mark.parametrize("name", AGENTS)
