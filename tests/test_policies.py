@@ -661,6 +661,12 @@ def test_a_kernel_that_kills_the_process_is_left_off(kernel, tmp_path):
     assert found.reason == "left off: the kernel kills the process here (SIGILL)"
 
 
+def test_the_trial_computes_in_another_process(kernel):
+    """It fails only where the kernel kills its process."""
+    failure = fast_matmul._trial(8, (16, 16))
+    assert failure is None or "kills the process" in failure
+
+
 def test_a_trial_that_cannot_run_leaves_the_kernel_off(kernel):
     kernel.setattr(sys, "executable", "/nowhere/python")
     found = fast_matmul.probe(8, (16, 16))

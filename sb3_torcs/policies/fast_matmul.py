@@ -105,7 +105,7 @@ def _tensors(batch_size: int, units: tuple[int, int]) -> list[th.Tensor]:
 
 def _trial(batch_size: int, units: tuple[int, int]) -> str | None:
     # Why the other kernel cannot be used here at all: a separate process tries it, and may die.
-    code = f"from sb3_torcs import fast_matmul as m; m.run_once({batch_size}, {units})"
+    code = f"from {__name__} import run_once; run_once({batch_size}, {units})"
     call = [sys.executable, "-c", code]
     try:
         ended = subprocess.run(call, capture_output=True, timeout=TRIAL_TIME, check=False)
