@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gymnasium as gym
 import numpy as np
 import pandas as pd
 import pytest
@@ -90,6 +91,21 @@ def test_an_agents_drive_is_noted_tick_by_tick_and_stays_the_same():
     assert len(frame) % 5 == 0
     assert set(frame["driver"]) | set(frame["world"]) == {"scripted", "TorcsLite-v0"}
     assert (set(frame["track"]), set(frame["episode"])) == ({"g-track-1"}, {1})
+
+
+@pytest.mark.usefixtures("game")
+@pytest.mark.parametrize("kwargs", [{}, {"delay": 2}, {"opponents": ["scripted"]}])
+def test_who_looks_on_draws_no_noise(kwargs):
+    """What an agent sees is the same to the bit, where each control tick is noted."""
+    made = {"track": "g-track-1", "sensor_noise": True, **kwargs}
+    alone, noted = (gym.make("sb3_torcs:Torcs-v0", **made) for _ in range(2))
+    log_drives(noted, "x")
+    seen = [env.reset(seed=3)[0] for env in (alone, noted)]
+    for _ in range(10):
+        assert np.array_equal(*seen)
+        seen = [env.step(np.array([0.1, 0.8, 0.0], np.float32))[0] for env in (alone, noted)]
+    for env in (alone, noted):
+        env.close()
 
 
 @pytest.mark.usefixtures("game")

@@ -242,7 +242,10 @@ class SharedRace:
     def ask(self) -> None:
         """Ask the opponents that are agents what they do next, once before each timestep."""
         if self.grid.crew is not None and self._asked != self._tick:
+            engine = self.world(0).engine
+            muted = engine.mute_noise(False)  # opponents see with noise, whoever looks on
             self.grid.crew.act(self._tick)
+            engine.mute_noise(muted)
             self._asked = self._tick
 
     def advance(self, ticks: int) -> None:
@@ -285,6 +288,11 @@ class Seat(Drawn):
         self.gears = race.gears(number)
         self.range_finder_angles = self.world.range_finder_angles
         self._closed = False
+
+    @property
+    def shares_race(self) -> bool:
+        """Whether other agents are stepped with this one."""
+        return self.race.agents > 1
 
     @property
     def world(self) -> SeatWorld:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sb3_torcs.car import CarState, Controls
+from sb3_torcs.evaluation.ticks import TickedWorld
 from sb3_torcs.telemetry import CONTROL_FIELDS, STATE_FIELDS, write_telemetry
 
 __all__ = ["Recorder", "Stretch", "Timestep", "best_stretch"]
@@ -136,7 +138,7 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
         cars = [d.car for d in self.episodes[stretch.episode][stretch.first : stretch.last]]
         line = np.array([(car.x, car.y) for car in cars])
         speed = np.array([car.speed_x for car in cars])
-        with self._again(stretch.episode, action_repeat=1) as env:
+        with self._again(stretch.episode) as env:
             plot_track(env.get_wrapper_attr("backend").track, path, line=line, speed=speed)
 
     def save_video(self, path: Path) -> None:
@@ -153,22 +155,31 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
         write_video(path, self._frames(stretch, repeat), VIDEO_FPS, total=total)
 
     def _frames(self, stretch: Stretch, repeat: int) -> Iterator[npt.NDArray[np.uint8]]:
-        """Drive the episode again, tick by tick, and render the stretch."""
+        """Drive the episode again, and render the stretch: some frames of each timestep."""
         timesteps = self.episodes[stretch.episode]
-        with self._again(stretch.episode, action_repeat=1, render_mode="rgb_array") as env:
-            tick = 0
-            for index, timestep in enumerate(timesteps[: stretch.last]):
-                for _ in range(repeat):
-                    env.step(timestep.action)
-                    tick += 1
-                    if index >= stretch.first and tick % VIDEO_TICKS == 0:
-                        yield env.render()  # type: ignore[misc]
+        with self._again(stretch.episode, render_mode="rgb_array") as env:
+            racing: Any = env.unwrapped
+            ticks = itertools.count(1)
+            frames: list[npt.NDArray[np.uint8]] = []
+
+            def show(car: CarState, controls: Controls) -> None:
+                del controls  # of the timestep, which the board shows
+                tick = next(ticks)
+                if tick > stretch.first * repeat and tick % VIDEO_TICKS == 0:
+                    before, racing.car = racing.car, car  # within a timestep, for the picture
+                    frames.append(racing.render())
+                    racing.car = before
+
+            racing.backend = TickedWorld(racing.backend, show)
+            for timestep in timesteps[: stretch.last]:
+                env.step(timestep.action)
+                yield from frames
+                frames.clear()
 
     def _again(self, episode: int, **changes: Any) -> gym.Env[Any, Any]:
         """Build the environment anew, at the beginning of an episode."""
-        limit = self._limit * self.get_wrapper_attr("action_repeat") + 1
         kwargs = {**self._kwargs, **changes}
-        env = gym.make(self.env_id, max_episode_steps=limit, **kwargs)
+        env = gym.make(self.env_id, max_episode_steps=self._limit + 1, **kwargs)
         env.reset(seed=self._seed)
         for _ in range(episode):  # each reset draws from the same generator
             env.reset()

@@ -1,20 +1,56 @@
-"""A drive noted tick by tick, whatever the length of the agent's timesteps."""
+"""Every control tick of a drive, whatever the length of the agent's timesteps."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
 from sb3_torcs.backends.base import Backend
+from sb3_torcs.backends.several import present_world
 from sb3_torcs.car import CarState, Controls, Start
 from sb3_torcs.telemetry.drives import DriveLabel, DriveLog
 
-__all__ = ["LoggedWorld", "log_drives"]
+__all__ = ["LoggedWorld", "TickedWorld", "log_drives"]
 
 
-class LoggedWorld:
+class TickedWorld:
+    """
+    A world that shows its car after every control tick, and drives as it would without.
+
+    :param world: that is driven
+    :param show: called with the car, and with the controls that it holds
+    """
+
+    def __init__(self, world: Backend, show: Callable[[CarState, Controls], None]) -> None:
+        self._world = world
+        self._show = show
+
+    def reset(self, rng: np.random.Generator, start: Start | None) -> CarState:
+        """Begin an episode; see :class:`~sb3_torcs.backends.base.Backend`."""
+        return self._world.reset(rng, start)
+
+    def step(self, controls: Controls, ticks: int) -> CarState:
+        """Drive on, one tick after the other; see :class:`~sb3_torcs.backends.base.Backend`."""
+        engine = getattr(present_world(self._world), "engine", None)
+        try:
+            for left in reversed(range(ticks)):
+                if engine is not None:  # noise is drawn with what the agent sees, the last tick
+                    engine.mute_noise(left > 0)
+                state = self._world.step(controls, 1)
+                self._show(state, controls)
+        finally:
+            if engine is not None:
+                engine.mute_noise(False)
+        return state
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._world, name)
+
+
+class LoggedWorld(TickedWorld):
     """
     A world that notes its car after every control tick.
 
@@ -25,26 +61,15 @@ class LoggedWorld:
     """
 
     def __init__(self, world: Backend, log: DriveLog, driver: str, env_id: str) -> None:
-        self._world = world
-        self._log = log
+        super().__init__(world, lambda car, controls: log.add(self._label, car, controls))
         self._label = DriveLabel(driver, "", world.car, env_id, episode=0)
 
     def reset(self, rng: np.random.Generator, start: Start | None) -> CarState:
         """Begin an episode; see :class:`~sb3_torcs.backends.base.Backend`."""
-        state = self._world.reset(rng, start)
+        state = super().reset(rng, start)
         track = self._world.track.name  # a random one is drawn before the reset
         self._label = self._label._replace(track=track, episode=self._label.episode + 1)
         return state
-
-    def step(self, controls: Controls, ticks: int) -> CarState:
-        """Drive on, one tick after the other, which comes to the same."""
-        for _ in range(ticks):
-            state = self._world.step(controls, 1)
-            self._log.add(self._label, state, controls)
-        return state
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._world, name)
 
 
 def log_drives(env: gym.Env[Any, Any], driver: str) -> DriveLog:

@@ -257,16 +257,22 @@ PYBIND11_MODULE(_engine, module) {
              py::kw_only(), "data"_a, "libraries"_a, "plib"_a, "track"_a, "session"_a, "entries"_a,
              "cars"_a, "laps"_a, "angles"_a, "road_speed"_a = std::vector<bool>{},
              "flagged"_a = false)
-        .def("start",
-             [](Engine& engine) {
-                 const WithoutPython released;
-                 engine.start();
-             })
-        .def("start_at",
-             [](Engine& engine, double distance, double position, double error, double speed) {
-                 const WithoutPython released;
-                 engine.start(Start{distance, position, error, speed});
-             })
+        .def(
+            "start",
+            [](Engine& engine) {
+                const WithoutPython released;
+                engine.start();
+            },
+            "Begin a race from the grid.")
+        .def(
+            "start_at",
+            [](Engine& engine, double distance, double position, double error, double speed) {
+                const WithoutPython released;
+                engine.start(Start{distance, position, error, speed});
+            },
+            "distance"_a, "position"_a, "error"_a, "speed"_a,
+            "Begin a race rolling: distance [m] along the road, position [-1 to 1] across it, "
+            "error [rad] of the heading, speed [m/s].")
         .def(
             "step",
             [](Engine& engine, double steering, double throttle, double brake,
@@ -298,19 +304,22 @@ PYBIND11_MODULE(_engine, module) {
             "car"_a, "steering"_a, "throttle"_a, "brake"_a, "gear"_a, "clutch"_a = 0.0,
             "Say what an agent does from its next call on.")
         .def(
-            "retire", [](Engine& engine, int car) { engine.retire(car); },
+            "retire", [](Engine& engine, int car) { engine.retire(car); }, "car"_a,
             "Take a car off the road and out of the race.")
         .def(
             "rejoin",
             [](Engine& engine, int car, double position, double error, double speed) {
                 engine.rejoin(car, Start{0.0, position, error, speed});
             },
+            "car"_a, "position"_a, "error"_a, "speed"_a,
             "Put an agent's car down in the middle of the longest free stretch of road, rolling.")
-        .def("advance",
-             [](Engine& engine, int ticks) {
-                 const WithoutPython released;
-                 engine.advance(ticks);
-             })
+        .def(
+            "advance",
+            [](Engine& engine, int ticks) {
+                const WithoutPython released;
+                engine.advance(ticks);
+            },
+            "ticks"_a, "Drive on, with the agents standing on their brakes.")
         .def(
             "drive",
             [](Engine& engine, int ticks) {
@@ -318,104 +327,140 @@ PYBIND11_MODULE(_engine, module) {
                 engine.drive(ticks);
             },
             "ticks"_a, "Drive on; each agent does what it was last told to hold.")
-        .def("read", [](Engine& engine, int car) { return as_state(engine.read(car)); })
-        .def("set_noise", &Engine::set_noise)
+        .def(
+            "read", [](Engine& engine, int car) { return as_state(engine.read(car)); }, "car"_a,
+            "Return a car as the fields of CarState.")
+        .def("set_noise", &Engine::set_noise, "seed"_a,
+             "Let range finders and opponents err from now on; None is no noise.")
+        .def("mute_noise", &Engine::mute_noise, "muted"_a,
+             "Read without noise for as long as it is muted, and draw none; returns what was set "
+             "before.")
         .def(
             "set_conditions",
             [](Engine& engine, double grip, double mass) { engine.set_conditions({grip, mass}); },
-            "grip"_a, "mass"_a)
-        .def("set_origin", &Engine::set_origin, "Move the positions that are read by x and y [m].")
-        .def("save", &Engine::save)
-        .def("restore", &Engine::restore)
-        .def("focus", [](Engine& engine, int car,
-                         double direction) { return read_only(engine.focus(car, direction)); })
-        .def("appearance", [](Engine& engine) { return py::bytes(engine.appearance()); })
-        .def("close", &Engine::close)
-        .def("controls",
-             [](Engine& engine, int car) {
-                 const Engine::Access race(engine);
-                 Engine::check_car(*race, car);
-                 const Control& control = race->car(car).control;
-                 return py::make_tuple(control.steering, control.throttle, control.brake,
-                                       control.gear, control.clutch);
-             })
+            "grip"_a, "mass"_a, "Change the starts that follow, by factors.")
+        .def("set_origin", &Engine::set_origin, "x"_a, "y"_a,
+             "Move the positions that are read by x and y [m].")
+        .def("save", &Engine::save, "Keep the whole race, for restore.")
+        .def("restore", &Engine::restore, "moment"_a, "Go back to a moment of this engine.")
+        .def(
+            "focus",
+            [](Engine& engine, int car, double direction) {
+                return read_only(engine.focus(car, direction));
+            },
+            "car"_a, "direction"_a,
+            "Return five distances [m] to the road's edge around a direction [rad], left negative.")
+        .def(
+            "appearance", [](Engine& engine) { return py::bytes(engine.appearance()); },
+            "Return what the game's window needs to draw this moment.")
+        .def("close", &Engine::close, "Free the race. A second call does nothing.")
+        .def(
+            "controls",
+            [](Engine& engine, int car) {
+                const Engine::Access race(engine);
+                Engine::check_car(*race, car);
+                const Control& control = race->car(car).control;
+                return py::make_tuple(control.steering, control.throttle, control.brake,
+                                      control.gear, control.clutch);
+            },
+            "car"_a, "Return the controls that a car holds.")
         .def_property_readonly("agents",
                                [](Engine& engine) { return Engine::Access(engine)->agents(); })
-        .def("finished",
-             [](Engine& engine, int car) {
-                 const Engine::Access race(engine);
-                 Engine::check_car(*race, car);
-                 return race->finished(car);
-             })
+        .def(
+            "finished",
+            [](Engine& engine, int car) {
+                const Engine::Access race(engine);
+                Engine::check_car(*race, car);
+                return race->finished(car);
+            },
+            "car"_a, "Say whether an agent was flagged off.")
         .def_property_readonly("ended",
                                [](Engine& engine) { return Engine::Access(engine)->ended(); })
-        .def("car_name",
-             [](Engine& engine, int car) {
-                 const Engine::Access race(engine);
-                 Engine::check_car(*race, car);
-                 return std::string(race->car(car).info.car);
-             })
-        .def("gears",
-             [](Engine& engine, int car) {
-                 const Engine::Access race(engine);
-                 Engine::check_car(*race, car);
-                 return race->car(car).priv.gears_number - 1;
-             })
-        .def("laps",
-             [](Engine& engine, int car) {
-                 py::list laps;
-                 const Engine::Access race(engine);
-                 Engine::check_car(*race, car);
-                 for (const LapRecord& lap : race->laps(car))
-                     laps.append(py::make_tuple(lap.time, lap.damage));
-                 return laps;
-             })
-        .def("results",
-             [](Engine& engine) {
-                 py::list results;
-                 for (const Result& result : Engine::Access(engine)->results())
-                     results.append(py::make_tuple(result.entry, result.laps, result.total_time,
-                                                   result.best_lap, result.damage, result.out));
-                 return results;
-             })
-        .def("track_summary",
-             [](Engine& engine) {
-                 const Engine::Access race(engine);
-                 const TrackData& track = race->track();
-                 const Segment& first = *track.last->next;
-                 return py::dict(
-                     "name"_a = track.name, "length"_a = track.length, "width"_a = track.width,
-                     "segments"_a = track.segments_number,
-                     "x"_a = 0.5 * (first.vertex[START_LEFT].x + first.vertex[START_RIGHT].x),
-                     "y"_a = 0.5 * (first.vertex[START_LEFT].y + first.vertex[START_RIGHT].y),
-                     "heading"_a = first.heading);
-             })
-        .def("road",
-             [](Engine& engine) {
-                 const std::vector<RoadSegment> road = Engine::Access(engine)->road();
-                 py::array_t<double> rows({road.size(), std::size_t{ROAD_COLUMNS}});
-                 std::memcpy(rows.mutable_data(), road.data(), road.size() * sizeof road[0]);
-                 return rows;
-             })
-        .def("replay",
-             [](Engine& engine, const py::array_t<double, py::array::c_style>& controls,
-                bool sensors) {
-                 const auto rows = controls.unchecked<2>();
-                 if (rows.shape(1) != 3)
-                     throw Error("InvalidAction",
-                                 "controls have " + std::to_string(rows.shape(1)) +
-                                     " columns; expected 3: steering, throttle, brake");
-                 std::vector<Controls> list;
-                 list.reserve(static_cast<std::size_t>(rows.shape(0)));
-                 for (py::ssize_t i = 0; i < rows.shape(0); i++)
-                     list.push_back(controls_of(rows(i, 0), rows(i, 1), rows(i, 2), {}, 0.0));
-                 const WithoutPython released;
-                 engine.replay(list, sensors);
-             })
-        .def("update_physics", [](Engine& engine, int steps) {
-            const WithoutPython released;
-            engine.update_physics(steps);
-        });
+        .def(
+            "car_name",
+            [](Engine& engine, int car) {
+                const Engine::Access race(engine);
+                Engine::check_car(*race, car);
+                return std::string(race->car(car).info.car);
+            },
+            "car"_a, "Return the name of a car's model.")
+        .def(
+            "gears",
+            [](Engine& engine, int car) {
+                const Engine::Access race(engine);
+                Engine::check_car(*race, car);
+                return race->car(car).priv.gears_number - 1;
+            },
+            "car"_a, "Return the number of a car's forward gears.")
+        .def(
+            "laps",
+            [](Engine& engine, int car) {
+                py::list laps;
+                const Engine::Access race(engine);
+                Engine::check_car(*race, car);
+                for (const LapRecord& lap : race->laps(car))
+                    laps.append(py::make_tuple(lap.time, lap.damage));
+                return laps;
+            },
+            "car"_a, "Return a car's laps so far: time [s] and damage [points].")
+        .def(
+            "results",
+            [](Engine& engine) {
+                py::list results;
+                for (const Result& result : Engine::Access(engine)->results())
+                    results.append(py::make_tuple(result.entry, result.laps, result.total_time,
+                                                  result.best_lap, result.damage, result.out));
+                return results;
+            },
+            "Return by place: entry, laps, time [s], best lap [s], damage [points], whether out.")
+        .def(
+            "track_summary",
+            [](Engine& engine) {
+                const Engine::Access race(engine);
+                const TrackData& track = race->track();
+                const Segment& first = *track.last->next;
+                return py::dict(
+                    "name"_a = track.name, "length"_a = track.length, "width"_a = track.width,
+                    "segments"_a = track.segments_number,
+                    "x"_a = 0.5 * (first.vertex[START_LEFT].x + first.vertex[START_RIGHT].x),
+                    "y"_a = 0.5 * (first.vertex[START_LEFT].y + first.vertex[START_RIGHT].y),
+                    "heading"_a = first.heading);
+            },
+            "Return name, sizes and the middle of the start line of the track.")
+        .def(
+            "road",
+            [](Engine& engine) {
+                const std::vector<RoadSegment> road = Engine::Access(engine)->road();
+                py::array_t<double> rows({road.size(), std::size_t{ROAD_COLUMNS}});
+                std::memcpy(rows.mutable_data(), road.data(), road.size() * sizeof road[0]);
+                return rows;
+            },
+            "Return the segments of the road, one per row; see road.h.")
+        .def(
+            "replay",
+            [](Engine& engine, const py::array_t<double, py::array::c_style>& controls,
+               bool sensors) {
+                const auto rows = controls.unchecked<2>();
+                if (rows.shape(1) != 3)
+                    throw Error("InvalidAction",
+                                "controls have " + std::to_string(rows.shape(1)) +
+                                    " columns; expected 3: steering, throttle, brake");
+                std::vector<Controls> list;
+                list.reserve(static_cast<std::size_t>(rows.shape(0)));
+                for (py::ssize_t i = 0; i < rows.shape(0); i++)
+                    list.push_back(controls_of(rows(i, 0), rows(i, 1), rows(i, 2), {}, 0.0));
+                const WithoutPython released;
+                engine.replay(list, sensors);
+            },
+            "controls"_a, "sensors"_a,
+            "Drive controls, a tick each, with or without sensors; for benchmarks.")
+        .def(
+            "update_physics",
+            [](Engine& engine, int steps) {
+                const WithoutPython released;
+                engine.update_physics(steps);
+            },
+            "steps"_a, "Move the bare physics on; for benchmarks.");
 
     py::class_<Fleet>(module, "Fleet", "Engines that are driven at once, on threads that stay.")
         .def(py::init([](const std::vector<std::shared_ptr<Engine>>& engines, int threads) {
@@ -438,16 +483,19 @@ PYBIND11_MODULE(_engine, module) {
                 const WithoutPython released;
                 fleet.begin(race, controls, ticks);
             },
-            "race"_a, "steering"_a, "throttle"_a, "brake"_a, "gear"_a, "ticks"_a, "clutch"_a = 0.0)
-        .def("wait",
-             [](Fleet& fleet, std::size_t race) {
-                 const Reading* reading;
-                 {
-                     const WithoutPython released;
-                     reading = &fleet.wait(race);
-                 }
-                 return as_state(*reading);
-             })
+            "race"_a, "steering"_a, "throttle"_a, "brake"_a, "gear"_a, "ticks"_a, "clutch"_a = 0.0,
+            "Let a race's first agent hold controls for some ticks, on a thread.")
+        .def(
+            "wait",
+            [](Fleet& fleet, std::size_t race) {
+                const Reading* reading;
+                {
+                    const WithoutPython released;
+                    reading = &fleet.wait(race);
+                }
+                return as_state(*reading);
+            },
+            "race"_a, "Wait for a race that has begun to move; returns its first agent's car.")
         .def(
             "step",
             [](Fleet& fleet, const py::array_t<std::int64_t, py::array::c_style>& races,
@@ -462,21 +510,26 @@ PYBIND11_MODULE(_engine, module) {
             },
             "races"_a, "seats"_a, "controls"_a, "ticks"_a, py::arg("cars").noconvert(),
             "Drive several at once; writes their cars, and returns the rows of those that failed.")
-        .def("finish", [](Fleet& fleet) {
-            const WithoutPython released;
-            fleet.finish();
-        });
+        .def(
+            "finish",
+            [](Fleet& fleet) {
+                const WithoutPython released;
+                fleet.finish();
+            },
+            "Wait for all races that have begun to move.");
 
     py::class_<Rollouts>(module, "Rollouts", "Short drives from one moment, at once.")
         .def(py::init([](const std::vector<Engine*>& engines, int threads) {
                  return std::make_unique<Rollouts>(checked(engines), threads);
              }),
              py::keep_alive<1, 2>(), "engines"_a, "threads"_a)
-        .def("mark",
-             [](Rollouts& rollouts) {
-                 const WithoutPython released;
-                 rollouts.mark();
-             })
+        .def(
+            "mark",
+            [](Rollouts& rollouts) {
+                const WithoutPython released;
+                rollouts.mark();
+            },
+            "Keep the moment of the first engine, from which all candidates begin.")
         .def(
             "drive",
             [](Rollouts& rollouts, const py::array_t<double, py::array::c_style>& path, int ticks) {

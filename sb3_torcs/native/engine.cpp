@@ -5,6 +5,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstring>
+#include <utility>
 
 #include "appearance.h"
 #include "errors.h"
@@ -143,6 +144,11 @@ void Engine::set_noise(std::optional<std::uint64_t> seed) {
     if (seed) noise_.emplace(*seed);
 }
 
+bool Engine::mute_noise(bool muted) {
+    Access race(*this);
+    return std::exchange(muted_, muted);
+}
+
 void Engine::set_conditions(const Conditions& conditions) {
     Access(*this)->set_conditions(conditions);
 }
@@ -256,7 +262,8 @@ Reading Engine::read(Race& race, int index) {
         static_cast<double>(race.contacts(index)), static_cast<double>(race.faults(index))};
     rivals(car, race.cars(), race.cars_number(), race.track().length,
            reading.race.data() + (RACE_NUMBERS - RIVAL_NUMBERS));
-    if (noise_) add_noise(*noise_, reading.range_finders.data(), reading.opponents.data());
+    if (noise_ && !muted_)
+        add_noise(*noise_, reading.range_finders.data(), reading.opponents.data());
     return reading;
 }
 

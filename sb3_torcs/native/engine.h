@@ -69,6 +69,7 @@ public:
     void rejoin(int car, const Start& start);
     Reading read(int car);
     void set_noise(std::optional<std::uint64_t> seed);
+    bool mute_noise(bool muted);  // read without noise, and draw none; returns what was set before
     void set_conditions(const Conditions& conditions);  // for the starts that follow
     void set_origin(double x, double y);                // added to positions that are read
     Moment save();
@@ -109,6 +110,7 @@ private:
     std::unique_ptr<Race> race_;
     std::vector<Angles> angles_;  // of each car
     std::optional<Generator> noise_;
+    bool muted_ = false;
     double x_ = 0.0, y_ = 0.0;
     std::atomic<bool> busy_{false};
     int forks_;  // of the process when the engine was made

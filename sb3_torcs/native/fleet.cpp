@@ -55,12 +55,17 @@ void Fleet::work(std::size_t index) {
     task.failure = nullptr;
     try {
         Engine::Access race(*task.engine);
+        const int ticks = task.orders.front().ticks;
         for (Order& order : task.orders) {
+            if (order.ticks != ticks)
+                throw Error("InvalidOption",
+                            "the cars of one race are driven for as many ticks, not for " +
+                                std::to_string(ticks) + " and " + std::to_string(order.ticks));
             if (order.car == FIRST_AGENT) order.car = Engine::first_agent(*race);
             Engine::check_agent(*race, order.car);
             race->hold(order.car, order.controls);
         }
-        race->drive(task.orders.front().ticks);
+        race->drive(ticks);
         for (const Order& order : task.orders) *order.arrival = task.engine->read(*race, order.car);
     } catch (...) {
         task.failure = std::current_exception();
