@@ -240,7 +240,8 @@ def checked_range(name: str, choice: Any, low: float, high: float, unit: str) ->
     :param unit: of both, in words
     :raises InvalidOption: if it is no such number
     """
-    pair = list(choice) if isinstance(choice, Sequence | np.ndarray) else [choice, choice]
+    several = isinstance(choice, Sequence) or np.ndim(choice) > 0
+    pair = list(choice) if several else [choice, choice]
     numbers = not isinstance(choice, str) and len(pair) == 2 and all(map(is_number, pair))
     if not numbers or not low <= pair[0] <= pair[1] <= high:
         raise InvalidOption(

@@ -241,6 +241,20 @@ def test_a_world_that_cannot_change_says_so(oval):
         gym.make("TorcsLite-v0", mass=1.1)
 
 
+@pytest.mark.usefixtures("game")
+def test_cars_of_one_race_have_no_delays_of_their_own():
+    """The engine moves all of them at once, for as many ticks."""
+    env = TorcsVecEnv(1, agents=2, track="g-track-1")
+    for choice in (3, (0, 4)):
+        with pytest.raises(InvalidOption, match=r"delay is .* the cars of one race move at once"):
+            env.env_method("set_conditions", {"delay": choice})
+    env.env_method("set_conditions", {"delay": 0})
+    env.close()
+    alone = TorcsVecEnv(1, track="g-track-1")
+    alone.env_method("set_conditions", {"delay": 3})
+    alone.close()
+
+
 def test_conditions_of_a_training_are_those_of_its_environments_alone(game):
     """They begin with the next episode; what was before comes back, also to the world."""
     del game

@@ -131,6 +131,19 @@ def test_a_refused_reset_leaves_the_race_as_it_is(make):
     env.step({"agent_1": GAS})
 
 
+def test_after_a_reset_that_the_game_refuses_there_is_no_race(make):
+    """Walls stand where the car should start."""
+    env = make(2, track="e-track-3")
+    env.reset(seed=0)
+    with pytest.raises(InvalidOption, match="start"):
+        env.reset(options={"distance": 0.0, "track_position": -1.0})
+    assert env.agents == []
+    with pytest.raises(EnvClosed, match="call reset first"):
+        env.step({"agent_0": GAS, "agent_1": GAS})
+    env.reset()
+    env.step({name: GAS for name in env.agents})
+
+
 @pytest.mark.parametrize(
     ("actions", "message"),
     [

@@ -174,7 +174,7 @@ class Batch:
         self._fleet.put(race, present_world(env.backend))
         self._cars[race] = np.hstack(env.car)
         self._laps[race] = np.inf if env.laps is None else env.laps
-        self._runoff[race], self._recovery[race] = env.runoff, env.recovery
+        self._runoff[race], self._recovery[race] = env.runoff, env.recovery_ticks
         self._unstick[race] = env.aids.unstick
         self._keep_distance[race] = env.aids.keep_distance
         self._ticks[race] = env.action_repeat

@@ -89,6 +89,11 @@ class Conditions:
         :param world: a backend
         :raises InvalidOption: if it cannot
         """
+        if self._delays != (0.0, 0.0) and getattr(world, "shares_race", False):
+            raise InvalidOption(
+                f"delay is {self.choice['delay']!r}, and the cars of one race move at once; leave "
+                "it out, or drive each agent in a race of its own"
+            )
         for name in self._changed:
             if name not in getattr(world, "conditions", ()):
                 raise InvalidOption(

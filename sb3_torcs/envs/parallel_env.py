@@ -101,18 +101,20 @@ class TorcsParallelEnv(ParallelEnv[str, Observation, Action]):
         :param options: where the field starts, as of ``Torcs-v0``; the place is the first agent's.
             Other names are ignored: PettingZoo's tests hand over one
         :return: observations and infos
-        :raises InvalidOption: if no car can start so; then the race before goes on
+        :raises InvalidOption: if options have wrong values, and the race before goes on; or if the
+            game lets no car start there, and there is no race then
         """
         given = options if isinstance(options, Mapping) else {}
         options = {name: given[name] for name in RESET_OPTIONS if name in given}
         read_start(options, next(iter(self._envs.values())).track.length)  # before anything changes
         self._race.end()
-        self.agents = list(self.possible_agents)
-        self._steps = 0
+        self.agents = []
         answers = {
             name: env.reset(seed=None if seed is None else seed + number, options=options)
             for number, (name, env) in enumerate(self._envs.items())
         }
+        self.agents = list(self.possible_agents)
+        self._steps = 0
         observations = {name: seen for name, (seen, _) in answers.items()}
         return observations, {name: _with_race(info) for name, (_, info) in answers.items()}
 

@@ -159,7 +159,8 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
     :param laps: whole laps after which the episode is truncated; ``None`` drives on
     :param runoff: how far the mass centre may be beside the road before the episode ends [m]
     :param recovery: how long a car may stand, or face backwards, before the episode ends [s]; 0
-        ends it after 1.5 s of standing, and at once if it faces backwards
+        ends it after 1.5 s of standing, 3 s after a standing start, and at once if it faces
+        backwards
     :param unstick: whether a car that is stuck across the road or beside it frees itself; actions
         count for nothing meanwhile
     :param keep_distance: whether a car brakes by itself where it is too close to the car ahead
@@ -205,7 +206,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         self.action_repeat = int(action_repeat)
         self.laps = checked_laps(laps)
         self.runoff = checked_runoff(runoff)
-        self.recovery = round(checked_recovery(recovery) / CONTROL_TICK)
+        self.recovery_ticks = round(checked_recovery(recovery) / CONTROL_TICK)
         self.aids = Aids(unstick, keep_distance)
         self.render_mode = render_mode
         self.metadata = {
@@ -348,7 +349,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
             self.car = self.backend.reset(self.np_random, start)
         self._controls = Controls(0.0, 0.0, 0.0)
         grace = STUCK_TICKS if start is not None and start.speed > 0.0 else GRACE_TICKS
-        self.patience = max(grace, self.recovery)
+        self.patience = max(grace, self.recovery_ticks)
         self.standing = 0
         self._race_is_over = False
         if self.render_mode == "human":
@@ -487,11 +488,11 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
     def _end(self, car: CarState) -> str | None:
         """Return why the episode ends, or ``None`` if it goes on."""
         laps = math.inf if self.laps is None else self.laps
-        reason = end_of(car, laps, self.runoff, self.recovery)
+        reason = end_of(car, laps, self.runoff, self.recovery_ticks)
         if reason:
             return ENDS[reason]
         if not stands(car):
-            self.standing, self.patience = 0, max(STUCK_TICKS, self.recovery)
+            self.standing, self.patience = 0, max(STUCK_TICKS, self.recovery_ticks)
             return self._end_of_race()
         self.standing += self.action_repeat
         return "stuck" if self.standing > self.patience else self._end_of_race()

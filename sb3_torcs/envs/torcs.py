@@ -72,7 +72,8 @@ class TorcsEnv(RacingEnv):
     :param laps: whole laps after which the episode is truncated; ``None`` drives on
     :param runoff: how far the mass centre may be beside the road before the episode ends [m]
     :param recovery: how long a car may stand, or face backwards, before the episode ends [s]; 0
-        ends it after 1.5 s of standing, and at once if it faces backwards
+        ends it after 1.5 s of standing, 3 s after a standing start, and at once if it faces
+        backwards
     :param unstick: whether a car that is stuck across the road or beside it frees itself, as the
         game's robots do; actions count for nothing meanwhile
     :param keep_distance: whether a car brakes by itself where it is too close to the car ahead;

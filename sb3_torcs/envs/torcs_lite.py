@@ -57,9 +57,10 @@ class TorcsLiteEnv(RacingEnv):
 
     Episode end
         Terminated: ``"off_track"`` (the mass centre is more than ``runoff`` beside the road),
-        ``"backwards"`` (more than 90 degrees off its direction), ``"stuck"`` (1.5 s below 5 km/h),
-        ``"damage"`` (10,000 points). Truncated: ``"laps"`` driven, or the time limit of the
-        registration. ``info["end"]`` says which.
+        ``"backwards"`` (more than 90 degrees off its direction, without ``recovery``), ``"stuck"``
+        (below 5 km/h for 1.5 s; 3 s after a standing start), ``"damage"`` (10,000 points).
+        Truncated: ``"laps"`` driven, or the time limit of the registration. ``info["end"]`` says
+        which.
 
     Units are SI and radians; left is positive.
 
@@ -81,7 +82,8 @@ class TorcsLiteEnv(RacingEnv):
     :param laps: whole laps after which the episode is truncated; ``None`` drives on
     :param runoff: how far the mass centre may be beside the road before the episode ends [m]
     :param recovery: how long a car may stand, or face backwards, before the episode ends [s]; 0
-        ends it after 1.5 s of standing, and at once if it faces backwards
+        ends it after 1.5 s of standing, 3 s after a standing start, and at once if it faces
+        backwards
     :param unstick: whether a car that is stuck across the road or beside it frees itself, as the
         game's robots do; actions count for nothing meanwhile
     :param keep_distance: ``False``; there are no other cars here
