@@ -257,7 +257,11 @@ def test_a_ghost_is_a_driver_like_others(file):
 @pytest.mark.parametrize(
     ("kwargs", "said"),
     [({"track": "b-speedway"}, "track 'a-speedway', not 'b-speedway'"),
-     ({"track": TRACK, "action_repeat": 2}, "action_repeat 5, not 2")],
+     ({"track": TRACK, "action_repeat": 2}, "action_repeat 5, not 2"),
+     ({"track": TRACK, "gearbox": "road_speed"}, "gearbox 'automatic', not 'road_speed'"),
+     ({"track": TRACK, "grip": 0.8}, "grip 1.0, not 0.8"),
+     ({"track": TRACK, "delay": 3}, "delay 0, not 3"),
+     ({"track": TRACK, "opponents": ["bt"]}, "opponents")],
 )  # fmt: skip
 def test_a_ghost_drives_no_other_race(file, kwargs, said):
     with gym.make("Torcs-v0", **kwargs) as env, pytest.raises(ModelMismatch, match=said):

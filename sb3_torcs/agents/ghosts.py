@@ -200,6 +200,12 @@ class GhostDriver:
         return np.array([0.0, AFTERWARDS] if width == 2 else [0.0, 0.0, -AFTERWARDS], "f4"), step
 
 
+USUAL = {"delay": 0, "grip": 1.0, "mass": 1.0, "unstick": False, "keep_distance": False}
+"""Options that change a drive, which environments tell, and their usual values."""
+MADE_WITH = {"gearbox": "automatic", "start": "grid", "opponents": ()}
+"""Those that only :func:`gym.make` knows."""
+
+
 def check_fits(ghost: Ghost, env: gym.Env[Any, Any], name: str | Path) -> None:
     """
     Make sure that an environment is the one that a ghost was driven in.
@@ -209,20 +215,28 @@ def check_fits(ghost: Ghost, env: gym.Env[Any, Any], name: str | Path) -> None:
     :param name: of the ghost, for the message
     :raises ModelMismatch: if the drive would be another one
     """
-    backend = env.get_wrapper_attr("backend")
+    backend, aids = env.get_wrapper_attr("backend"), env.get_wrapper_attr("aids")
     wanted = ghost.env_kwargs
     has = {
         "track": backend.track.name,
         "car": backend.car,
         "action_repeat": env.get_wrapper_attr("action_repeat"),
         "action": env.get_wrapper_attr("action"),
+        **env.get_wrapper_attr("conditions").choice,
+        "unstick": aids.unstick,
+        "keep_distance": aids.keep_distance,
     }
     needs = {
         "track": load_track(find_track(wanted["track"], find_game()).path).name,
         "car": wanted["car"],
         "action_repeat": wanted["action_repeat"],
         "action": wanted.get("action", "pedals"),
+        **{name: wanted.get(name, usual) for name, usual in USUAL.items()},
     }
+    if env.spec is not None:  # cars of one race have none
+        made_with = env.spec.kwargs
+        has.update({name: made_with.get(name) or usual for name, usual in MADE_WITH.items()})
+        needs.update({name: wanted.get(name) or usual for name, usual in MADE_WITH.items()})
     for what, value in needs.items():
         if has[what] != value:
             raise ModelMismatch(
