@@ -44,6 +44,7 @@ __all__ = [
     "StudyError",
     "TrackFileError",
     "TrackNotFound",
+    "TrainingDiverged",
     "UnknownCar",
     "UnknownRewardTerm",
     "UnknownRobot",
@@ -191,6 +192,10 @@ class StudyError(Sb3TorcsError, ValueError):
 
 class RayUnavailable(Sb3TorcsError, RuntimeError):
     """A study needs Ray, which is not installed or does not answer."""
+
+
+class TrainingDiverged(Sb3TorcsError, ArithmeticError):
+    """The weights of a model that learns are not numbers any more."""
 
 
 class WorkerLost(Sb3TorcsError, RuntimeError):

@@ -552,13 +552,35 @@ def recorded():
 
 
 def test_an_episode_is_driven_again_exactly(recorded):
-    """Tick by tick, on the track that was drawn for the second episode."""
-    env = recorded._again(1, action_repeat=1)
+    """On the track that was drawn for the second episode."""
+    env = recorded._again(1)
     for step in recorded.episodes[1]:
-        for _ in range(recorded.get_wrapper_attr("action_repeat")):
-            info = env.step(step.action)[4]
+        info = env.step(step.action)[4]
         assert (info["car"].x, info["car"].y) == (step.car.x, step.car.y)
     env.close()
+
+
+def test_a_video_shows_the_drive_with_its_aids_and_delay(monkeypatch):
+    """An aid steps in at the begin of a timestep, and not between."""
+    kwargs = {"track": "g-track-1", "unstick": True, "recovery": 20.0, "runoff": 5.0, "delay": 3}
+    recorder = recording.Recorder("TorcsLite-v0", kwargs, 100)
+    recorder.reset(seed=0)
+    for _ in range(60):
+        recorder.step(np.array([1.0, 0.3, 0.0], np.float32))
+    (timesteps,) = recorder.episodes
+    assert any(step.controls.throttle != pytest.approx(0.3) for step in timesteps), "it was freed"
+    shown, again = [], recorder._again
+
+    def shown_again(episode, **changes):
+        env = again(episode, **changes)
+        monkeypatch.setattr(env.unwrapped, "render", lambda: shown.append(env.unwrapped.car))
+        return env
+
+    monkeypatch.setattr(recorder, "_again", shown_again)
+    list(recorder._frames(recording.Stretch(0, 40, 60), 5))
+    assert len(shown) == 50
+    assert shown[-1][:23] == timesteps[-1].car[:23]
+    recorder.close()
 
 
 def test_a_stretch_is_recorded_in_real_time(recorded, tmp_path):
@@ -670,6 +692,18 @@ def test_the_command_that_goes_on_means_the_same_options():
     assert words[2:-3] == [
         "--entry", "as the post", "--timesteps", "5", "--seed", "3", "--no-progress",
     ]  # fmt: skip
+    assert training_run._command(TrainOptions(trust=True)) == "sb3-torcs train --seed 0 --trust"
+
+
+@pytest.mark.parametrize(("name", "value", "least"), [
+    ("timesteps", 0, 1), ("timesteps", -7, 1), ("eval_episodes", 0, 1), ("seed", -1, 0),
+])  # fmt: skip
+def test_numbers_of_a_training_from_python_are_checked_too(tmp_path, name, value, least):
+    with pytest.raises(
+        InvalidOption, match=f"{name} is {value}; expected a whole number >= {least}"
+    ):
+        training_run.train(options(tmp_path, **{name: value}))
+    assert list(tmp_path.glob("logs*")) == []
 
 
 def test_the_pictures_come_after_the_entry_s_callbacks_and_the_bar_before(tmp_path):

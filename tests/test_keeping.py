@@ -26,7 +26,7 @@ from toy import ToyRace
 
 from sb3_torcs.agents import models
 from sb3_torcs.cli import main
-from sb3_torcs.errors import InvalidOption
+from sb3_torcs.errors import InvalidOption, TrainingDiverged
 from sb3_torcs.training import manager as zoo_training
 from sb3_torcs.training.keeping import (
     REPLAY_BUFFER,
@@ -151,12 +151,30 @@ def test_a_full_disk_leaves_the_files_of_before(tmp_path, monkeypatch):
     assert callback.files.unfinished() == []
 
 
-def test_a_model_that_has_diverged_is_not_healthy(tmp_path):
+def test_a_model_that_has_diverged_does_not_replace_a_good_one(tmp_path):
     callback = keeper(tmp_path)
     callback.init_callback(tiny(buffer_size=50))
-    assert callback.is_healthy()
+    callback.keep()
+    (model,) = tmp_path.glob("*.zip")
+    before = model.read_bytes()
     next(callback.model.policy.parameters()).data[0, 0] = np.nan
-    assert not callback.is_healthy()
+    with pytest.raises(TrainingDiverged, match="after 0 timesteps its model computes no numbers"):
+        callback.keep()
+    assert model.read_bytes() == before
+
+
+@pytest.mark.slow
+def test_a_training_that_diverges_is_told(tmp_path, capfd):
+    """The weights are numbers still, and what PPO's distribution gets is none."""
+    file = tmp_path / "own.yml"
+    file.write_text(
+        "TorcsLite-v0: {n_timesteps: 4000, n_steps: 64, policy: MlpPolicy, learning_rate: 1.0e+9}"
+    )
+    words = ["--algo", "ppo", "--conf-file", str(file), "--folder", str(tmp_path / "logs")]
+    assert main(["train", "--no-progress", *words]) == 2
+    last = capfd.readouterr().err.strip().splitlines()[-1]
+    assert last.startswith("sb3-torcs: the training has diverged: after ")
+    assert last.endswith("nothing was kept yet; lower the learning_rate, and start again")
 
 
 @pytest.mark.parametrize("every", [0, -1, 1.5, True])

@@ -269,6 +269,12 @@ def test_a_symmetric_policy_needs_observations_that_have_a_mirror_image(tmp_path
     accepted({**symmetric, "env_kwargs": {"range_finders": "narrow"}, "normalize": False})
     accepted({**symmetric, **one_sided, "policy_kwargs": {"symmetric": False}})
     assert "whose middle is 0" in complaint(tmp_path, {**symmetric, "normalize": True})
+    text = {**symmetric, "policy_kwargs": "dict(symmetric=True, activation_fn=nn.ReLU)"}
+    assert "whose middle is 0" in complaint(tmp_path, {**text, "normalize": True})
+    accepted({**text, "normalize": {"norm_obs": False}})
+    assert "unknown policy_kwargs: argument 'symmetrical'" in complaint(
+        tmp_path, {**text, "policy_kwargs": "dict(symmetrical=True, activation_fn=nn.ReLU)"}
+    )
     assert "and frame_stack is 2" in complaint(tmp_path, {**symmetric, "frame_stack": 2})
     assert "set range_finders to scr or narrow" in complaint(tmp_path, {**symmetric, **one_sided})
 

@@ -6,7 +6,6 @@ import io
 import json
 import os
 import pickle
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,7 +25,7 @@ from sb3_torcs.agents.model_file import (
 from sb3_torcs.agents.model_policy import Spaces, build_policy, readable_policy, readable_space
 from sb3_torcs.agents.model_record import TrainingRecord, record_beside, record_within
 from sb3_torcs.agents.scripted import SCRIPTED, ScriptedDriver
-from sb3_torcs.agents.wrapping import frames_of, stacked_space, unrebuilt
+from sb3_torcs.agents.wrapping import frames_of, normalizes, stacked_space, unrebuilt
 from sb3_torcs.errors import (
     InvalidOption,
     ModelMismatch,
@@ -405,7 +404,7 @@ def _statistics(file: Path, record: TrainingRecord, trust: bool) -> Any:
     if record.statistics is not None:
         return record.statistics
     if record.statistics_file is None:
-        if _normalized(record.hyperparameters.get("normalize")):
+        if normalizes(record.hyperparameters.get("normalize")):
             raise ModelMismatch(
                 f"'{file}' has learned from normalized observations, and their statistics are not "
                 "there; put the vecnormalize.pkl of its training beside its config.yml"
@@ -419,13 +418,6 @@ def _statistics(file: Path, record: TrainingRecord, trust: bool) -> Any:
         if not isinstance(statistics, VecNormalize):
             raise TypeError(f"a {type(statistics).__name__}")
         return statistics
-
-
-def _normalized(normalize: Any) -> bool:
-    """Read whether a training had normalized observations; strings are the zoo's to evaluate."""
-    if isinstance(normalize, Mapping):
-        return bool(normalize.get("norm_obs", True))
-    return normalize is True
 
 
 def _scripted(env: gym.Env[Any, Any]) -> Any:

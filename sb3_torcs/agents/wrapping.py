@@ -18,7 +18,7 @@ from sb3_torcs.agents.model_file import as_mismatch
 from sb3_torcs.errors import ModelMismatch, ModelNotTrusted, PackageMissing
 from sb3_torcs.files import listed, path_and_arguments
 
-__all__ = ["frames_of", "stacked_space", "unrebuilt", "wrapped"]
+__all__ = ["frames_of", "normalizes", "stacked_space", "unrebuilt", "wrapped"]
 
 TRUSTED_PACKAGES = ("sb3_torcs", "gymnasium", "stable_baselines3", "sb3_contrib", "rl_zoo3")
 """Whose wrappers a record may name: importing them, and putting them around, does no harm."""
@@ -100,6 +100,17 @@ def stacked_space(space: spaces.Space[Any], frames: int | None) -> spaces.Space[
     from stable_baselines3.common.vec_env.stacked_observations import StackedObservations
 
     return StackedObservations(1, frames, space).stacked_observation_space
+
+
+def normalizes(normalize: Any) -> bool:
+    """
+    Read whether a training has normalized observations.
+
+    :param normalize: of its hyperparameters; a string is the zoo's to evaluate
+    """
+    if isinstance(normalize, Mapping):
+        return bool(normalize and normalize.get("norm_obs", True))
+    return normalize is True
 
 
 def unrebuilt(hyperparameters: Mapping[str, Any]) -> str | None:

@@ -230,7 +230,8 @@ class MirrorCallback(_WhileLearning):
                 f"{type(self).__name__} mirrors samples of a replay buffer, but "
                 f"{type(self.model).__name__} has none; take it out of the callbacks"
             )
-        if self.model.get_vec_normalize_env() is not None:
+        normalizer = self.model.get_vec_normalize_env()
+        if normalizer is not None and normalizer.norm_obs:
             raise InvalidOption(
                 f"{type(self).__name__} needs observations whose middle is 0, which VecNormalize "
                 "moves; take 'normalize' away: the observations are scaled already"

@@ -10,11 +10,12 @@ import os
 import shutil
 from pathlib import Path
 
+import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_torcs.car import is_count
-from sb3_torcs.errors import InvalidOption
+from sb3_torcs.errors import InvalidOption, TrainingDiverged
 
 __all__ = ["REPLAY_BUFFER", "SAVING", "STATISTICS", "KeepCallback", "WholeFiles"]
 
@@ -107,7 +108,15 @@ class KeepCallback(BaseCallback):
         Save the model and what belongs to it. The previous files stay until then.
 
         The replay buffer comes last: it is large, and may not fit on the disk.
+
+        :raises TrainingDiverged: if the model computes no numbers any more, and would replace a
+            good one
         """
+        if not self.is_healthy():
+            raise TrainingDiverged(
+                f"the training has diverged: after {self.model.num_timesteps} timesteps its model "
+                "computes no numbers any more"
+            )
         self.files.drop()
         aside = self.files.aside
         with (aside / f"{self.name}.zip").open("wb") as file:
@@ -122,5 +131,13 @@ class KeepCallback(BaseCallback):
             self.files.settle()
 
     def is_healthy(self) -> bool:
-        """Check that all weights are finite; a diverged model must not replace a good one."""
-        return all(bool(th.isfinite(weights).all()) for weights in self.model.policy.parameters())
+        """Check that all weights are finite, and what the model does next."""
+        if not all(bool(th.isfinite(w).all()) for w in self.model.policy.parameters()):
+            return False
+        if self.model._last_obs is None:
+            return True
+        try:
+            actions, _ = self.model.policy.predict(self.model._last_obs, deterministic=True)
+        except ValueError:  # of a distribution whose mean is no number
+            return False
+        return bool(np.isfinite(actions).all())

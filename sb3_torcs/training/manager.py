@@ -35,7 +35,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 import sb3_torcs  # noqa: F401  registers the environments
 from sb3_torcs.agents.model_algorithm import algorithm_class
 from sb3_torcs.agents.model_writing import RecordCallback, recipe
-from sb3_torcs.errors import InvalidOption, WorkerLost
+from sb3_torcs.errors import InvalidOption, TrainingDiverged, WorkerLost
 from sb3_torcs.signals import answered
 from sb3_torcs.training.keeping import SAVING, KeepCallback, WholeFiles
 from sb3_torcs.training.zoo import OURS
@@ -247,10 +247,16 @@ class Manager(_Threaded):
             with self._named_errors():
                 super().learn(model)
         except Exception as error:
-            with contextlib.suppress(OSError):
-                if self.keeper.is_healthy():
-                    self.keeper.keep()
+            diverged = None
+            try:
+                self.keeper.keep()
+            except TrainingDiverged as found:
+                diverged = found
+            except OSError:
+                pass
             self.files.close()
+            if diverged is not None:
+                raise diverged from error
             if isinstance(error, EOFError | ConnectionError):
                 raise WorkerLost("a process with a car of the training has ended") from error
             raise

@@ -13,7 +13,8 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
-from sb3_torcs.errors import InvalidOption, OutputNotWritable, WorkerLost
+from sb3_torcs.car import is_count
+from sb3_torcs.errors import InvalidOption, OutputNotWritable, TrainingDiverged, WorkerLost
 from sb3_torcs.files import listed, writable_folder
 from sb3_torcs.signals import answered
 
@@ -111,11 +112,13 @@ def train_run(options: TrainOptions) -> Run:
     :param options: what to train, and where to put it
     :return: the result
     :raises ZooConfigError: if the hyperparameters have something that nothing would read
-    :raises InvalidOption: if the arguments for the zoo cannot be read, or would move the model
+    :raises InvalidOption: if a number is not allowed, or if the arguments for the zoo cannot be
+        read, or would move the model
     :raises OutputNotWritable: if a folder cannot be written
     """
     from sb3_torcs.training import zoo
 
+    _check_numbers(options)
     for word in options.zoo_args:
         if word.partition("=")[0] in OURS:
             raise InvalidOption(
@@ -127,7 +130,7 @@ def train_run(options: TrainOptions) -> Run:
         resume = _resumed(options, entry, env, changed)
     folder = writable_folder(options.folder)
     tensorboard = _for_tensorboard(options.tensorboard or folder / "tensorboard")
-    wanted = options.timesteps or zoo.timesteps(changed)
+    wanted = zoo.timesteps(changed) if options.timesteps is None else options.timesteps
     if any(word.endswith("subproc") for word in options.zoo_args):
         entry["env_wrapper"] = [*listed(entry.get("env_wrapper")), WORKER]
     if options.progress or options.pictures is not None:
@@ -137,6 +140,17 @@ def train_run(options: TrainOptions) -> Run:
     words += ["--trained-agent", str(resume)] if resume else []
     track = changed["env_kwargs"].get("track")
     return _run_zoo(options, [*words, *options.zoo_args], entry, wanted, track)
+
+
+def _check_numbers(options: TrainOptions) -> None:
+    if options.timesteps is not None and not is_count(options.timesteps):
+        raise InvalidOption(f"timesteps is {options.timesteps!r}; expected a whole number >= 1")
+    if not is_count(options.eval_episodes):
+        raise InvalidOption(
+            f"eval_episodes is {options.eval_episodes!r}; expected a whole number >= 1"
+        )
+    if not is_count(options.seed) and options.seed != 0:
+        raise InvalidOption(f"seed is {options.seed!r}; expected a whole number >= 0")
 
 
 def _for_tensorboard(folder: str | Path) -> Path:
@@ -281,7 +295,7 @@ def _run_zoo(
     try:
         with redirected[0], redirected[1], _noted_interrupts() as seen:
             zoo_training.train(options.algo, options.env, entry, words, managers)
-    except (OSError, WorkerLost) as error:
+    except (OSError, WorkerLost, TrainingDiverged) as error:
         if not managers:
             raise
         raise _told(error, _result(managers[0], wanted, track, False), options) from error
@@ -300,13 +314,17 @@ def _result(manager: Manager, wanted: int, track: Any, interrupted: bool) -> Run
     return Run(folder, timesteps, wanted, interrupted, last_model, track)
 
 
-def _told(error: OSError | WorkerLost, result: Run, options: TrainOptions) -> Exception:
+def _told(
+    error: OSError | WorkerLost | TrainingDiverged, result: Run, options: TrainOptions
+) -> Exception:
     """Compose a message: why a training ended, what is saved, and what to type."""
     if result.timesteps > 0:
         kept = f"kept: '{result.last_model}', {result.timesteps} of {result.wanted} timesteps"
         more = f"go on with: {going_on(options, result)}"
     else:
         kept, more = "nothing was kept yet", "start again"
+    if isinstance(error, TrainingDiverged):
+        return TrainingDiverged(f"{error}; {kept}; lower the learning_rate, and {more}")
     if isinstance(error, WorkerLost):
         return WorkerLost(f"{error}; {kept}; see above why, and {more}")
     said = f"cannot write '{error.filename}': {error.strerror or error}"
@@ -355,5 +373,8 @@ def _command(options: TrainOptions) -> str:
         if field.name == "zoo_args" or (value == field.default and field.name != "seed"):
             continue
         option = field.name.replace("_", "-")
-        words += [f"--no-{option}"] if value is False else [f"--{option}", str(value)]
+        if isinstance(value, bool):
+            words.append(f"--{option}" if value else f"--no-{option}")
+        else:
+            words += [f"--{option}", str(value)]
     return shlex.join([*words, *(["--", *options.zoo_args] if options.zoo_args else [])])

@@ -21,7 +21,7 @@ import gymnasium as gym
 import yaml
 
 from sb3_torcs.agents.model_algorithm import SBX, algorithm_class
-from sb3_torcs.agents.wrapping import wrapped
+from sb3_torcs.agents.wrapping import normalizes, wrapped
 from sb3_torcs.car import is_count
 from sb3_torcs.errors import InvalidOption, ModelMismatch, ZooConfigError, near_miss
 from sb3_torcs.files import listed, path_and_arguments, read_yaml
@@ -34,6 +34,7 @@ from sb3_torcs.training.zoo_data import (
     check_noise,
     check_numbers,
     check_sight,
+    policy_arguments,
 )
 
 __all__ = [
@@ -202,7 +203,7 @@ def check_entry(entry: Entry, algo: str, env_id: str, place: Place, *, trust: bo
     _check_keys(entry, ZOO_KEYS | constructor, "key", place)
     check_noise(entry, "action_noise" in constructor, algo, str(place))
     policy = _policy(entry["policy"], algorithm, place)
-    _check_call("policy_kwargs", policy, entry.get("policy_kwargs"), place, GIVEN_BY_POLICY_OWNER)
+    _check_call("policy_kwargs", policy, policy_arguments(entry), place, GIVEN_BY_POLICY_OWNER)
     if algo.startswith(SBX):
         check_jax(policy, entry.get("policy_kwargs"), str(place))
     for key in ("callback", "env_wrapper", "vec_env_wrapper"):
@@ -247,10 +248,10 @@ def checked_env(entry: Entry, env_id: str, place: Place) -> gym.Env[Any, Any]:
 
 def _check_symmetric(entry: Entry, place: Place) -> None:
     """Make sure that observations have a mirror image, if the policy is symmetric."""
-    policy_kwargs = entry.get("policy_kwargs")
-    if not isinstance(policy_kwargs, Mapping) or not policy_kwargs.get("symmetric"):
+    arguments = policy_arguments(entry)
+    if not isinstance(arguments, Mapping) or not arguments.get("symmetric"):
         return
-    if entry.get("normalize"):
+    if normalizes(entry.get("normalize")):
         raise ZooConfigError(
             f"{place}: policy_kwargs has symmetric, which needs observations whose middle is 0, "
             "and normalize moves it; take one of them away: the observations are scaled already"

@@ -26,6 +26,7 @@ __all__ = [
     "check_numbers",
     "check_sight",
     "plain_python",
+    "policy_arguments",
 ]
 
 EVALUATED = (
@@ -66,7 +67,7 @@ def check_data(entry: Mapping[str, Any], place: str) -> None:
     for key in EVALUATED:
         if not isinstance(entry.get(key), str):
             continue
-        if key != "policy_kwargs" or not _names_activations(entry[key]):
+        if key != "policy_kwargs" or isinstance(policy_arguments(entry), str):
             raise ZooConfigError(
                 f"{place}: the zoo would evaluate {key}, {entry[key]!r:.80}, as Python; write a "
                 "mapping, as in the shipped files, or train from a file of your own with --trust"
@@ -253,8 +254,22 @@ def plain_python(text: str) -> Any:
         raise ValueError(f"{text!r:.80} is not plain data") from error
 
 
-def _names_activations(text: str) -> bool:
-    """Say whether an expression is plain data once ``nn.ReLU`` and its like are replaced."""
+def policy_arguments(entry: Mapping[str, Any]) -> Any:
+    """
+    Read the ``policy_kwargs`` of an entry, also those that name activations.
+
+    :param entry: of :func:`as_data`
+    :return: names and values, with activations as text; or what stands there, if it cannot be read
+    """
+    value = entry.get("policy_kwargs")
+    try:
+        return _with_activations(value) if isinstance(value, str) else value
+    except ValueError:
+        return value
+
+
+def _with_activations(text: str) -> Any:
+    """Read an expression that is plain data once ``nn.ReLU`` and its like are replaced."""
 
     class Named(ast.NodeTransformer):
         def visit_Attribute(self, node: ast.Attribute) -> ast.expr:
@@ -263,10 +278,9 @@ def _names_activations(text: str) -> bool:
             return ast.Constant(name) if known else node
 
     try:
-        _value(Named().visit(ast.parse(text.strip(), mode="eval")).body)
-    except (ValueError, *TOO_MUCH):
-        return False
-    return True
+        return _value(Named().visit(ast.parse(text.strip(), mode="eval")).body)
+    except TOO_MUCH as error:
+        raise ValueError(f"{text!r:.80} is not plain data") from error
 
 
 def _value(node: ast.expr) -> Any:
