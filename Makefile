@@ -33,7 +33,7 @@ $(STAMP): setup.cfg pyproject.toml setup.py
 	  echo "There is no C++ compiler: the engine of Torcs-v0 is missing. For it type: sudo apt install g++ python3-dev; make native"
 	@touch $@
 
-demo: install ## watch a car learn to lap, and record its best lap (5 minutes; Ctrl-C keeps what was learned)
+demo: install ## watch a car learn to lap, and record its best lap (three minutes; Ctrl-C keeps what was learned)
 	$(BIN)/python examples/demo.py $(DEMO_ARGS)
 
 native: $(BUILT) ## build the engine in place, and fail if that cannot be done

@@ -1,4 +1,4 @@
-"""Hold the SCR protocol to the engine: the same driver on the same track by both.
+"""Check the SCR protocol against the engine: the same driver on the same track by both.
 
 The driver decides by what it sees: in the engine, and over SCR in the stock game with our driver
 module. All observations, actions, lap times and the damage have to be the same. The exit status

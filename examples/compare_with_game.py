@@ -1,4 +1,4 @@
-"""Hold the engine to the game: the same robots by both, every time equal to the millisecond.
+"""Check the engine against the game: the same robots by both, every time equal to the millisecond.
 
 Without arguments six robots drive three laps of every installed track, alone, in the session that
 the game calls practice; with --race they drive four at a time against each other. The exit status

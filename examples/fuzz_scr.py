@@ -1,4 +1,4 @@
-"""Break messages of the SCR protocol, and hold what is read to a slow, obvious reader.
+"""Break messages of the SCR protocol, and check what is read against a slow, obvious reader.
 
 A message is either refused with MessageBroken or gives the numbers that stand in it; actions give
 those that the game's side reads, too. A million messages take some minutes.

@@ -1,4 +1,4 @@
-"""A reward of one's own: by weights, or by any code at all."""
+"""Your own reward: by weights, or by any code at all."""
 
 import argparse
 from typing import Any

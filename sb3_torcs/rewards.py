@@ -69,8 +69,8 @@ def safe_speed(sight: float) -> float:
 
 
 def overspeed(before: CarState, after: CarState, controls: Controls) -> float:
-    """Speed beyond √(12² + 2 · 10 · d) [m/s], from which 10 m/s² slow down to 12 m/s within the
-    longest range finder's d metres.
+    """Speed above v = √(12² + 2 · 10 · d) [m/s], where d [m] is the longest range finder: who
+    brakes from v at 10 m/s² has 12 m/s at the end of what it sees.
     """
     sight = max(float(after.range_finders.max()), 0.0)
     return max(after.speed_x - safe_speed(sight), 0.0)
@@ -100,9 +100,10 @@ def fault(before: CarState, after: CarState, controls: Controls) -> float:
 
 
 def closing(before: CarState, after: CarState, controls: Controls) -> float:
-    """Speed beyond that from which 10 m/s² avoid the car ahead, if that goes on as it does [m/s].
+    """Speed above that from which braking at 10 m/s² avoids the car ahead, if that keeps its speed
+    [m/s].
 
-    Cars that it would pass are not in the way. Of several in the way the worst counts.
+    Cars that would be passed do not count; of several the worst counts.
     """
     worst = 0.0
     rivals = after.race[FIRST_RIVAL:]

@@ -348,6 +348,8 @@ def test_a_command_in_the_docs_parses_and_names_what_exists(page, line, parsed, 
         case ["sudo", "apt", "install", *packages]:
             tools = {"git", "make", "g++", "python3-dev", "python3-venv"}
             assert set(packages) <= {*tools, *VIDEO_PACKAGES}
+        case ["python3", "-m", "venv", ".venv"] | ["source", ".venv/bin/activate"]:
+            pass
         case other:
             pytest.fail(f"{other} is nothing that a test knows")
 

@@ -292,6 +292,19 @@ def test_a_model_of_another_observation_layout_is_refused_with_both_named(env, t
     assert "sb3-torcs train --env TorcsLite-v0" in message
 
 
+@pytest.mark.parametrize(("kwargs", "option"), [
+    ({"action": "pedal"}, "action='pedal'"), ({"action": "manual"}, "action='manual'"),
+    ({"sensors": ("base", "line")}, "sensors=['base','line']"),
+])  # fmt: skip
+def test_a_model_without_a_record_is_told_the_option_that_it_needs(env, tmp_path, kwargs, option):
+    with gym.make("TorcsLite-v0", **kwargs) as other:
+        PPO("MlpPolicy", other, **SMALL).save(tmp_path / "m.zip")
+        with pytest.raises(ModelMismatch) as caught:
+            models.load_driver(tmp_path / "m.zip", env)
+        assert str(caught.value).endswith(f"made with {option} has them: --env-kwargs {option}")
+        models.load_driver(tmp_path / "m.zip", other)
+
+
 def test_a_model_of_stacked_frames_without_a_record_is_told_what_to_write(env, tmp_path):
     """What it sees is four times as long; with the line in config.yml, it drives."""
     stacked = VecFrameStack(DummyVecEnv([lambda: gym.make("TorcsLite-v0")]), 4)

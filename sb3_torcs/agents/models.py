@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
+from sb3_torcs.actions import ACTIONS, ActionLayout, action_layout
 from sb3_torcs.agents.ghosts import GhostDriver, check_fits, is_ghost, read_ghost
 from sb3_torcs.agents.model_algorithm import algorithm_of, check_same, is_sbx, told_algorithm
 from sb3_torcs.agents.model_file import (
@@ -32,7 +33,7 @@ from sb3_torcs.errors import (
     ModelNotTrusted,
     near_miss,
 )
-from sb3_torcs.sensors import range_finder_angles
+from sb3_torcs.sensors import View, choices_of_size, range_finder_angles
 
 if TYPE_CHECKING:
     from sb3_torcs.torcs.installation import Game
@@ -234,8 +235,9 @@ def one_of(option: str, choice: Any) -> Any:
     :raises InvalidOption: if it is a list
     """
     if isinstance(choice, list):
+        names = list(dict.fromkeys(choice))  # one may be listed twice, to be drawn more often
         raise InvalidOption(
-            f"the model was trained with {len(choice)} {option}s, {', '.join(choice)}; say which "
+            f"the model was trained with {len(names)} {option}s, {', '.join(names)}; say which "
             f"one it shall drive: --{option} {choice[0]}"
         )
     return choice
@@ -304,6 +306,9 @@ def check_spaces(
             f"--env {name}"
         )
         frames_seen = _frames_seen(has, needs) if what == "observations" else None
+        option = _option_of(has)
+        if not record.known and option is not None:
+            advice = f"an environment that is made with {option} has them: --env-kwargs {option}"
         if frames_seen is not None and not record.known:
             advice = (
                 f"if it sees {frames_seen} observations at once, write 'frame_stack: {frames_seen}'"
@@ -312,6 +317,22 @@ def check_spaces(
         raise ModelMismatch(
             f"'{model}'{hint} has {what} {_layout(has)}, but {name} has {_layout(needs)}; {advice}"
         )
+
+
+def _option_of(space: spaces.Space[Any]) -> str | None:
+    """Find the argument of an environment that gives it such observations or actions."""
+    if not isinstance(space, spaces.Box) or len(space.shape) != 1:
+        return None
+
+    def is_of(other: View | ActionLayout) -> bool:
+        bounds = np.array((other.low, other.high), np.float32)
+        return np.array_equal(bounds, np.array((space.low, space.high), np.float32))
+
+    for action in ACTIONS:
+        if is_of(action_layout(action)):
+            return f"action={action!r}"
+    views = [view for view in choices_of_size(space.shape[0]) if is_of(view)]
+    return f"sensors={list(views[0].sensors)}".replace(" ", "") if views else None
 
 
 def _frames_seen(has: spaces.Space[Any], needs: spaces.Space[Any]) -> int | None:

@@ -36,7 +36,7 @@ def add_parser(subparsers: Any) -> None:
     """
     parser = subparsers.add_parser(
         "compare",
-        help="say where one lap is faster than another, as a page to share",
+        help="compare laps on a page that shows where time is gained and lost",
         description=DESCRIPTION,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

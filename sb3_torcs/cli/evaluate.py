@@ -66,11 +66,13 @@ def add_parser(subparsers: Any) -> None:
     add = parser.add_argument
     add("model", metavar="MODEL", help=MODEL_HELP)
     add("--env", metavar="ID", help="default: that of the training, or Torcs-v0 if it runs here")
-    add("--track", metavar="T", help="default: that of the training, or aalborg")
-    add("--car", metavar="C", help=f"default: that of the training, or {DEFAULT_CAR}")
+    add("--track", metavar="T", help="default: that of the training, or aalborg; needed if the "
+        "training had several")  # fmt: skip
+    add("--car", metavar="C", help=f"default: that of the training, or {DEFAULT_CAR}; needed if "
+        "the training had several")  # fmt: skip
     add("--episodes", type=positive, default=1, metavar="N", help="default: 1")
     add("--laps", type=positive, default=3, metavar="L", help="laps per episode; default: 3")
-    add("--seed", type=seed, default=0, metavar="S", help="of the first reset; default: 0")
+    add("--seed", type=seed, default=0, metavar="S", help="seed of the first reset; default: 0")
     add("--action-repeat", type=positive, metavar="N", help="control ticks of 0.02 s per timestep")
     add("--range-finders", metavar="SET", help="scr or narrow")
     add(

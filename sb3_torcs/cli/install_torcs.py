@@ -42,7 +42,7 @@ def add_parser(subparsers: Any) -> None:
         action="store_true",
         help="only check; the exit status is 1 if it is not installed",
     )
-    add("--user", action="store_true", help="unpack it for this user, also as root")
+    add("--user", action="store_true", help="unpack it for this user, even when run as root")
     add(
         "--video",
         action="store_true",

@@ -31,12 +31,12 @@ INTERRUPTED = 130
 HEADERS = ("lap", "time s")
 
 DESCRIPTION = """\
-Search the fastest three laps of a track from the grid, in the game, and write them to a file: a
+Search for the fastest three laps of a track from the grid, in the game, and write them to a file: a
 ghost. A ghost drives as any driver does: `sb3-torcs watch GHOST`, `sb3-torcs evaluate GHOST`.
 
 The search begins with the fastest of these drives: the agent's, and those of the robots that have
 the same car. It drives the race again and again. On the way it restores the engine's snapshots to
-try some ten ways on, a few seconds far, and takes the best.
+try some ten ways to go on, each a few seconds long, and takes the best.
 
 It uses all cores. With --rollouts the same seed finds the same ghost; what is found in --seconds
 depends on the machine, and is another ghost each time. Ctrl-C keeps what was found.
@@ -49,7 +49,7 @@ def add_parser(subparsers: Any) -> None:
     """
     parser = subparsers.add_parser(
         "optimize-lap",
-        help="search a faster lap around an agent's drive",
+        help="search for a faster lap, beginning with an agent's drive",
         description=DESCRIPTION,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -59,8 +59,13 @@ def add_parser(subparsers: Any) -> None:
     add("--car", metavar="C", help="default: that of the training, or car1-trb1")
     add("--seconds", type=positive, metavar="S",
         help=f"how long to search; default: {SECONDS}, or no limit with --rollouts")  # fmt: skip
-    add("--rollouts", type=positive, metavar="N", help="end after so many tries")
-    add("--seed", type=seed, default=0, metavar="S", help="of all random numbers; default: 0")
+    add(
+        "--rollouts",
+        type=positive,
+        metavar="N",
+        help="end the search after N tries; a ghost takes some 10,000",
+    )
+    add("--seed", type=seed, default=0, metavar="S", help="seed of the search; default: 0")
     add("--action-repeat", type=positive, metavar="N",
         help="control ticks of 0.02 s per timestep; default: that of the training")  # fmt: skip
     add("--alone", action="store_true", help="begin with the agent's drive, not with a robot's")

@@ -75,7 +75,7 @@ def add_parser(subparsers: Any) -> None:
     add("--races", type=positive, default=20, metavar="N", help="races to hold; default: 20")
     add("--grid", choices=GRIDS, default="last", help="who starts where; default: last")
     add("--field", type=positive, metavar="N", help="cars in a race; default: all drivers")
-    add("--seed", type=seed, default=0, metavar="S", help="of the first race; default: 0")
+    add("--seed", type=seed, default=0, metavar="S", help="seed of the first race; default: 0")
     add("--video", metavar="FILE.mp4",
         help="video of the first race; the camera follows its best agent")  # fmt: skip
     add("--view", choices=VIEWS, metavar="V",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import shlex
+import sys
 from typing import Any
 
 from sb3_torcs.cli.common import positive, seed
@@ -37,11 +38,12 @@ def add_parser(subparsers: Any) -> None:
     add = parser.add_argument
     add(
         "--algo",
-        help="ddpg (default), td3, sac, ppo, or any of the zoo; with SBX also sbx_sac, sbx_tqc, "
-        "sbx_crossq",
+        help="ddpg (default), td3, sac, tqc, crossq or ppo; with SBX also sbx_sac, sbx_tqc, "
+        "sbx_crossq; others of the zoo with a --conf-file",
     )
-    add("--env", metavar="ID", help="default: TorcsLite-v0")
-    add("--entry", metavar="NAME", help='entry of the file, e.g. "as the post"; default: the id')
+    add("--env", metavar="ID", help="Torcs-v0, or by default TorcsLite-v0")
+    add("--entry", metavar="NAME", help='block of the hyperparameter file, e.g. "as the post"; '
+        "default: the one called as --env")  # fmt: skip
     add("--conf-file", metavar="FILE", help="hyperparameter file; default: the shipped one")
     add("--track", metavar="T", help="track; default: the entry's; `sb3-torcs tracks` lists them")
     add(
@@ -57,14 +59,14 @@ def add_parser(subparsers: Any) -> None:
         "--eval-freq",
         type=int,
         metavar="N",
-        help="timesteps between evaluations; default: a fortieth of the training",
+        help="timesteps between evaluations; default: one fortieth of --timesteps",
     )
     add(
         "--eval-episodes",
         type=positive,
         default=1,
         metavar="N",
-        help="per evaluation; default: 1",
+        help="episodes per evaluation; default: 1",
     )
     add(
         "--resume",
@@ -79,7 +81,7 @@ def add_parser(subparsers: Any) -> None:
         "hyperparameter file: only if you trust their author",
     )
     add("--progress", action=argparse.BooleanOptionalAction, default=True, help="progress bar")
-    add("--pictures", metavar="DIR", help="keep pictures of the lines it learns, one a minute")
+    add("--pictures", metavar="DIR", help="draw the line of an evaluation lap about once a minute")
     parser.set_defaults(run=run)
 
 
@@ -92,6 +94,11 @@ def run(args: argparse.Namespace) -> int:
     values = {name: getattr(args, name) for name in names}
     values.update(_trained_before(args), zoo_args=tuple(args.zoo_args))
     options = TrainOptions(**values)
+    if args.entry is not None and args.env is None and args.resume is None:
+        print(
+            f"learning in {options.env}, where no game is needed; --env Torcs-v0 is the game itself",
+            file=sys.stderr,
+        )
     result = train_run(options)
     print("\n".join(_closing_words(options, result)))
     return 130 if result.interrupted else 0
