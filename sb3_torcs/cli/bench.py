@@ -65,7 +65,7 @@ def add_parser(subparsers: Any) -> None:
         type=float,
         default=30.0,
         metavar="S",
-        help="how long it may take, about; default: 30",
+        help="how long, about; default: 30",
     )
     parser.set_defaults(run=run)
 

@@ -96,7 +96,7 @@ def run(args: argparse.Namespace) -> int:
     options = TrainOptions(**values)
     if args.entry is not None and args.env is None and args.resume is None:
         print(
-            f"learning in {options.env}, where no game is needed; --env Torcs-v0 is the game itself",
+            f"learning in {options.env}, which needs no game; --env Torcs-v0 is the game itself",
             file=sys.stderr,
         )
     result = train_run(options)
