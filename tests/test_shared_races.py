@@ -401,6 +401,8 @@ class TestVectorEnvironment:
         assert np.array_equal(observations, on_grid)
 
     def test_a_time_limit_ends_an_episode_like_any_other(self, make):
+        usual = make(1, 2, max_episode_steps=None)  # of Torcs-v0, as in gym.make
+        assert usual.get_attr("_max_episode_steps") == [3000, 3000]
         envs = make(1, 2, max_episode_steps=7)
         envs.reset()
         for step in range(1, 15):

@@ -9,15 +9,36 @@ from typing import Any
 import gymnasium as gym
 from gymnasium.wrappers import TimeLimit
 
+from sb3_torcs.car import is_count
 from sb3_torcs.envs.racing import RacingEnv
 from sb3_torcs.envs.torcs_race import make_race
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.starting_list import guests_of
 
-__all__ = ["EnvMaker", "env_makers"]
+__all__ = ["NO_LIMIT", "EnvMaker", "checked_time_limit", "env_makers"]
 
 EnvMaker = Callable[[], gym.Env[Any, Any]]
+
+NO_LIMIT = -1  # as in gym.make
+
+
+def checked_time_limit(steps: Any, env_id: str) -> int:
+    """
+    Check the option ``max_episode_steps`` as ``gym.make`` means it.
+
+    :param steps: timesteps; ``None`` is the limit that the environment is registered with, -1 none
+    :param env_id: of the environment
+    :return: timesteps, or ``NO_LIMIT``
+    :raises InvalidOption: if it is no such number
+    """
+    if steps is None:
+        return gym.spec(env_id).max_episode_steps or NO_LIMIT
+    if not is_count(steps) and steps != NO_LIMIT:
+        raise InvalidOption(
+            f"max_episode_steps is {steps!r}; expected a whole number >= 1, or -1 for no limit"
+        )
+    return int(steps)
 
 
 def env_makers(races: int, agents: int, env_id: str, env_kwargs: dict[str, Any]) -> list[EnvMaker]:
@@ -32,7 +53,7 @@ def env_makers(races: int, agents: int, env_id: str, env_kwargs: dict[str, Any])
     """
     if agents > 1 or _has_guests(env_id, env_kwargs):
         return _shared(races, agents, env_id, env_kwargs)
-    limits = _limits(env_kwargs.get("max_episode_steps"), races)
+    limits = _limits(env_kwargs.get("max_episode_steps"), env_id, races)
     kwargs = [{**env_kwargs, "max_episode_steps": limit} for limit in limits]
     return [partial(gym.make, env_id, **each) for each in kwargs]
 
@@ -53,19 +74,19 @@ def _shared(races: int, agents: int, env_id: str, env_kwargs: dict[str, Any]) ->
             f"agents is {agents}, and {env_id} has one car in each race; races are of Torcs-v0"
         )
     options = dict(env_kwargs)
-    steps = options.pop("max_episode_steps", gym.spec(env_id).max_episode_steps)
-    limits = _limits(steps, races)
+    limits = _limits(options.pop("max_episode_steps", None), env_id, races)
     envs = [(env, limit) for limit in limits for env in make_race(agents, **options)]
     return [partial(_limited, env, limit) for env, limit in envs]
 
 
-def _limits(steps: Any, races: int) -> list[Any]:
+def _limits(steps: Any, env_id: str, races: int) -> list[int]:
     """Return the time limit of each race."""
     several = steps if isinstance(steps, (list, tuple)) else [steps]
     if not several:
         raise InvalidOption("max_episode_steps is an empty list; give a number, or some of them")
-    return [several[race % len(several)] for race in range(races)]
+    limits = [checked_time_limit(each, env_id) for each in several]
+    return [limits[race % len(limits)] for race in range(races)]
 
 
-def _limited(env: RacingEnv, steps: int | None) -> gym.Env[Any, Any]:
-    return env if steps in (None, -1) else TimeLimit(env, steps)
+def _limited(env: RacingEnv, steps: int) -> gym.Env[Any, Any]:
+    return env if steps == NO_LIMIT else TimeLimit(env, steps)

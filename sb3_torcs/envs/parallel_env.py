@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from functools import partial
 from typing import Any
@@ -11,7 +12,8 @@ import numpy.typing as npt
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
-from sb3_torcs.car import CarState, is_count
+from sb3_torcs.car import CarState
+from sb3_torcs.envs.making import NO_LIMIT, checked_time_limit
 from sb3_torcs.envs.starts import RESET_OPTIONS, read_start
 from sb3_torcs.envs.torcs_race import RaceCarEnv, make_race
 from sb3_torcs.errors import EnvClosed, InvalidAction, InvalidOption
@@ -35,7 +37,7 @@ class TorcsParallelEnv(ParallelEnv[str, Observation, Action]):
     ``gap_ahead`` and ``gap_behind`` [m], ``contacts`` with other cars, and those by own ``faults``.
 
     :param agents: their number
-    :param max_episode_steps: timesteps after which all are truncated; ``None`` is never
+    :param max_episode_steps: timesteps after which all are truncated; ``None`` or -1 is never
     :param options: of :func:`~sb3_torcs.envs.torcs_race.make_race`
     :raises InvalidOption: if an option has a value that is not allowed
     """
@@ -50,10 +52,9 @@ class TorcsParallelEnv(ParallelEnv[str, Observation, Action]):
     def __init__(
         self, agents: int = 2, *, max_episode_steps: int | None = MAX_STEPS, **options: Any
     ) -> None:
-        if max_episode_steps is not None and not is_count(max_episode_steps):
-            raise InvalidOption(
-                f"max_episode_steps is {max_episode_steps!r}; expected a whole number >= 1, or None"
-            )
+        limit = checked_time_limit(
+            NO_LIMIT if max_episode_steps is None else max_episode_steps, "Torcs-v0"
+        )
         if options.pop("render_mode", None) is not None:
             raise InvalidOption(
                 "render_mode is for Torcs-v0; `sb3-torcs race --video FILE.mp4` shows a race of "
@@ -65,7 +66,7 @@ class TorcsParallelEnv(ParallelEnv[str, Observation, Action]):
         self.agents: list[str] = []
         self._envs = dict(zip(self.possible_agents, envs, strict=True))
         self._race = envs[0].seat.race
-        self._limit = max_episode_steps
+        self._limit = math.inf if limit == NO_LIMIT else limit
         self._steps = 0
         self._closed = False
         self.observation_spaces: dict[str, spaces.Space[Any]] = {
@@ -132,7 +133,7 @@ class TorcsParallelEnv(ParallelEnv[str, Observation, Action]):
         self._hold(racing, actions)
         failure = self._drive(next(iter(racing.values())))
         self._steps += 1
-        late = self._limit is not None and self._steps >= self._limit
+        late = self._steps >= self._limit
         answers: tuple[dict[str, Any], ...] = ({}, {}, {}, {}, {})
         for name, env in racing.items():
             seen, reward, terminated, truncated, info = env.finish_step(partial(_car, env, failure))

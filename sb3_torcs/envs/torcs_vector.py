@@ -9,7 +9,6 @@ from contextlib import suppress
 from functools import partial
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 from gymnasium.error import ResetNeeded
@@ -19,6 +18,7 @@ from sb3_torcs.backends.native import Fleet
 from sb3_torcs.backends.several import present_world, shared_worlds
 from sb3_torcs.car import CarState, is_count
 from sb3_torcs.envs.conditions import Part
+from sb3_torcs.envs.making import NO_LIMIT, checked_time_limit
 from sb3_torcs.envs.racing import Observation
 from sb3_torcs.envs.torcs import TorcsEnv
 from sb3_torcs.errors import CarLost, EnvClosed, InvalidAction, InvalidOption
@@ -26,8 +26,6 @@ from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.starting_list import guests_of
 
 __all__ = ["TorcsVectorEnv"]
-
-NO_LIMIT = -1  # as in gym.make
 
 Answer = tuple[Observation, float, bool, bool, dict[str, Any]]
 Answers = tuple[
@@ -81,12 +79,7 @@ class TorcsVectorEnv(SyncVectorEnv):
                 f"opponents is {opponents!r}, with agents among them; such races drive by "
                 "sb3_torcs.vec_env.TorcsVecEnv, or gym.make_vec(..., vectorization_mode='async')"
             )
-        registered = gym.spec("Torcs-v0").max_episode_steps or NO_LIMIT
-        limit = registered if max_episode_steps is None else max_episode_steps
-        if not is_count(limit) and limit != NO_LIMIT:
-            raise InvalidOption(
-                f"max_episode_steps is {limit!r}; expected a whole number >= 1, or -1 for no limit"
-            )
+        limit = checked_time_limit(max_episode_steps, "Torcs-v0")
         timesteps = math.inf if limit == NO_LIMIT else limit
         self.envs: list[_Race]  # type: ignore[assignment]  # a list of Env, says Gymnasium
         self._env_obs: list[Observation | None]  # type: ignore[assignment]  # of None, says Gymnasium
