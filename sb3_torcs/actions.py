@@ -17,7 +17,6 @@ __all__ = [
     "ACTIONS",
     "ACTION_HIGH",
     "ACTION_LOW",
-    "ACTUATORS",
     "GEARBOXES",
     "GEARS",
     "PEDALS",
@@ -121,7 +120,7 @@ PEDALS = ActionLayout(
 )
 """The layout of the original post."""
 
-ACTUATORS, ACTION_LOW, ACTION_HIGH = PEDALS[:3]
+_, ACTION_LOW, ACTION_HIGH = PEDALS[:3]
 
 _PEDAL = ActionLayout(("steering", "pedal"), (-1.0, -1.0), (1.0, 1.0), _read_pedal)
 _MANUAL = ("steering", "throttle", "brake", "gear", "clutch")

@@ -22,8 +22,10 @@ from sb3_torcs.errors import ModelMismatch
 from sb3_torcs.files import read_yaml
 
 __all__ = [
+    "BEST_MODEL",
     "DRIVEN_WITH",
     "RECORD",
+    "STATISTICS",
     "VERSION",
     "Statistics",
     "TrainingRecord",
@@ -41,7 +43,8 @@ RECORD = "sb3_torcs"
 
 VERSION = 1
 
-CHECKPOINT = "rl_model_"  # as the zoo calls them
+BEST_MODEL, STATISTICS, CHECKPOINT = "best_model.zip", "vecnormalize.pkl", "rl_model_"
+"""Files of a run, as the zoo calls them; a checkpoint's name only begins so."""
 
 
 @dataclass(frozen=True)
@@ -188,7 +191,7 @@ def record_beside(model: Path) -> TrainingRecord | None:
     own = _record(model.parent)
     if own is not None:
         return own
-    ours = model.name == "best_model.zip" or model.name.startswith(CHECKPOINT)
+    ours = model.name == BEST_MODEL or model.name.startswith(CHECKPOINT)
     below = [path for path in model.parent.iterdir() if (path / "args.yml").is_file()]
     runs = [path for path in below if ours or path.name == model.stem]
     records = [(path, _record(path)) for path in runs]
@@ -203,7 +206,7 @@ def record_beside(model: Path) -> TrainingRecord | None:
 def _record(folder: Path) -> TrainingRecord | None:
     """Read the zoo's files in a folder."""
     arguments, config = folder / "args.yml", folder / "config.yml"
-    statistics = folder / "vecnormalize.pkl"
+    statistics = folder / STATISTICS
     if not any(file.is_file() for file in (arguments, config, statistics)):
         return None
     return TrainingRecord(

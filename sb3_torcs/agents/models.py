@@ -24,7 +24,7 @@ from sb3_torcs.agents.model_file import (
     saved_weights,
 )
 from sb3_torcs.agents.model_policy import Spaces, build_policy, readable_policy, readable_space
-from sb3_torcs.agents.model_record import TrainingRecord, record_beside, record_within
+from sb3_torcs.agents.model_record import BEST_MODEL, TrainingRecord, record_beside, record_within
 from sb3_torcs.agents.scripted import SCRIPTED, ScriptedDriver
 from sb3_torcs.agents.wrapping import frames_of, normalizes, stacked_space, unrebuilt
 from sb3_torcs.errors import (
@@ -54,7 +54,6 @@ __all__ = [
     "training_record",
 ]
 
-BEST_MODEL = "best_model.zip"
 AGENTS = Path(__file__).parent
 
 UNTRUSTED = (

@@ -29,6 +29,7 @@ from sb3_torcs.cli import (
     train,
     watch,
 )
+from sb3_torcs.cli.common import INTERRUPTED
 from sb3_torcs.cli.parser import Parser
 from sb3_torcs.cli.plain import any_terminal
 from sb3_torcs.errors import Sb3TorcsError
@@ -37,7 +38,6 @@ from sb3_torcs.signals import answered
 __all__ = ["main"]
 
 USAGE_ERROR = 2
-INTERRUPTED = 130
 READER_LEFT = 141
 VERBS = (
     doctor, install_torcs, tracks, train, evaluate, compare, watch, optimize_lap, study, report,

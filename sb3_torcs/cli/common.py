@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from sb3_torcs.torcs.installation import Game
 
 __all__ = [
+    "INTERRUPTED",
     "MODEL_HELP",
     "TRUST_HELP",
     "natural",
@@ -26,6 +27,9 @@ __all__ = [
     "table",
     "told_record",
 ]
+
+INTERRUPTED = 130
+"""The exit status after Ctrl-C, as shells have it."""
 
 MODEL_HELP = "a saved .zip, a run's folder, a shipped agent, a ghost, or 'scripted'"
 

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from sb3_torcs.cli.common import (
+    INTERRUPTED,
     MODEL_HELP,
     TRUST_HELP,
     positive,
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
 __all__ = ["add_parser", "run"]
 
 SECONDS = 300
-INTERRUPTED = 130
 HEADERS = ("lap", "time s")
 
 DESCRIPTION = """\

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sb3_torcs.cli.common import positive, print_json, quiet_output
+from sb3_torcs.cli.common import INTERRUPTED, positive, print_json, quiet_output
 from sb3_torcs.files import writable_folder
 
 if TYPE_CHECKING:
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Board", "add_parser", "run"]
 
-INTERRUPTED = 130
 REFRESHES = 2  # [1/s] of the table
 COLUMNS = ("variant", "seed", "timesteps", "laps", "best lap s", "completes", "state")
 

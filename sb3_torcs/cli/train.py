@@ -8,7 +8,7 @@ import shlex
 import sys
 from typing import Any
 
-from sb3_torcs.cli.common import positive, seed
+from sb3_torcs.cli.common import INTERRUPTED, positive, seed
 from sb3_torcs.training.run import Run, TrainOptions, going_on, train_run
 
 __all__ = ["add_parser", "run"]
@@ -101,7 +101,7 @@ def run(args: argparse.Namespace) -> int:
         )
     result = train_run(options)
     print("\n".join(_closing_words(options, result)))
-    return 130 if result.interrupted else 0
+    return INTERRUPTED if result.interrupted else 0
 
 
 def _trained_before(args: argparse.Namespace) -> dict[str, str]:

@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from sb3_torcs.agents.model_record import BEST_MODEL
 from sb3_torcs.errors import OutputNotWritable, RayUnavailable, StudyError
 from sb3_torcs.signals import answered, handlers_kept
 from sb3_torcs.studies.config import Study, Trial
@@ -77,7 +78,7 @@ def run_trial(trial: Trial, store: Any, report: Callable[[dict[str, Any]], None]
     chosen = [row for row in store.rows(trial) if row["phase"] == "train" and row["kept"]][-1]
     with _unpacked(files) as folder:
         assert folder is not None
-        model = folder / "best_model.zip"
+        model = folder / BEST_MODEL
         for track in missing:
             row = final_row(trial, model, track, chosen)
             store.put_finals(trial, [row])

@@ -26,7 +26,7 @@ from typing import Any
 
 import yaml
 
-from sb3_torcs.agents.models import BEST_MODEL
+from sb3_torcs.agents.model_record import BEST_MODEL, STATISTICS
 from sb3_torcs.errors import OutputNotWritable, StudyError
 from sb3_torcs.files import read_yaml
 from sb3_torcs.studies.config import FIELDS, Study, Trial, track_name
@@ -39,7 +39,7 @@ Files = dict[str, bytes]
 RESULTS = "results.csv"
 RECIPE, ROWS, LOCK = "recipe.yml", "rows.json", ".lock"
 CHECKPOINT = "checkpoint-"
-FOR_DRIVERS = (BEST_MODEL, "vecnormalize.pkl", "config.yml", "args.yml")
+FOR_DRIVERS = (BEST_MODEL, STATISTICS, "config.yml", "args.yml")
 
 
 class StudyFolder:

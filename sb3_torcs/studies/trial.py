@@ -21,8 +21,9 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_torcs.agents.model_record import BEST_MODEL, STATISTICS
 from sb3_torcs.agents.model_writing import recipe, write_record
-from sb3_torcs.agents.models import BEST_MODEL, ModelDriver, load_driver
+from sb3_torcs.agents.models import ModelDriver, load_driver
 from sb3_torcs.agents.wrapping import frames_of
 from sb3_torcs.car import DEFAULT_CAR
 from sb3_torcs.errors import StudyError
@@ -36,7 +37,7 @@ __all__ = ["Row", "Training", "final_row"]
 Row = dict[str, Any]
 
 LAST_MODEL, REPLAY, STATE = "last_model.zip", "replay.npz", "state.json"
-STATISTICS, BEST_STATISTICS = "statistics.pkl", "vecnormalize.pkl"
+LAST_STATISTICS = "statistics.pkl"
 
 
 class Training:
@@ -156,7 +157,7 @@ class Training:
             arrays: dict[str, Any] = dict(_buffer_arrays(self.model.replay_buffer))
             np.savez(folder / REPLAY, **arrays)
         if self.normalizer is not None:
-            self.normalizer.save(str(folder / STATISTICS))
+            self.normalizer.save(str(folder / LAST_STATISTICS))
         for name, content in {**self._best_files, **self._records}.items():
             (folder / name).write_bytes(content)
         state = {
@@ -176,8 +177,8 @@ class Training:
 
     def _load(self, folder: Path) -> None:
         env = self.model.get_env()
-        if (folder / STATISTICS).is_file():
-            env = _with_statistics(env, folder / STATISTICS)
+        if (folder / LAST_STATISTICS).is_file():
+            env = _with_statistics(env, folder / LAST_STATISTICS)
         self.model = type(self.model).load(folder / LAST_MODEL, env=env, device="cpu")
         if (folder / REPLAY).is_file():
             with np.load(folder / REPLAY) as arrays:
@@ -187,7 +188,7 @@ class Training:
         self._best, self._spent = Merit(*state["best"]), np.array(state["spent"])
         for car, mishaps in enumerate(state["mishaps"]):
             env.env_method("set_mishaps", mishaps, indices=car)
-        names = (BEST_MODEL, BEST_STATISTICS)
+        names = (BEST_MODEL, STATISTICS)
         self._best_files = {n: (folder / n).read_bytes() for n in names if (folder / n).is_file()}
 
     def _race(self, track: str) -> Episode:
@@ -212,7 +213,7 @@ class Training:
         if self.normalizer is not None:
             with tempfile.NamedTemporaryFile() as file:
                 self.normalizer.save(file.name)
-                files[BEST_STATISTICS] = Path(file.name).read_bytes()
+                files[STATISTICS] = Path(file.name).read_bytes()
         return files
 
 

@@ -14,15 +14,16 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_torcs.agents.model_record import STATISTICS
 from sb3_torcs.car import is_count
 from sb3_torcs.errors import InvalidOption, TrainingDiverged
 
-__all__ = ["REPLAY_BUFFER", "SAVING", "STATISTICS", "KeepCallback", "WholeFiles"]
+__all__ = ["REPLAY_BUFFER", "SAVING", "KeepCallback", "WholeFiles"]
 
 SAVING = "saving what was learned; Ctrl-C once more drops it\n"
 
 UNFINISHED = ".unfinished"
-REPLAY_BUFFER, STATISTICS = "replay_buffer.pkl", "vecnormalize.pkl"
+REPLAY_BUFFER = "replay_buffer.pkl"
 
 
 class WholeFiles:
