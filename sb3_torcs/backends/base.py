@@ -12,24 +12,41 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from sb3_torcs.actions import GEARS
 from sb3_torcs.car import CarState, Controls, FloatArray, Start
 from sb3_torcs.tracks.track import Track
 
-__all__ = ["Backend", "Fleet"]
+__all__ = ["OPTIONAL", "Backend", "Fleet", "optional"]
+
+OPTIONAL: dict[str, Any] = {
+    "gears": GEARS,  # forward ones of the car
+    "profile": None,  # the road's :class:`~sb3_torcs.tracks.profile.RoadProfile`, if it has hills
+    "facts": None,  # :class:`~sb3_torcs.torcs.car_file.CarFacts` of the present episode's car
+    "tells_race": False,  # whether it fills ``CarState.race``
+    "shares_race": False,  # whether the cars of other agents move whenever this one does
+    "conditions": (),  # names of those that ``set_conditions(grip, mass)`` changes
+    "draw_track": None,  # a method, of a world that has several; see :class:`Backend`
+}
+"""What a world may have besides, and what holds for one that has it not."""
+
+
+def optional(world: Any, name: str) -> Any:
+    """
+    Return what a world may have, or what holds for one that has it not.
+
+    :param world: a backend
+    :param name: of :data:`OPTIONAL`
+    """
+    return getattr(world, name, OPTIONAL[name])
 
 
 class Backend(Protocol):
     """
     One car in one world.
 
-    A world that has several tracks has a method ``draw_track(rng)``, which the environment calls
-    before it draws a start on that track. One whose car has more or fewer than six forward gears
-    has an attribute ``gears``. One whose road has hills has an attribute ``profile``, a
-    :class:`~sb3_torcs.tracks.profile.RoadProfile`. One that can drive under other conditions has a
-    method ``set_conditions(grip, mass)``, factors that hold from the next reset on, and in
-    ``conditions`` the names of those that it can change. One that fills ``CarState.race`` has an
-    attribute ``tells_race``, which is true. One that knows its car's file has an attribute
-    ``facts``, a :class:`~sb3_torcs.torcs.car_file.CarFacts` of the present episode's car.
+    A world may have more, :data:`OPTIONAL`. The environment calls ``draw_track(rng)`` of a world
+    that has several tracks before it draws a start on one. ``set_conditions(grip, mass)`` sets
+    factors that hold from the next reset on.
     """
 
     @property

@@ -13,8 +13,7 @@ from typing import Any, Generic, Protocol, TypeGuard, TypeVar
 
 import numpy as np
 
-from sb3_torcs.actions import GEARS
-from sb3_torcs.backends.base import Backend
+from sb3_torcs.backends.base import Backend, optional
 from sb3_torcs.car import CarState, Controls, Start
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.torcs.car_file import CarFacts
@@ -237,12 +236,12 @@ class Drawn(ABC):
     @property
     def profile(self) -> RoadProfile | None:
         """The road of the present episode, if it has hills."""
-        return getattr(self.world, "profile", None)
+        return optional(self.world, "profile")
 
     @property
     def facts(self) -> CarFacts | None:
         """What the file of the present episode's car says, if its world knows."""
-        return getattr(self.world, "facts", None)
+        return optional(self.world, "facts")
 
 
 class SeveralWorlds(Drawn):
@@ -254,10 +253,10 @@ class SeveralWorlds(Drawn):
 
     def __init__(self, pool: WorldPool[Backend]) -> None:
         self._turn = Turn(pool)
-        self.gears: int = min(getattr(world, "gears", GEARS) for world in pool.examples)
+        self.gears: int = min(optional(world, "gears") for world in pool.examples)
         self.range_finder_angles = self.world.range_finder_angles
-        self.tells_race = all(getattr(world, "tells_race", False) for world in pool.examples)
-        self.conditions: Sequence[str] = getattr(self.world, "conditions", ())
+        self.tells_race = all(optional(world, "tells_race") for world in pool.examples)
+        self.conditions: Sequence[str] = optional(self.world, "conditions")
 
     @property
     def world(self) -> Any:
@@ -268,7 +267,7 @@ class SeveralWorlds(Drawn):
         """Choose the next episode's world; see :class:`~sb3_torcs.backends.base.Backend`."""
         if self._turn.draw(rng) and self.conditions:
             self.set_conditions(1.0, 1.0)  # whatever another environment has set
-        draw_within = getattr(self.world, "draw_track", None)  # of a world of random tracks
+        draw_within = optional(self.world, "draw_track")  # of a world of random tracks
         if draw_within is not None:
             draw_within(rng)
 

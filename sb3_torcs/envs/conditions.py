@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from sb3_torcs.backends.base import optional
 from sb3_torcs.car import Controls, checked_delay, checked_factor
 from sb3_torcs.errors import InvalidOption
 
@@ -89,13 +90,13 @@ class Conditions:
         :param world: a backend
         :raises InvalidOption: if it cannot
         """
-        if self._delays != (0.0, 0.0) and getattr(world, "shares_race", False):
+        if self._delays != (0.0, 0.0) and optional(world, "shares_race"):
             raise InvalidOption(
                 f"delay is {self.choice['delay']!r}, and the cars of one race move at once; leave "
                 "it out, or drive each agent in a race of its own"
             )
         for name in self._changed:
-            if name not in getattr(world, "conditions", ()):
+            if name not in optional(world, "conditions"):
                 raise InvalidOption(
                     f"{name} is {tuple(self._factors[name])!r}, which this world cannot change; "
                     "leave it out, or use backend 'native' of Torcs-v0, with no agents as opponents"

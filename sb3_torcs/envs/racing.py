@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from sb3_torcs.actions import GEARS, ActionName, action_layout, controls_from_action
-from sb3_torcs.backends.base import Backend
+from sb3_torcs.actions import ActionName, action_layout, controls_from_action
+from sb3_torcs.backends.base import Backend, optional
 from sb3_torcs.car import (
     CONTROL_TICK,
     MAX_DAMAGE,
@@ -133,13 +133,13 @@ def _check_tells(world: Backend, view: View, keep_distance: bool) -> None:
     """Refuse what needs a race, or a car's file, in a world that does not know of it."""
     lacking = sorted(NEEDS_RACE.intersection(view.sensors))
     lacking += ["keep_distance"] if keep_distance else []
-    if lacking and not getattr(world, "tells_race", False):
+    if lacking and not optional(world, "tells_race"):
         raise InvalidOption(
             "without a race, of which this world does not tell, there is no "
             f"{' and no '.join(map(repr, lacking))}; leave that out, or use backend 'native' of "
             "Torcs-v0"
         )
-    if NEEDS_CAR.intersection(view.sensors) and getattr(world, "facts", None) is None:
+    if NEEDS_CAR.intersection(view.sensors) and optional(world, "facts") is None:
         raise InvalidOption(
             "sensors 'car' are of the car's file in the game, which this world does not read; "
             "leave them out, or use backend 'native' of Torcs-v0"
@@ -202,7 +202,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
             modes = ", ".join(repr(mode) for mode in self.metadata["render_modes"])
             raise InvalidOption(f"render_mode is {render_mode!r}; expected None or one of {modes}")
         self.backend = backend
-        self._draw_track = getattr(backend, "draw_track", None)
+        self._draw_track = optional(backend, "draw_track")
         self.action_repeat = int(action_repeat)
         self.laps = checked_laps(laps)
         self.runoff = checked_runoff(runoff)
@@ -217,7 +217,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         _check_tells(backend, self.view, keep_distance)
         self.observation_space = spaces.Box(self.view.low, self.view.high, dtype=np.float32)
         self.action = action
-        self.layout = action_layout(action, getattr(backend, "gears", GEARS))
+        self.layout = action_layout(action, optional(backend, "gears"))
         self.action_space = spaces.Box(
             np.array(self.layout.low, np.float32), np.array(self.layout.high, np.float32)
         )
