@@ -13,7 +13,6 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
-from sb3_torcs.agents.model_record import BEST_MODEL
 from sb3_torcs.car import is_count
 from sb3_torcs.errors import InvalidOption, OutputNotWritable, TrainingDiverged, WorkerLost
 from sb3_torcs.files import listed, writable_folder
@@ -92,6 +91,8 @@ class Run:
     @property
     def best_model(self) -> Path | None:
         """The best model by evaluation, or the last one if there was no evaluation yet."""
+        from sb3_torcs.agents.model_record import BEST_MODEL
+
         best = self.folder / BEST_MODEL
         return best if best.is_file() else self.last_model
 
