@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
+import shutil
 from pathlib import Path
 
+import gymnasium as gym
 import pytest
 from fake_game import write_game
 
+from sb3_torcs.agents.model_writing import recipe
 from sb3_torcs.errors import InvalidOption, TrackNotFound
 from sb3_torcs.torcs.installation import find_game
-from sb3_torcs.torcs.track_names import BUNDLED_FOLDER, TrackFile, find_track, known_tracks
+from sb3_torcs.torcs.track_names import (
+    BUNDLED_FOLDER,
+    TrackFile,
+    find_track,
+    known_tracks,
+    lasting_track,
+)
 
 
 @pytest.fixture
@@ -42,7 +53,7 @@ def test_our_own_files_are_not_for_the_game(fake, tmp_path):
     path = tmp_path / "mine.csv"
     path.touch()
     assert find_track(path).source == "file"
-    with pytest.raises(TrackNotFound, match=r"no track '.*mine\.csv'.*TORCS's \.xml files$"):
+    with pytest.raises(TrackNotFound, match=r"mine\.csv' is a file for TorcsLite-v0; .*xml files$"):
         find_track(path, fake)
 
 
@@ -58,3 +69,20 @@ def test_what_is_no_file_is_told(fake, track):
         find_track(track)
     with pytest.raises(InvalidOption, match="Torcs-v0 takes the name of an installed track"):
         find_track(track, fake)
+
+
+def test_a_path_means_the_same_in_another_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(BUNDLED_FOLDER / "road" / "aalborg.csv", "mine.csv")
+    env = gym.make("TorcsLite-v0", track=["mine.csv", "aalborg"])
+    env.reset(seed=0)
+    monkeypatch.chdir("/")
+    copy.deepcopy(env).reset(seed=0)
+    pickle.loads(pickle.dumps(env)).reset(seed=0)
+    assert lasting_track(["~/a.xml", "aalborg"]) == [str(Path("~/a.xml").expanduser()), "aalborg"]
+
+
+def test_a_record_names_the_whole_path_of_a_track(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    asked = {"env_kwargs": {"track": "mine.xml"}}
+    assert recipe("ppo", "Torcs-v0", asked)["env_kwargs"] == {"track": str(tmp_path / "mine.xml")}

@@ -26,7 +26,7 @@ from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.process import GameProcess, compiled_library
 from sb3_torcs.torcs.race_setup import SCR_SERVER, RaceSetup
 from sb3_torcs.torcs.starting_list import AGENT, starting_list
-from sb3_torcs.torcs.track_names import find_track
+from sb3_torcs.torcs.track_names import find_track, lasting_track
 from sb3_torcs.tracks.catalogue import load_track
 from sb3_torcs.tracks.profile import RoadProfile, game_profile
 from sb3_torcs.tracks.track import Track
@@ -80,7 +80,7 @@ class ScrBackend:
         gearbox: str = "automatic",
     ) -> None:
         self._settings: dict[str, Any] = {
-            "track": track,
+            "track": lasting_track(track),
             "car": car,
             "range_finders": range_finders,
             "opponents": opponents,

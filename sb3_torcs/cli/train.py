@@ -59,7 +59,7 @@ def add_parser(subparsers: Any) -> None:
         "--eval-freq",
         type=int,
         metavar="N",
-        help="timesteps between evaluations; default: one fortieth of --timesteps",
+        help="timesteps between evaluations, 0 for none; default: one fortieth of --timesteps",
     )
     add(
         "--eval-episodes",
@@ -71,8 +71,9 @@ def add_parser(subparsers: Any) -> None:
     add(
         "--resume",
         metavar="MODEL",
-        help="continue from a saved model (.zip) or a run's folder, with its --algo and --env; "
-        "runs code that is pickled in model and replay buffer: only if you trust their author",
+        help="continue from a saved model (.zip) or a run's folder, with its own hyperparameters, "
+        "track and timesteps that are left, unless you give others; runs code that is pickled in "
+        "model and replay buffer: only if you trust their author",
     )
     add(
         "--trust",

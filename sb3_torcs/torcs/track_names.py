@@ -4,12 +4,19 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from sb3_torcs.errors import GameIncomplete, InvalidOption, TrackNotFound, near_miss
 from sb3_torcs.torcs.installation import INSTALL, Game, torcs_folders, track_files
 
-__all__ = ["BUNDLED_FOLDER", "RANDOM_TRACK", "TrackFile", "find_track", "known_tracks"]
+__all__ = [
+    "BUNDLED_FOLDER",
+    "RANDOM_TRACK",
+    "TrackFile",
+    "find_track",
+    "known_tracks",
+    "lasting_track",
+]
 
 BUNDLED_FOLDER = Path(__file__).parents[1] / "data" / "tracks"
 COMPACT, XML = ".csv", ".xml"  # suffixes of our own files, and of the game's
@@ -46,7 +53,12 @@ def find_track(track: str | os.PathLike[str] | TrackFile, game: Game | None = No
     name = os.fspath(track)
     suffix = Path(name).suffix.lower()
     if suffix == XML or (suffix == COMPACT and game is None):
-        return _own_file(Path(os.path.expanduser(name)).absolute())
+        return _own_file(Path(lasting_track(name)))
+    if suffix == COMPACT:
+        raise TrackNotFound(
+            f"'{name}' is a file for TorcsLite-v0; Torcs-v0 has the game's own tracks ({LISTED}) "
+            f"and TORCS's {XML} files"
+        )
     known = known_tracks(game)
     for full, file in known.items():
         if name in (full, full.rpartition("/")[2]):
@@ -56,6 +68,21 @@ def find_track(track: str | os.PathLike[str] | TrackFile, game: Game | None = No
     names = [word for full in known for word in (full.rpartition("/")[2], full)]
     where = "" if game is None else f"; Torcs-v0 has those of {game.data}, and TORCS's {XML} files"
     raise TrackNotFound(f"no track '{name}'{near_miss(name, names, LISTED)}{where}")
+
+
+def lasting_track(track: Any) -> Any:
+    """
+    Say a track so that it means the same in another working folder.
+
+    :param track: as of an environment: a name, a path, a ``Track``, or a list of them
+    :return: the same, with absolute paths
+    """
+    if isinstance(track, (list, tuple)) and not isinstance(track, TrackFile):
+        return [lasting_track(item) for item in track]
+    is_path = isinstance(track, (str, os.PathLike)) and (
+        Path(track).suffix.lower() in (XML, COMPACT)
+    )
+    return str(Path(os.path.expanduser(track)).absolute()) if is_path else track
 
 
 def known_tracks(game: Game | None = None) -> dict[str, TrackFile]:

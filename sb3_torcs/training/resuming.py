@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +11,55 @@ import numpy as np
 
 from sb3_torcs.agents.model_algorithm import check_same, told_algorithm
 from sb3_torcs.agents.model_file import as_mismatch, saved_data
-from sb3_torcs.agents.models import check_spaces, saved_spaces, training_record
+from sb3_torcs.agents.models import check_spaces, saved_spaces, saved_timesteps, training_record
 from sb3_torcs.agents.wrapping import frames_of
 from sb3_torcs.errors import ModelMismatch, ModelNotTrusted
+from sb3_torcs.files import listed, path_and_arguments
 from sb3_torcs.sensors import range_finder_angles
 from sb3_torcs.training.keeping import REPLAY_BUFFER
+from sb3_torcs.training.zoo_data import as_data
 
-__all__ = ["check_resumable"]
+__all__ = ["check_resumable", "recorded_entry"]
+
+SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf", "delta_std")
+"""What the zoo lets fall to 0 over a training if it is written as ``lin_…``."""
+
+
+def recorded_entry(
+    model: Path, algo: str, env_id: str, without: Collection[str] = ()
+) -> dict[str, Any]:
+    """
+    Take the entry that a model has learned by, for what is left of its training.
+
+    What falls over the training goes on from where it is. A training that has ended is held again.
+
+    :param model: the file
+    :param algo: that is to learn, as the zoo calls it
+    :param env_id: of the environment in which it is to learn
+    :param without: dotted paths of callbacks and wrappers that are left out
+    :return: the entry; of a script's model only ``env_kwargs``, and empty if nothing fits
+    :raises ModelMismatch: if it cannot be read
+    """
+    record = training_record(model)
+    if record.env_id != env_id or record.algo not in (None, algo):
+        return {}
+    with as_mismatch(f"the hyperparameters in the record of '{model}' cannot be read", "give"):
+        entry = as_data(record.hyperparameters)
+        for key in ("callback", "env_wrapper"):
+            if key in entry:
+                items = listed(entry[key])
+                entry[key] = [i for i in items if path_and_arguments(i)[0] not in without]
+        if "n_timesteps" not in entry:
+            return entry
+        whole = int(float(entry["n_timesteps"]))
+        left = whole - saved_timesteps(model)
+        if 0 < left < whole:
+            entry["n_timesteps"] = left
+            for key in SCHEDULES:
+                if isinstance(entry.get(key), str):
+                    first = float(entry[key].removeprefix("lin_"))
+                    entry[key] = f"lin_{first * left / whole}"
+    return entry
 
 
 def check_resumable(

@@ -13,10 +13,11 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
-from sb3_torcs.car import is_count
+from sb3_torcs.car import check_count, is_count
 from sb3_torcs.errors import InvalidOption, OutputNotWritable, TrainingDiverged, WorkerLost
 from sb3_torcs.files import listed, writable_folder
 from sb3_torcs.signals import answered
+from sb3_torcs.torcs.track_names import lasting_track
 
 __all__ = ["Run", "TrainOptions", "going_on", "train", "train_run"]
 
@@ -30,6 +31,8 @@ SHORTEST_EVAL_FREQ = 1000  # timesteps
 PROGRESS = "sb3_torcs.callbacks.RacingProgressCallback"
 PICTURES = "sb3_torcs.callbacks.LinePicturesCallback"
 WORKER = "sb3_torcs.training.zoo.UninterruptedWorker"
+OF_ONE_RUN = (PROGRESS, PICTURES, WORKER)
+"""What options add to an entry; a training that is resumed has its own options."""
 OURS = ("--algo", "--env", "--n-timesteps", "-n", "--log-folder", "-f", "--conf-file", "--uuid")
 """Words of the zoo that decide where things are; ours say the same."""
 
@@ -44,14 +47,16 @@ class TrainOptions:
     :param entry: of the hyperparameter file; ``None`` is the environment's own
     :param conf_file: hyperparameter file; ``None`` is the shipped one of the algorithm
     :param track: instead of the entry's
-    :param timesteps: to learn from; ``None`` is what the entry says
+    :param timesteps: to learn from; ``None`` is what the entry says, or what is left of the
+        training that is resumed
     :param seed: of everything
     :param folder: gets ``ALGO/ENV_1``, ``ALGO/ENV_2``, ...
     :param tensorboard: its log folder; ``None`` is ``FOLDER/tensorboard``
     :param eval_freq: timesteps between evaluations; ``None`` is a fortieth of the
         training, and at least 1000 where it has as many
     :param eval_episodes: per evaluation
-    :param resume: a saved model (.zip) or a run's folder to continue from
+    :param resume: a saved model (.zip) or a run's folder to continue from, with the entry that it
+        has learned by unless ``entry`` or ``conf_file`` is given
     :param trust: accept a model without a record, and evaluate strings of the hyperparameter file
     :param progress: show a progress bar
     :param pictures: folder for pictures of the driven lines, one a minute, and their table
@@ -127,9 +132,10 @@ def train_run(options: TrainOptions) -> Run:
                 f"'{word}' after -- is refused: sb3-torcs would not find the model; before -- "
                 "there are --algo, --env, --timesteps, --folder and --conf-file"
             )
-    entry, changed, place = _entry(options)
+    resume = _resumed(options)
+    entry, changed, place = _entry(options, resume)
     with contextlib.closing(zoo.checked_env(changed, options.env, place)) as env:
-        resume = _resumed(options, entry, env, changed)
+        _check_resumed(options, resume, entry, env, changed)
     folder = writable_folder(options.folder)
     tensorboard = _for_tensorboard(options.tensorboard or folder / "tensorboard")
     wanted = zoo.timesteps(changed) if options.timesteps is None else options.timesteps
@@ -145,12 +151,9 @@ def train_run(options: TrainOptions) -> Run:
 
 
 def _check_numbers(options: TrainOptions) -> None:
-    if options.timesteps is not None and not is_count(options.timesteps):
-        raise InvalidOption(f"timesteps is {options.timesteps!r}; expected a whole number >= 1")
-    if not is_count(options.eval_episodes):
-        raise InvalidOption(
-            f"eval_episodes is {options.eval_episodes!r}; expected a whole number >= 1"
-        )
+    if options.timesteps is not None:
+        check_count("timesteps", options.timesteps)
+    check_count("eval_episodes", options.eval_episodes)
     if not is_count(options.seed) and options.seed != 0:
         raise InvalidOption(f"seed is {options.seed!r}; expected a whole number >= 0")
 
@@ -168,23 +171,45 @@ def _for_tensorboard(folder: str | Path) -> Path:
     return path
 
 
-def _entry(options: TrainOptions) -> tuple[dict[str, Any], dict[str, Any], Place]:
+def _resumed(options: TrainOptions) -> Path | None:
+    """Find the model to resume; ``None`` begins anew."""
+    if options.resume is None:
+        return None
+    from sb3_torcs.agents.models import find_model
+
+    return find_model(options.resume, prefer_last=True)
+
+
+def _entry(
+    options: TrainOptions, resume: Path | None
+) -> tuple[dict[str, Any], dict[str, Any], Place]:
     """
     Read and check the hyperparameters.
 
     :param options: what to train
+    :param resume: the model to resume, which knows its own, unless others are given
     :return: the entry, before and after the changes of the zoo's arguments, and where it stands
     """
     from sb3_torcs.training import zoo
+    from sb3_torcs.training.resuming import recorded_entry
 
     zoo.check_registered(options.env)
-    path = zoo.config_file(options.algo, options.conf_file)
-    name = options.entry or options.env
-    entry = zoo.read_entry(path, name)
+    entry: dict[str, Any] = {}
+    if resume is not None and options.entry is None and options.conf_file is None:
+        entry = recorded_entry(resume, options.algo, options.env, without=OF_ONE_RUN)
+    if resume is not None and "policy" in entry:
+        place = zoo.Place(resume, "as it was recorded")
+    else:
+        place = zoo.Place(
+            zoo.config_file(options.algo, options.conf_file), options.entry or options.env
+        )
+        entry = {**zoo.read_entry(*place), **entry}
     if options.track is not None:
         entry["env_kwargs"] = {**(entry.get("env_kwargs") or {}), "track": options.track}
+    if "track" in (entry.get("env_kwargs") or {}):  # of which the zoo writes a record
+        track = lasting_track(entry["env_kwargs"]["track"])
+        entry["env_kwargs"] = {**entry["env_kwargs"], "track": track}
     changed = {**entry, **_changes(options.zoo_args)}
-    place = zoo.Place(path, name)
     zoo.check_entry(changed, options.algo, options.env, place, trust=options.trust)
     return entry, {**changed, "env_kwargs": changed.get("env_kwargs") or {}}, place
 
@@ -211,33 +236,37 @@ def _changes(zoo_args: Sequence[str]) -> dict[str, Any]:
     return {**known.hyperparams, "env_kwargs": known.env_kwargs}
 
 
-def _resumed(
-    options: TrainOptions, entry: dict[str, Any], env: Any, changed: Mapping[str, Any]
-) -> Path | None:
+def _check_resumed(
+    options: TrainOptions,
+    resume: Path | None,
+    entry: dict[str, Any],
+    env: Any,
+    changed: Mapping[str, Any],
+) -> None:
     """
-    Find and check the model to resume. With its replay buffer it needs no new warm-up.
+    Check the model to resume. With its replay buffer it needs no new warm-up.
 
     :param options: what to train
-    :param entry: of the hyperparameter file; is adapted
+    :param resume: the model; ``None`` begins anew
+    :param entry: its hyperparameters; is adapted
     :param env: one of those to train in
     :param changed: the entry after the changes of the zoo's arguments
-    :return: the model's file; ``None`` begins anew
     """
-    if options.resume is None:
-        return None
-    from sb3_torcs.agents.models import find_model
+    if resume is None:
+        return
+    from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+    from sb3_torcs.agents.model_algorithm import algorithm_class
     from sb3_torcs.agents.wrapping import frames_of
     from sb3_torcs.training.resuming import check_resumable
 
-    path = find_model(options.resume, prefer_last=True)
     n_envs, frames = changed.get("n_envs", 1), frames_of(changed)
-    buffer = check_resumable(path, env, options.algo, n_envs, frames=frames, trust=options.trust)
+    buffer = check_resumable(resume, env, options.algo, n_envs, frames=frames, trust=options.trust)
     if "learning_starts" in entry and buffer:
         entry["learning_starts"] = 0
-    if "n_steps" in entry:
+    if "n_steps" in entry and issubclass(algorithm_class(options.algo), OffPolicyAlgorithm):
         # SB3 chooses the class of the replay buffer as before; given its own choice, it would warn.
         entry.setdefault("replay_buffer_class", None)
-    return path
 
 
 def _zoo_words(options: TrainOptions, wanted: int, env_kwargs: dict[str, Any]) -> list[str]:
@@ -329,7 +358,7 @@ def _told(
         return TrainingDiverged(f"{error}; {kept}; lower the learning_rate, and {more}")
     if isinstance(error, WorkerLost):
         return WorkerLost(f"{error}; {kept}; see above why, and {more}")
-    said = f"cannot write '{error.filename}': {error.strerror or error}"
+    said = f"cannot write '{error.filename or result.folder}': {error.strerror or error}"
     return OutputNotWritable(f"{said}; {kept}; make room, or choose another folder, and {more}")
 
 
