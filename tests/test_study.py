@@ -3,6 +3,7 @@
 import csv
 import errno
 import json
+import math
 import os
 import shutil
 import signal
@@ -14,12 +15,14 @@ from pathlib import Path
 
 import pytest
 import yaml
+from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_torcs.cli import main
 from sb3_torcs.cli.study import Board
 from sb3_torcs.errors import RayUnavailable, StudyError
 from sb3_torcs.studies import runner as study_module
 from sb3_torcs.studies.config import FIELDS, read_study
+from sb3_torcs.studies.report import write_report
 from sb3_torcs.studies.runner import MARK, PRIVATE, SESSION, run_study, run_trial
 from sb3_torcs.studies.storage import StudyFolder
 
@@ -27,16 +30,17 @@ CLOCKS = ("wall_s", "cpu_s")
 HANDLED = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
 
 
+TINY = {
+    "learning_starts": 100, "buffer_size": 1000, "batch_size": 16,
+    "policy_kwargs": {"net_arch": [16, 16], "head_bias": [0.0, 1.0, -3.0]},
+}  # fmt: skip
+
+
 def study_file(folder, **changes):
     said = {
         "name": "tiny", "env": "TorcsLite-v0", "seeds": 2, "n_timesteps": 1920,
         "eval_interval": 240, "final_tracks": ["g-track-1"],
-        "variants": {
-            "small nets": {
-                "learning_starts": 100, "buffer_size": 1000, "batch_size": 16,
-                "policy_kwargs": {"net_arch": [16, 16], "head_bias": [0.0, 1.0, -3.0]},
-            },
-        },
+        "variants": {"small nets": TINY},
         **changes,
     }  # fmt: skip
     file = folder / "tiny.yml"
@@ -87,6 +91,57 @@ def begun(tmp_path):
     store.begin()
     store.put(study.trials[0], {"state.json": b"1"}, [evaluated(study.trials[0])])
     return study, store
+
+
+class PoisonCallback(BaseCallback):
+    """Lets a model compute no numbers any more."""
+
+    def __init__(self, at):
+        super().__init__()
+        self.at = at
+
+    def _on_step(self):
+        if self.num_timesteps >= self.at:
+            next(self.model.policy.parameters()).data.fill_(math.nan)
+        return True
+
+
+def test_an_agent_that_diverges_is_measured_by_its_best_model_of_before(tmp_path, capsys):
+    callback = {f"{__name__}.PoisonCallback": {"at": 500}}
+    study = read_study(
+        study_file(tmp_path, seeds=1, variants={"poisoned": {**TINY, "callback": callback}})
+    )
+    store = StudyFolder(tmp_path / "out", study)
+    store.begin()
+    (trial,) = study.trials
+    run_trial(trial, store, lambda row: None)
+    assert store.ended(trial)
+    rows = results(tmp_path / "out")
+    assert [(row["phase"], row["decisions"]) for row in rows[:2]] == [
+        ("train", "240"),
+        ("train", "480"),
+    ]
+    assert [row["phase"] for row in rows[2:]] == ["final"] * 2
+    assert store.diverged(trial).startswith("the training has diverged: after ")
+    assert store.checkpoint(trial) is None
+    write_report(tmp_path / "out", tmp_path / "report")
+    assert (
+        "Diverged, and measured by the best model of before: poisoned-seed0."
+        in (tmp_path / "report" / "report.md").read_text()
+    )
+
+
+def test_an_agent_that_diverges_before_its_first_evaluation_fails_once(tmp_path):
+    callback = {f"{__name__}.PoisonCallback": {"at": 150}}
+    study = read_study(
+        study_file(tmp_path, seeds=1, variants={"poisoned": {**TINY, "callback": callback}})
+    )
+    store = StudyFolder(tmp_path / "out", study)
+    store.begin()
+    told = []
+    study_module._run_or_tell(study.trials[0], store, told.append)
+    assert [row["phase"] for row in told] == ["failed"]
+    assert "the training has diverged: after " in told[0]["error"]
 
 
 def test_the_table_shows_how_far_everybody_is_and_the_best_so_far(begun, monkeypatch, capsys):

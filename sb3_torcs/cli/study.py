@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import shlex
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -74,9 +74,14 @@ def run(args: argparse.Namespace) -> int:
     store = StudyFolder(folder, study)
     left = [trial for trial in study.trials if not store.ended(trial)]
     failed = board.errors()
+    diverged = {trial.name: store.diverged(trial) for trial in study.trials}
     if args.json:
-        print_json({"study": study.name, "results": str(store.results), "trials": board.as_json()})
+        lines = board.as_json(diverged)
+        print_json({"study": study.name, "results": str(store.results), "trials": lines})
     else:
+        for name, why in diverged.items():
+            if why is not None:
+                print(f"{name}: {why}; its best model of before was measured")
         for name, error in failed.items():
             print(f"{name} failed: {error}")
         ended = len(study.trials) - len(left)
@@ -128,10 +133,19 @@ class Board:
         """Return the messages of the trials that failed, by name."""
         return {name: row["error"] for name, row in self._rows.items() if "error" in row}
 
-    def as_json(self) -> list[dict[str, Any]]:
-        """Return the lines as plain values."""
+    def as_json(self, diverged: Mapping[str, str | None]) -> list[dict[str, Any]]:
+        """
+        Return the lines as plain values.
+
+        :param diverged: why trainings ended early, by name
+        """
         return [
-            {"variant": trial.variant, "seed": trial.seed, **self._rows[trial.name]}
+            {
+                "variant": trial.variant,
+                "seed": trial.seed,
+                **self._rows[trial.name],
+                "diverged": diverged[trial.name],
+            }
             for trial in self._study.trials
         ]
 

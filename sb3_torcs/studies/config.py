@@ -21,7 +21,6 @@ from typing import Any
 import yaml
 
 from sb3_torcs.agents.model_algorithm import SBX
-from sb3_torcs.agents.wrapping import unrebuilt
 from sb3_torcs.errors import StudyError, near_miss, with_new_names
 from sb3_torcs.files import listed, read_yaml
 from sb3_torcs.torcs.track_names import RANDOM_TRACK
@@ -253,7 +252,6 @@ def _trials(
     entry = as_data(entry)
     zoo.check_entry(entry, algo, env_id, place)
     entry["n_timesteps"] = zoo.timesteps(entry)
-    _check_evaluable(entry, place)
     interval = source["eval_interval"]
     if type(interval) is not int or interval < 1:
         raise StudyError(f"{place}: eval_interval is {interval!r}; expected timesteps, e.g. 5000")
@@ -282,13 +280,6 @@ def _source(
         if not isinstance(source[key], str | None):
             raise StudyError(f"{place}: {key} is {source[key]!r}; expected a word")
     return source
-
-
-def _check_evaluable(entry: Mapping[str, Any], place: zoo.Place) -> None:
-    """Make sure that evaluations can be driven in the training's environment."""
-    reason = unrebuilt(entry)
-    if reason is not None:
-        raise StudyError(f"{place}: {reason}; or take it away: 'vec_env_wrapper: null'")
 
 
 def _tracks(value: Any, what: str) -> tuple[str, ...]:

@@ -18,7 +18,7 @@ from sb3_torcs.studies.estimates import Estimate, estimate
 from sb3_torcs.studies.page import Section, study_page
 from sb3_torcs.studies.pictures import NO_LAP, draw_together, draw_variant
 from sb3_torcs.studies.results import Results
-from sb3_torcs.studies.storage import RECIPE, RESULTS, ROWS, write_whole
+from sb3_torcs.studies.storage import DIVERGED, RECIPE, RESULTS, ROWS, write_whole
 
 __all__ = ["read_results", "write_report"]
 
@@ -96,7 +96,7 @@ def write_report(folder: Path, output: Path) -> Path:
     """
     trials = read_results(folder)
     study = trials[0].train[0]["study"]
-    notes = [NOTE, *_waiting(folder)]
+    notes = [NOTE, *_waiting(folder), *_diverged(folder)]
     sections = [_summary(trials), _seeds(trials), _ladder(trials), _shares(trials)]
     lines = [f"# {study}", ""]
     for note in notes:
@@ -130,6 +130,13 @@ def _waiting(folder: Path) -> list[str]:
     recipes = sorted(folder.glob(f"*/{RECIPE}"))
     waiting = [file.parent.name for file in recipes if not (file.parent / ROWS).is_file()]
     return [f"Not evaluated yet, and in no figure: {', '.join(waiting)}."] if waiting else []
+
+
+def _diverged(folder: Path) -> list[str]:
+    """List the agents whose training ended early."""
+    names = sorted(file.parent.name for file in folder.glob(f"*/{DIVERGED}"))
+    said = f"Diverged, and measured by the best model of before: {', '.join(names)}."
+    return [said] if names else []
 
 
 def _homes(trials: Sequence[Results]) -> str:

@@ -12,12 +12,13 @@ import os
 import shutil
 import signal
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 from sb3_torcs.agents.model_record import BEST_MODEL
-from sb3_torcs.errors import OutputNotWritable, RayUnavailable, StudyError
+from sb3_torcs.errors import OutputNotWritable, RayUnavailable, StudyError, TrainingDiverged
 from sb3_torcs.signals import answered, handlers_kept
 from sb3_torcs.studies.config import Study, Trial
 from sb3_torcs.studies.storage import Files, StudyFolder
@@ -28,6 +29,7 @@ RETRIES = 3  # retries of a trial whose worker was lost or whose code failed, pe
 SESSION = ".session"  # where a killed run's temporary files are
 SCRATCH = "st-"  # prefix of folders for temporary files; short, since paths of sockets are limited
 MARK = ".of-a-study"  # a file that names the folder for temporary files
+PATIENCE = 5.0  # [s] until a folder for temporary files counts as one that cannot be removed
 PRIVATE = "sb3_torcs_study"  # a resource that marks a Ray that was started by a study
 FAILED = "failed"  # the phase of a row with an error instead of a race
 
@@ -73,7 +75,12 @@ def run_trial(trial: Trial, store: Any, report: Callable[[dict[str, Any]], None]
             report(training.rows[-1])
 
         with contextlib.closing(training):
-            training.run(after_slice)
+            try:
+                training.run(after_slice)
+            except TrainingDiverged as error:
+                if not store.rows(trial):
+                    raise
+                store.put_diverged(trial, str(error))
         files, _, missing = store.state(trial)
     chosen = [row for row in store.rows(trial) if row["phase"] == "train" and row["kept"]][-1]
     with _unpacked(files) as folder:
@@ -214,7 +221,7 @@ def _ray(store: StudyFolder, jobs: int | None, address: str | None) -> Iterator[
             yield scratch
     finally:
         ray.shutdown()
-        shutil.rmtree(scratch, ignore_errors=True)
+        _remove_folder(scratch)
         session.unlink(missing_ok=True)
 
 
@@ -225,8 +232,17 @@ def _remove_scratch(session: Path) -> None:
     with contextlib.suppress(OSError, ValueError):  # damaged, or naming what cannot be
         folder = Path(session.read_text(encoding="utf-8"))
         if (folder / MARK).is_file():
-            shutil.rmtree(folder, ignore_errors=True)
+            _remove_folder(folder)
     session.unlink()
+
+
+def _remove_folder(folder: Path) -> None:
+    """Remove a folder of Ray, whose processes may write into it while they end."""
+    give_up = time.monotonic() + PATIENCE
+    shutil.rmtree(folder, ignore_errors=True)
+    while folder.exists() and time.monotonic() < give_up:
+        time.sleep(0.1)
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _tune(trials: list[Trial], store: StudyFolder, scratch: Path, progress: Progress) -> None:
@@ -287,7 +303,7 @@ def _run_or_tell(trial: Trial, store: Any, report: Callable[[dict[str, Any]], No
     """Run a trial. An error that would recur is reported as a row, so that Tune does not retry."""
     try:
         run_trial(trial, store, report)
-    except (StudyError, OutputNotWritable) as error:
+    except (StudyError, OutputNotWritable, TrainingDiverged) as error:
         report({"phase": FAILED, "error": _last_line(error)})
 
 

@@ -7,6 +7,7 @@
       VARIANT-seed0/
         recipe.yml                what the training depends on
         rows.json                 of the evaluations so far
+        diverged.txt              why the training ended early, if it did
         best_model.zip, …         what `sb3-torcs evaluate` reads
         checkpoint-000012/        to go on from; gone when the training is over
 """
@@ -31,12 +32,13 @@ from sb3_torcs.errors import OutputNotWritable, StudyError
 from sb3_torcs.files import read_yaml
 from sb3_torcs.studies.config import FIELDS, Study, Trial, track_name
 
-__all__ = ["RECIPE", "RESULTS", "ROWS", "Files", "StudyFolder", "write_whole"]
+__all__ = ["DIVERGED", "RECIPE", "RESULTS", "ROWS", "Files", "StudyFolder", "write_whole"]
 
 Files = dict[str, bytes]
 """Contents of files by name."""
 
 RESULTS = "results.csv"
+DIVERGED = "diverged.txt"
 RECIPE, ROWS, LOCK = "recipe.yml", "rows.json", ".lock"
 CHECKPOINT = "checkpoint-"
 FOR_DRIVERS = (BEST_MODEL, STATISTICS, "config.yml", "args.yml")
@@ -135,10 +137,22 @@ class StudyFolder:
         Check whether the training of a trial is complete.
 
         :param trial: of the study
-        :return: whether all its timesteps were learned from
+        :return: whether all its timesteps were learned from, or it has diverged
         """
+        if self.diverged(trial) is not None:
+            return True
         learned = [row["decisions"] for row in self.rows(trial) if row["phase"] == "train"]
         return bool(learned) and learned[-1] >= trial.budget
+
+    def diverged(self, trial: Trial) -> str | None:
+        """
+        Read why a training ended early.
+
+        :param trial: of the study
+        :return: how it diverged; ``None`` if it did not
+        """
+        file = self.of(trial) / DIVERGED
+        return file.read_text(encoding="utf-8") if file.is_file() else None
 
     def missing(self, trial: Trial) -> list[str]:
         """
@@ -215,6 +229,17 @@ class StudyFolder:
         for old in before:
             shutil.rmtree(old, ignore_errors=True)
         self.write_results()
+
+    def put_diverged(self, trial: Trial, why: str) -> None:
+        """
+        End a training that has diverged. Its best model of before is what it has learned.
+
+        :param trial: of the study, with an evaluation at least
+        :param why: the message
+        """
+        write_whole(self.of(trial) / DIVERGED, why.encode())
+        for old in self.of(trial).glob(f"{CHECKPOINT}*"):
+            shutil.rmtree(old, ignore_errors=True)
 
     def put_finals(self, trial: Trial, rows: Iterable[dict[str, Any]]) -> None:
         """

@@ -30,6 +30,7 @@ from sb3_torcs.errors import StudyError
 from sb3_torcs.evaluation.ladder import rung
 from sb3_torcs.evaluation.protocol import Episode, Merit, evaluate, merit, race_environment
 from sb3_torcs.studies.config import FIELDS, Trial, track_name
+from sb3_torcs.training.keeping import check_healthy
 from sb3_torcs.training.manager import build
 
 __all__ = ["Row", "Training", "final_row"]
@@ -88,6 +89,7 @@ class Training:
 
         :param after_slice: called after each evaluation; may call :meth:`save`
         :raises StudyError: if a callback stops the training early
+        :raises TrainingDiverged: if the model computes no numbers any more
         """
         remaining = self.trial.budget - self.model.num_timesteps
         self._clock = _clocks()
@@ -100,7 +102,11 @@ class Training:
             # Slices come last, after other callbacks have undone their changes of a rollout.
             callbacks = [*self.callbacks, slices]
             # One learn() for all slices, so that schedules span the whole budget.
-            self.model.learn(remaining, callback=callbacks, reset_num_timesteps=False)
+            try:
+                self.model.learn(remaining, callback=callbacks, reset_num_timesteps=False)
+            except Exception:
+                check_healthy(self.model)  # explains what SB3 or the environment complains about
+                raise
             if self.model.num_timesteps < self.trial.budget:
                 raise StudyError(
                     f"a callback stopped the training at {self.model.num_timesteps} of "
@@ -129,6 +135,7 @@ class Training:
 
         :param running: (n_envs,) whether an episode is cut here
         """
+        check_healthy(self.model)
         self.episodes += int(running.sum())
         _cut_episodes(self.model, running)
         races = {track: self._race(track) for track in self.trial.eval_tracks}

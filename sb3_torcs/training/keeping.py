@@ -12,13 +12,14 @@ from pathlib import Path
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_torcs.agents.model_record import STATISTICS
 from sb3_torcs.car import is_count
 from sb3_torcs.errors import InvalidOption, TrainingDiverged
 
-__all__ = ["REPLAY_BUFFER", "SAVING", "KeepCallback", "WholeFiles"]
+__all__ = ["REPLAY_BUFFER", "SAVING", "KeepCallback", "WholeFiles", "check_healthy"]
 
 SAVING = "saving what was learned; Ctrl-C once more drops it\n"
 
@@ -113,11 +114,7 @@ class KeepCallback(BaseCallback):
         :raises TrainingDiverged: if the model computes no numbers any more, and would replace a
             good one
         """
-        if not self.is_healthy():
-            raise TrainingDiverged(
-                f"the training has diverged: after {self.model.num_timesteps} timesteps its model "
-                "computes no numbers any more"
-            )
+        check_healthy(self.model)
         self.files.drop()
         aside = self.files.aside
         with (aside / f"{self.name}.zip").open("wb") as file:
@@ -131,14 +128,28 @@ class KeepCallback(BaseCallback):
                 self.model.save_replay_buffer(file)  # type: ignore[attr-defined]
             self.files.settle()
 
-    def is_healthy(self) -> bool:
-        """Check that all weights are finite, and what the model does next."""
-        if not all(bool(th.isfinite(w).all()) for w in self.model.policy.parameters()):
-            return False
-        if self.model._last_obs is None:
-            return True
-        try:
-            actions, _ = self.model.policy.predict(self.model._last_obs, deterministic=True)
-        except ValueError:  # of a distribution whose mean is no number
-            return False
-        return bool(np.isfinite(actions).all())
+
+def check_healthy(model: BaseAlgorithm) -> None:
+    """
+    Make sure that a model computes numbers.
+
+    :param model: that learns
+    :raises TrainingDiverged: if a weight is not finite, or what the model does next
+    """
+    if not _is_healthy(model):
+        raise TrainingDiverged(
+            f"the training has diverged: after {model.num_timesteps} timesteps its model computes "
+            "no numbers any more"
+        )
+
+
+def _is_healthy(model: BaseAlgorithm) -> bool:
+    if not all(bool(th.isfinite(w).all()) for w in model.policy.parameters()):
+        return False
+    if model._last_obs is None:
+        return True
+    try:
+        actions, _ = model.policy.predict(model._last_obs, deterministic=True)
+    except ValueError:  # of a distribution whose mean is no number
+        return False
+    return bool(np.isfinite(actions).all())
