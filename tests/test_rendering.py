@@ -16,6 +16,7 @@ from sb3_torcs.errors import EnvClosed, InvalidOption
 from sb3_torcs.rendering.hud import lap_clock
 from sb3_torcs.rendering.scenery import GRASS_FAR, ROAD, Scenery, colour
 from sb3_torcs.rendering.viewer import BEAM_END, CAR_HEIGHT, Viewer
+from sb3_torcs.torcs.display import VirtualDisplay
 from sb3_torcs.tracks.catalogue import load_track
 from sb3_torcs.tracks.track import Surface
 
@@ -278,6 +279,19 @@ def test_a_window_shows_the_picture_and_ends_cleanly_when_it_is_closed():
         "assert not pygame.display.get_init()\n",
         SDL_VIDEODRIVER="dummy",
     )
+
+
+def test_a_model_can_be_built_beside_a_window():
+    with VirtualDisplay((1280, 720)) as display:
+        run_python(
+            PRELUDE + "viewer = Viewer(mode='human', fps=1000)\n"
+            "viewer.frame(track, car, COASTING, ANGLES)\n"
+            "assert pygame.display.get_driver() == 'x11'\n"
+            "from stable_baselines3 import PPO\n"
+            "PPO('MlpPolicy', 'Pendulum-v1', device='cpu')\n"
+            "viewer.close()\n",
+            DISPLAY=display.name,
+        )
 
 
 def test_nothing_graphical_is_imported_before_the_first_picture():

@@ -23,12 +23,9 @@ from sb3_torcs.tracks.track import Segment, Track
 
 
 @contextmanager
-def _unchanged_environment() -> Iterator[None]:
-    """Undo the changes of ``os.environ`` that importing pygame and highway-env makes."""
+def unchanged_environment() -> Iterator[None]:
+    """Undo the changes of ``os.environ`` that are made within, by pygame and highway-env, too."""
     before = dict(os.environ)
-    os.environ["PYGAME_HIDE_SUPPORT_PROMPT"] = (
-        "1"  # pygame's greeting would spoil the output of --json
-    )
     try:
         yield
     finally:
@@ -37,7 +34,8 @@ def _unchanged_environment() -> Iterator[None]:
         os.environ.update(before)
 
 
-with _unchanged_environment():
+with unchanged_environment():
+    os.environ["PYGAME_HIDE_SUPPORT_PROMPT"] = "1"  # its greeting would spoil the output of --json
     import pygame
     import pygame.gfxdraw
     from highway_env.road.graphics import WorldSurface
@@ -56,6 +54,7 @@ __all__ = [
     "pygame",
     "road_network",
     "to_highway",
+    "unchanged_environment",
 ]
 
 LINES = (LineType.CONTINUOUS_LINE, LineType.CONTINUOUS_LINE)

@@ -32,6 +32,7 @@ from sb3_torcs.rendering.highway import (
     pygame,
     road_network,
     to_highway,
+    unchanged_environment,
 )
 from sb3_torcs.rendering.hud import Dashboard
 from sb3_torcs.rendering.scenery import GRASS_FAR, WALL, WHITE, Colour, Scenery
@@ -256,7 +257,11 @@ def _open_window(size: tuple[int, int]) -> Any:
                 "WAYLAND_DISPLAY set? Else %s",
                 remedy,
             )
-        window = pygame.display.set_mode(size)
+        with unchanged_environment():
+            # Acceleration loads LLVM, beside which PyTorch cannot load its own: a segmentation
+            # fault, as soon as a model is built.
+            os.environ.setdefault("SDL_FRAMEBUFFER_ACCELERATION", "0")
+            window = pygame.display.set_mode(size)
     except pygame.error as error:
         pygame.display.quit()
         raise InvalidOption(f'render_mode is "human", but {error}; {remedy}') from None
