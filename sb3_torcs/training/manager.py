@@ -13,6 +13,7 @@ import fcntl
 import io
 import locale
 import os
+import shutil
 import signal
 import sys
 import tempfile
@@ -35,7 +36,13 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 import sb3_torcs  # noqa: F401  registers the environments
 from sb3_torcs.agents.model_algorithm import algorithm_class
 from sb3_torcs.agents.model_writing import RecordCallback, recipe
-from sb3_torcs.errors import InvalidOption, TrainingDiverged, WorkerLost
+from sb3_torcs.errors import (
+    InvalidOption,
+    Sb3TorcsError,
+    TrainingDiverged,
+    WorkerLost,
+    ZooConfigError,
+)
 from sb3_torcs.signals import answered
 from sb3_torcs.training.keeping import SAVING, KeepCallback, WholeFiles
 from sb3_torcs.training.zoo import OURS
@@ -194,6 +201,26 @@ class Manager(_Threaded):
         if self.optimize_hyperparameters:
             self.tensorboard_log = None  # a search writes no such files, and would warn
 
+    def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
+        """
+        Build the algorithm, its environments and its callbacks.
+
+        :return: as the zoo's own
+        :raises ZooConfigError: if the algorithm refuses what it is given; its folder is removed
+        """
+        try:
+            return super().setup_experiment()
+        except (AssertionError, NotImplementedError, TypeError, ValueError) as error:
+            self.close_envs()
+            shutil.rmtree(self.save_path)
+            if isinstance(error, Sb3TorcsError):
+                raise
+            why = " ".join(str(error).split())
+            raise ZooConfigError(
+                f"{self.algo} cannot learn in {self.env_name.gym_id} by this entry: {why}; change "
+                "the entry, or choose another --algo"
+            ) from error
+
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """
         Read the hyperparameters, and keep them for the model's record.
@@ -247,16 +274,13 @@ class Manager(_Threaded):
             with self._named_errors():
                 super().learn(model)
         except Exception as error:
-            diverged = None
             try:
-                self.keeper.keep()
-            except TrainingDiverged as found:
-                diverged = found
-            except OSError:
-                pass
-            self.files.close()
-            if diverged is not None:
+                with contextlib.suppress(OSError):
+                    self.keeper.keep()
+            except TrainingDiverged as diverged:
                 raise diverged from error
+            finally:
+                self.files.close()
             if isinstance(error, EOFError | ConnectionError):
                 raise WorkerLost("a process with a car of the training has ended") from error
             raise

@@ -21,7 +21,7 @@ import gymnasium as gym
 import yaml
 
 from sb3_torcs.agents.model_algorithm import SBX, algorithm_class
-from sb3_torcs.agents.wrapping import normalizes, wrapped
+from sb3_torcs.agents.wrapping import normalizes, unrebuilt, wrapped
 from sb3_torcs.car import is_count
 from sb3_torcs.errors import InvalidOption, ModelMismatch, ZooConfigError, near_miss
 from sb3_torcs.files import listed, path_and_arguments, read_yaml
@@ -209,6 +209,9 @@ def check_entry(entry: Entry, algo: str, env_id: str, place: Place, *, trust: bo
     for key in ("callback", "env_wrapper", "vec_env_wrapper"):
         for path, arguments in _items(entry.get(key), key, place):
             _check_call(f"{key} {path}", _imported(path, key, place), arguments, place)
+    reason = unrebuilt(entry)
+    if reason is not None:
+        raise ZooConfigError(f"{place}: {reason}; or take it away: 'vec_env_wrapper: null'")
     check_env_kwargs(entry.get("env_kwargs"), env_id, place)
     _check_wrappers(entry, place)
     _check_symmetric(entry, place)
