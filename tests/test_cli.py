@@ -1,6 +1,7 @@
 import argparse
 import csv
 import dataclasses
+import errno
 import importlib
 import itertools
 import json
@@ -107,6 +108,17 @@ def test_help_loads_nothing_heavy():
     """It starts in a blink; torch alone takes seconds."""
     heavy = {"torch", "numba", "stable_baselines3", "matplotlib", "pygame"}
     assert loaded_by("--help") & heavy == set()
+
+
+@pytest.mark.parametrize("closed", [">&-", "2>&-", "<&-", ">&- 2>&- <&-"])
+def test_a_closed_stream_ends_nothing(closed, tmp_path):
+    done = subprocess.run(
+        f"{sys.executable} -m sb3_torcs.cli tracks --json aalborg --plot line.png {closed}",
+        shell=True, cwd=tmp_path, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+    assert (tmp_path / "line.png").read_bytes()[:4] == PNG
+    assert bool(done.stdout) == (">&-" not in closed.replace("2>&-", ""))
 
 
 def test_listing_tracks_does_not_load_torch():
@@ -595,6 +607,18 @@ def test_a_stretch_is_recorded_in_real_time(recorded, tmp_path):
 def test_a_stretch_is_drawn(recorded, tmp_path):
     recorded.draw_line(tmp_path / "line.png")
     assert (tmp_path / "line.png").read_bytes()[:4] == PNG
+
+
+def test_what_was_driven_is_told_before_a_file_fails(capsys, tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(recording.Recorder, "draw_line", full)
+    line = str(tmp_path / "line.png")
+    status, out, err = run(capsys, "evaluate", "scripted", *LITE, "--laps", "1", "--line", line)
+    assert status == 2
+    assert "1     1 " in out.splitlines()[-1]
+    assert err.splitlines()[-1].startswith("sb3-torcs: No space left on device")
 
 
 def test_an_output_that_takes_no_more_is_told():

@@ -128,7 +128,7 @@ def test_races_driven_at_once_brake_as_single_ones_do(game):
 @pytest.mark.parametrize("world", [{"id": "TorcsLite-v0"}, {"id": "Torcs-v0", "backend": "scr"}])
 def test_a_world_without_races_has_nobody_to_keep_from(game, world):
     with pytest.raises(
-        InvalidOption, match="of which this world does not tell, there is no 'keep_distance'; leave"
+        InvalidOption, match="other cars, which is needed for 'keep_distance'; use Torcs-v0 with"
     ):
         gym.make(**world, keep_distance=True)
 

@@ -18,6 +18,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNorm
 import sb3_torcs  # noqa: F401  registers the environments
 from sb3_torcs.agents import model_record, models
 from sb3_torcs.agents.scripted import ScriptedDriver
+from sb3_torcs.cli import main
 from sb3_torcs.errors import InvalidOption, ModelMismatch, ModelNotTrusted, PackageMissing
 from sb3_torcs.training.resuming import check_resumable
 
@@ -301,8 +302,18 @@ def test_a_model_without_a_record_is_told_the_option_that_it_needs(env, tmp_path
         PPO("MlpPolicy", other, **SMALL).save(tmp_path / "m.zip")
         with pytest.raises(ModelMismatch) as caught:
             models.load_driver(tmp_path / "m.zip", env)
-        assert str(caught.value).endswith(f"made with {option} has them: --env-kwargs {option}")
+        said = f"made with {option} has them: sb3-torcs evaluate takes --env-kwargs {option}, and "
+        assert said in str(caught.value)
         models.load_driver(tmp_path / "m.zip", other)
+
+
+def test_a_model_that_is_given_other_options_is_told_its_own(capsys):
+    words = ["evaluate", "ppo-aalborg", "--env-kwargs", "action=pedals"]
+    assert main(words) == 2
+    said = capsys.readouterr().err
+    assert "it learned there with action_repeat=5, range_finders='narrow', " in said
+    assert "action='pedal'" in said
+    assert said.endswith("; give it the same\n")
 
 
 def test_a_model_of_stacked_frames_without_a_record_is_told_what_to_write(env, tmp_path):

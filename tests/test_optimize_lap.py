@@ -268,6 +268,13 @@ def test_a_ghost_drives_no_other_race(file, kwargs, said):
         load_driver(file, env)
 
 
+def test_a_ghost_drives_in_no_other_world(file, capsys):
+    assert main(["evaluate", str(file), "--env", "TorcsLite-v0", "--track", TRACK]) == 2
+    assert "was driven in Torcs-v0, not in TorcsLite-v0" in capsys.readouterr().err
+    assert main(["watch", str(file), "--robots", "bt", "--video", "never.mp4"]) == 2
+    assert "a ghost drives as it did" in capsys.readouterr().err
+
+
 def test_after_its_last_action_a_ghost_brakes(ghost):
     action, state = GhostDriver(ghost).predict(np.zeros(29, "f4"), len(ghost.actions))
     assert (action[1], state) == (0.0, len(ghost.actions))

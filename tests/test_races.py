@@ -14,6 +14,7 @@ from sb3_torcs.agents.scripted import ScriptedDriver
 from sb3_torcs.cli import main
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.evaluation.comparing import saved_drives
+from sb3_torcs.races import protocol
 from sb3_torcs.races.entrants import find_entrants
 from sb3_torcs.races.protocol import Race, Standing, run_race, run_races
 from sb3_torcs.races.ratings import ratings
@@ -239,6 +240,25 @@ def test_the_command_prints_one_object(capsys, game, tmp_path):
     best = printed["drivers"][0]
     assert (best["driver"], best["races"], best["wins"], best["win_rate"][1]) == ("bt", 2, 2, 1.0)
     assert picture.stat().st_size > 1000
+
+
+def test_ctrl_c_keeps_the_races_that_are_over(capsys, game, tmp_path, monkeypatch):
+    held = protocol.run_race
+
+    def run_race(*arguments, **options):
+        if options["seed"] == 2:
+            raise KeyboardInterrupt
+        return held(*arguments, **options)
+
+    monkeypatch.setattr(protocol, "run_race", run_race)
+    picture, drives = tmp_path / "race.svg", tmp_path / "race.parquet"
+    words = ["race", "scripted", "bt", "--track", SHORT, "--laps", "1", "--races", "3", "--json"]
+    assert main([*words, "--picture", str(picture), "--telemetry", str(drives)]) == 130
+    assert [race["seed"] for race in json.loads(capsys.readouterr().out)["races"]] == [0, 1]
+    assert picture.is_file()
+    assert not drives.exists()
+    assert main(["race", "scripted", "bt", "--track", SHORT, "--seed", "2"]) == 130
+    assert capsys.readouterr().out == ""
 
 
 def test_the_last_race_is_written_and_reported(capsys, game, tmp_path):

@@ -35,6 +35,7 @@ __all__ = [
 SUFFIX = ".npz"
 SHIPPED = Path(__file__).parents[1] / "data" / "ghosts"
 VERSION = 1
+WORLD = "Torcs-v0"
 MAX_SIZE = 2**24  # [bytes] of a ghost's file, and of what is in it
 AFTERWARDS = -0.3  # [-] the pedal of a ghost that has no actions left: it brakes
 
@@ -64,7 +65,7 @@ class Ghost:
     def make_env(self) -> gym.Env[Any, Any]:
         """Make the environment in which the actions give this drive."""
         return gym.make(
-            "sb3_torcs:Torcs-v0", max_episode_steps=len(self.actions) + 1, **self.env_kwargs
+            f"sb3_torcs:{WORLD}", max_episode_steps=len(self.actions) + 1, **self.env_kwargs
         )
 
     def drive(self) -> Iterator[Timestep]:
@@ -200,10 +201,11 @@ class GhostDriver:
         return np.array([0.0, AFTERWARDS] if width == 2 else [0.0, 0.0, -AFTERWARDS], "f4"), step
 
 
-USUAL = {"delay": 0, "grip": 1.0, "mass": 1.0, "unstick": False, "keep_distance": False}
-"""Options that change a drive, which environments tell, and their usual values."""
-MADE_WITH = {"gearbox": "automatic", "start": "grid", "opponents": ()}
-"""Those that only :func:`gym.make` knows."""
+USUAL: Mapping[str, Any] = {
+    "action": "pedals", "gearbox": "automatic", "start": "grid", "opponents": (), "delay": 0,
+    "grip": 1.0, "mass": 1.0, "unstick": False, "keep_distance": False,
+}  # fmt: skip
+"""Options that change a drive, and their usual values."""
 
 
 def check_fits(ghost: Ghost, env: gym.Env[Any, Any], name: str | Path) -> None:
@@ -215,30 +217,27 @@ def check_fits(ghost: Ghost, env: gym.Env[Any, Any], name: str | Path) -> None:
     :param name: of the ghost, for the message
     :raises ModelMismatch: if the drive would be another one
     """
+    if env.spec is not None and env.spec.id != WORLD:
+        raise ModelMismatch(
+            f"the ghost '{name}' was driven in {WORLD}, not in {env.spec.id}: give --env {WORLD}"
+        )
     backend, aids = env.get_wrapper_attr("backend"), env.get_wrapper_attr("aids")
-    wanted = ghost.env_kwargs
     has = {
+        **USUAL,
+        **(env.spec.kwargs if env.spec is not None else {}),  # cars of one race have none
+        **env.get_wrapper_attr("conditions").choice,
         "track": backend.track.name,
         "car": backend.car,
         "action_repeat": env.get_wrapper_attr("action_repeat"),
         "action": env.get_wrapper_attr("action"),
-        **env.get_wrapper_attr("conditions").choice,
         "unstick": aids.unstick,
         "keep_distance": aids.keep_distance,
     }
-    needs = {
-        "track": load_track(find_track(wanted["track"], find_game()).path).name,
-        "car": wanted["car"],
-        "action_repeat": wanted["action_repeat"],
-        "action": wanted.get("action", "pedals"),
-        **{name: wanted.get(name, usual) for name, usual in USUAL.items()},
-    }
-    if env.spec is not None:  # cars of one race have none
-        made_with = env.spec.kwargs
-        has.update({name: made_with.get(name) or usual for name, usual in MADE_WITH.items()})
-        needs.update({name: wanted.get(name) or usual for name, usual in MADE_WITH.items()})
-    for what, value in needs.items():
-        if has[what] != value:
+    own_track = load_track(find_track(ghost.env_kwargs["track"], find_game()).path).name
+    needs = {**USUAL, **ghost.env_kwargs, "track": own_track}
+    for what in ("track", "car", "action_repeat", *USUAL):
+        value = needs[what] or USUAL.get(what)  # no opponents may be None, [] or ()
+        if (has[what] or USUAL.get(what)) != value:
             raise ModelMismatch(
                 f"the ghost '{name}' was driven with {what} {value!r}, not {has[what]!r}: its "
                 "actions fit no other race; search one there: sb3-torcs optimize-lap"

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from sb3_torcs.actions import ACTIONS, ActionLayout, action_layout
+from sb3_torcs.actions import ACTIONS, action_layout
 from sb3_torcs.agents.ghosts import GhostDriver, check_fits, is_ghost, read_ghost
 from sb3_torcs.agents.model_algorithm import algorithm_of, check_same, is_sbx, told_algorithm
 from sb3_torcs.agents.model_file import (
@@ -24,7 +24,13 @@ from sb3_torcs.agents.model_file import (
     saved_weights,
 )
 from sb3_torcs.agents.model_policy import Spaces, build_policy, readable_policy, readable_space
-from sb3_torcs.agents.model_record import BEST_MODEL, TrainingRecord, record_beside, record_within
+from sb3_torcs.agents.model_record import (
+    BEST_MODEL,
+    DRIVEN_WITH,
+    TrainingRecord,
+    record_beside,
+    record_within,
+)
 from sb3_torcs.agents.scripted import SCRIPTED, ScriptedDriver
 from sb3_torcs.agents.wrapping import frames_of, normalizes, stacked_space, unrebuilt
 from sb3_torcs.errors import (
@@ -33,7 +39,7 @@ from sb3_torcs.errors import (
     ModelNotTrusted,
     near_miss,
 )
-from sb3_torcs.sensors import View, choices_of_size, range_finder_angles
+from sb3_torcs.sensors import choice_within, range_finder_angles
 
 if TYPE_CHECKING:
     from sb3_torcs.torcs.installation import Game
@@ -279,10 +285,7 @@ def saved_spaces(model: Path, *, trust: bool = False) -> Spaces:
 
 
 def check_spaces(
-    model: Path,
-    saved: Spaces,
-    env: gym.Env[Any, Any],
-    frames: int | None = None,
+    model: Path, saved: Spaces, env: gym.Env[Any, Any], frames: int | None = None
 ) -> None:
     """
     Make sure that a model fits an environment.
@@ -300,38 +303,50 @@ def check_spaces(
         record = training_record(model)
         hint = f" (it was trained on {record.env_id})" if record.env_id else ""
         name = env.spec.id if env.spec else "Torcs-v0"  # cars of one race have no spec
-        advice = (
-            "give the --env that it was trained on, or train a model for this one: sb3-torcs train "
-            f"--env {name}"
-        )
         frames_seen = _frames_seen(has, needs) if what == "observations" else None
         option = _option_of(has)
-        if not record.known and option is not None:
-            advice = f"an environment that is made with {option} has them: --env-kwargs {option}"
-        if frames_seen is not None and not record.known:
+        if record.env_id == name:
+            said = ", ".join(f"{key}={value!r}" for key, value in _task(record).items())
+            advice = f"it learned there with {said or 'the defaults'}; give it the same"
+        elif record.known or (frames_seen is None and option is None):
             advice = (
-                f"if it sees {frames_seen} observations at once, write 'frame_stack: {frames_seen}'"
-                f" into '{model.parent / 'config.yml'}', as the zoo does"
+                "give the --env that it was trained on, or train a model for this one: sb3-torcs "
+                f"train --env {name}"
+            )
+        elif frames_seen is not None:
+            advice = (
+                f"if it sees {frames_seen} observations at once, write "
+                f"'frame_stack: {frames_seen}' into '{model.parent / 'config.yml'}', as the zoo "
+                "does"
+            )
+        else:
+            advice = (
+                f"an environment that is made with {option} has them: sb3-torcs evaluate takes "
+                f"--env-kwargs {option}, and RecordCallback writes it into the models of a script, "
+                "for all commands"
             )
         raise ModelMismatch(
             f"'{model}'{hint} has {what} {_layout(has)}, but {name} has {_layout(needs)}; {advice}"
         )
 
 
+def _task(record: TrainingRecord) -> dict[str, Any]:
+    """Collect what of a training decides on the layout of observations and actions."""
+    wrappers = ("env_wrapper", "frame_stack")
+    found = {key: record.hyperparameters[key] for key in wrappers if key in record.hyperparameters}
+    return {**record.kept(DRIVEN_WITH), **found}
+
+
 def _option_of(space: spaces.Space[Any]) -> str | None:
     """Find the argument of an environment that gives it such observations or actions."""
     if not isinstance(space, spaces.Box) or len(space.shape) != 1:
         return None
-
-    def is_of(other: View | ActionLayout) -> bool:
-        bounds = np.array((other.low, other.high), np.float32)
-        return np.array_equal(bounds, np.array((space.low, space.high), np.float32))
-
     for action in ACTIONS:
-        if is_of(action_layout(action)):
+        layout = action_layout(action)
+        if np.array_equal((space.low, space.high), np.array((layout.low, layout.high), np.float32)):
             return f"action={action!r}"
-    views = [view for view in choices_of_size(space.shape[0]) if is_of(view)]
-    return f"sensors={list(views[0].sensors)}".replace(" ", "") if views else None
+    view = choice_within(space.low, space.high)
+    return None if view is None else f"sensors={list(view.sensors)}".replace(" ", "")
 
 
 def _frames_seen(has: spaces.Space[Any], needs: spaces.Space[Any]) -> int | None:

@@ -31,7 +31,7 @@ from sb3_torcs.cli import (
 )
 from sb3_torcs.cli.common import INTERRUPTED
 from sb3_torcs.cli.parser import Parser
-from sb3_torcs.cli.plain import any_terminal
+from sb3_torcs.cli.plain import any_terminal, open_streams
 from sb3_torcs.errors import Sb3TorcsError
 from sb3_torcs.signals import answered
 
@@ -53,6 +53,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     :return: the exit status: 0, 2 if the command cannot be run as typed, 130 after Ctrl-C
     """
     words = list(sys.argv[1:] if argv is None else argv)
+    open_streams()
     with any_terminal():
         args = _parsed(words)
         return 0 if args is None else _run(args)

@@ -61,11 +61,7 @@ def add_parser(subparsers: Any) -> None:
         "--json", action="store_true", help="print one JSON object and nothing else"
     )
     parser.add_argument(
-        "--seconds",
-        type=float,
-        default=30.0,
-        metavar="S",
-        help="how long, about; default: 30",
+        "--seconds", type=float, default=30.0, metavar="S", help="for about so long; default: 30"
     )
     parser.set_defaults(run=run)
 

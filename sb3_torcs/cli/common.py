@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from sb3_torcs.torcs.installation import Game
 
 __all__ = [
+    "AGENT_HELP",
     "INTERRUPTED",
     "MODEL_HELP",
     "TRUST_HELP",
@@ -31,7 +32,8 @@ __all__ = [
 INTERRUPTED = 130
 """The exit status after Ctrl-C, as shells have it."""
 
-MODEL_HELP = "a saved .zip, a run's folder, a shipped agent, a ghost, or 'scripted'"
+AGENT_HELP = "a saved .zip, a run's folder, a shipped agent, or 'scripted'"
+MODEL_HELP = AGENT_HELP.replace(", or ", ", a ghost, or ")
 
 TRUST_HELP = "run the code that is pickled in the model: only if you trust its author"
 

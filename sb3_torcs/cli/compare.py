@@ -62,11 +62,13 @@ def run(args: argparse.Namespace) -> int:
     html = writable_file(args.html, (".html",))
     with quiet_output(args.json):
         report = compare(*args.drivers, track=args.track, laps=args.laps, trust=args.trust)
-        report.save(html)
     if args.json:
         print_json(report.comparison.as_dict(str(html)))
+        report.save(html)
     else:
         _show(report.comparison, html)
+        report.save(html)
+        print(f"page: {html}")
     return 0
 
 
@@ -90,7 +92,6 @@ def _show(comparison: Comparison, html: Path) -> None:
         print(table(CORNER_HEADERS, rows))
     for sentence in (*summary(comparison), *missing(comparison)):
         print(sentence)
-    print(f"page: {html}")
 
 
 def _corner_row(number: int, driver: str, corner: dict[str, Any]) -> tuple[str, ...]:

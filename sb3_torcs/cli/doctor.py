@@ -10,7 +10,6 @@ import shutil
 import sys
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 from sb3_torcs.car import DEFAULT_CAR
@@ -142,18 +141,12 @@ def _package(name: str, module: str) -> Check:
 
 
 def _compile_cache() -> Check:
-    """Find numba's cache. Without one, each start compiles for seconds."""
-    from numba.core import config
-
-    import sb3_torcs.backends
-
-    given = config.CACHE_DIR
-    folder = Path(given) if given else Path(sb3_torcs.backends.__file__).parent / "__pycache__"
-    existing = next(path for path in (folder, *folder.parents) if path.exists())
-    if os.access(existing, os.W_OK):
-        return Check("compile cache", True, str(folder), None)
-    fix = "export NUMBA_CACHE_DIR=~/.cache/numba"
-    return Check("compile cache", False, f"{folder} is not writable", fix)
+    """Ask numba where it keeps what it compiles. Without that, each start takes seconds longer."""
+    try:
+        from sb3_torcs.actions import automatic_gear
+    except RuntimeError as error:  # no folder can be written
+        return Check("compile cache", False, str(error), "export NUMBA_CACHE_DIR=/tmp/numba")
+    return Check("compile cache", True, automatic_gear.stats.cache_path, None)
 
 
 def _bundled_tracks() -> Check:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -102,13 +103,15 @@ def run(args: argparse.Namespace) -> int:
     files = _files(args)
     with quiet_output(args.json):
         result, recorder, log = _drive(args, ticks=_ticks_wanted(files, "telemetry", "report"))
-        _write(files, recorder, log, str(args.model))
+    # Before the files: a full disk does not drop what was driven.
     if args.json:
         episodes = [episode.as_dict() for episode in result]
         print_json({"env": recorder.env_id, **recorder.names(), "episodes": episodes})
     else:
         print(f"{recorder.env_id}, {', '.join(recorder.names().values())}")
         print(table(HEADERS, [_row(number, episode) for number, episode in enumerate(result, 1)]))
+    with quiet_output(args.json), contextlib.closing(recorder):
+        _write(files, recorder, log, str(args.model))
     if "report" in files and not _reported(files["report"], recorder, log):
         print(f"sb3-torcs: no report: nobody drove a whole lap of {recorder.names()['track']}",
             file=sys.stderr)  # fmt: skip
@@ -150,7 +153,6 @@ def _write(files: Mapping[str, Path], recorder: Recorder, log: DriveLog, model: 
         log.write(files["telemetry"])
     elif "telemetry" in files:
         recorder.write(files["telemetry"], model)
-    recorder.close()
 
 
 def _reported(path: Path, recorder: Recorder, log: DriveLog) -> bool:
@@ -187,7 +189,7 @@ def _drive(args: argparse.Namespace, *, ticks: bool) -> tuple[list[Episode], Rec
     from sb3_torcs.telemetry import DriveLog
     from sb3_torcs.training.zoo import check_env_kwargs, check_racing
 
-    _check_options(dict(args.env_kwargs))
+    _check_options(args.env_kwargs)
     record = told_record(args.model)
     env_id = args.env
     if env_id is None:
@@ -205,12 +207,15 @@ def _drive(args: argparse.Namespace, *, ticks: bool) -> tuple[list[Episode], Rec
     return result, recorder, log
 
 
-def _check_options(env_kwargs: Mapping[str, Any]) -> None:
-    """Refuse what has an option of its own: one of the two would be dropped."""
+def _check_options(settings: Sequence[tuple[str, Any]]) -> None:
+    """Refuse what is said twice, or has an option of its own: one of the two would be dropped."""
     from sb3_torcs.errors import InvalidOption
     from sb3_torcs.training.zoo import TIME_LIMIT
 
-    for name, value in env_kwargs.items():
+    names = [name for name, _ in settings]
+    for name, value in settings:
+        if names.count(name) > 1:
+            raise InvalidOption(f"--env-kwargs has {name} twice; give it one value")
         if name == TIME_LIMIT:
             raise InvalidOption(
                 f"--env-kwargs has {name}={value}, but the time limit follows from the laps; "

@@ -59,12 +59,8 @@ def add_parser(subparsers: Any) -> None:
     add("--car", metavar="C", help="default: that of the training, or car1-trb1")
     add("--seconds", type=positive, metavar="S",
         help=f"how long to search; default: {SECONDS}, or no limit with --rollouts")  # fmt: skip
-    add(
-        "--rollouts",
-        type=positive,
-        metavar="N",
-        help="end the search after N tries; a ghost takes some 10,000",
-    )
+    add("--rollouts", type=positive, metavar="N",
+        help="end the search after N tries; a ghost takes some 10,000")  # fmt: skip
     add("--seed", type=seed, default=0, metavar="S", help="seed of the search; default: 0")
     add("--action-repeat", type=positive, metavar="N",
         help="control ticks of 0.02 s per timestep; default: that of the training")  # fmt: skip
@@ -98,7 +94,6 @@ def run(args: argparse.Namespace) -> int:
             f"the search ended before its first race of its own was whole ({state.rollouts} "
             f"rollouts, {seconds:.0f} s), so no ghost is kept; give more --seconds or --rollouts"
         )
-    ghost.write(out)
     standing, *flying = ghost.lap_times
     figures = {
         "track": track,
@@ -112,10 +107,12 @@ def run(args: argparse.Namespace) -> int:
     }
     if args.json:
         print_json(figures)
+        ghost.write(out)
     else:
         print(f"{track}, {kwargs['car']}: {state.rollouts} rollouts, {seconds:.0f} s")
         rows = [(f"{number}", f"{time:.3f}") for number, time in enumerate(ghost.lap_times, 1)]
         print(table(HEADERS, rows))
+        ghost.write(out)
         print(f"ghost: {out}")
     return INTERRUPTED if stopped else 0
 

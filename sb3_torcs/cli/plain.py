@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import codecs
 import contextlib
+import os
 import sys
 import unicodedata
 from collections.abc import Iterator
 
-__all__ = ["any_terminal"]
+__all__ = ["any_terminal", "open_streams"]
 
 HANDLER = "sb3_torcs.plain"
 PLAIN = {"→": "->", "–": "-", "—": "-", "−": "-", "×": "x", "·": "*", "°": " deg", "’": "'"}
@@ -30,6 +31,22 @@ def _plain(error: UnicodeError) -> tuple[str | bytes, int]:
 
 
 codecs.register_error(HANDLER, _plain)
+
+
+def open_streams() -> None:
+    """
+    Let what is written to a closed stream (``>&-``) go nowhere.
+
+    Otherwise the next file that is opened would take the place of the stream.
+    """
+    missing = [name for name in ("stdin", "stdout", "stderr") if getattr(sys, name) is None]
+    if not missing:
+        return
+    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
+        os.set_inheritable(descriptor, True)
+    os.close(descriptor)
+    for name in missing:
+        setattr(sys, name, open(os.devnull, "r" if name == "stdin" else "w"))  # noqa: SIM115
 
 
 @contextlib.contextmanager

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sb3_torcs.cli.common import (
-    MODEL_HELP,
+    AGENT_HELP,
+    INTERRUPTED,
     TRUST_HELP,
     positive,
     print_json,
@@ -32,6 +33,8 @@ FILES = {
     "report": (".html",),
 }  # fmt: skip
 """Endings of what can be written: a video of the first race, the others of the last one."""
+NEED_THE_LAST = ("telemetry", "report")
+"""What is written only if all races were held."""
 
 GRIDS = ("last", "reverse", "random")
 BAR = "{l_bar}{bar}| {n:.1f}/{total} races [{elapsed}<{remaining}]"
@@ -49,6 +52,8 @@ all; reverse begins each race in the reverse order of the standings before. With
 holds the first driver and N - 1 of the others, who are drawn.
 
 A win rate comes with its 95 % interval. Ratings are those of openskill (Plackett-Luce).
+
+Ctrl-C ends the command after the races that are over, and tells how they went.
 
 With --game the installed game holds the same races, and comes to the same standings. It does not
 count contacts and metres.
@@ -69,7 +74,7 @@ def add_parser(subparsers: Any) -> None:
     )
     add = parser.add_argument
     add("drivers", nargs="+", metavar="DRIVER",
-        help=f"{MODEL_HELP}; or a robot, e.g. inferno or bt:3")  # fmt: skip
+        help=f"{AGENT_HELP}; or a robot, e.g. inferno or bt:3")  # fmt: skip
     add("--track", default="aalborg", metavar="T", help="the track; default: aalborg")
     add("--laps", type=positive, default=5, metavar="N", help="laps of a race; default: 5")
     add("--races", type=positive, default=20, metavar="N", help="races to hold; default: 20")
@@ -114,17 +119,25 @@ def run(args: argparse.Namespace) -> int:
         log = DriveLog() if "telemetry" in files or "report" in files else None
         footage = _footage(args)
         races = _held(args, entrants, log, footage)
-        if footage is not None:
-            footage.save(files["video"], _followed(entrants, races[0]), args.laps)
-        _write(files, races[-1], log, entrants[0].name)
     for race in races:
         for driver, why in race.failures.items():
             print(f"sb3-torcs: race {race.seed}: {driver} is out: {why}", file=sys.stderr)
     if args.json:
         print_json(_as_json(args, races))
     else:
-        _show(races, files)
-    return 0
+        _show(races)
+    stopped = len(races) < args.races
+    if stopped:
+        for what in NEED_THE_LAST:
+            files.pop(what, None)
+    with quiet_output(args.json):
+        if footage is not None:
+            footage.save(files["video"], _followed(entrants, races[0]), args.laps)
+        _write(files, races[-1], log, entrants[0].name)
+    if not args.json:
+        for what, path in files.items():
+            print(f"{what}: {path}")
+    return INTERRUPTED if stopped else 0
 
 
 def _footage(args: argparse.Namespace) -> Footage | None:
@@ -176,7 +189,11 @@ def _held(
     log: DriveLog | None,
     footage: Footage | None,
 ) -> list[Race]:
-    """Hold the races behind a progress bar; the first one is recorded, the last one is noted."""
+    """
+    Hold the races behind a progress bar; the first one is recorded, the last one is noted.
+
+    After Ctrl-C those that were held are all.
+    """
     from tqdm import tqdm
 
     from sb3_torcs.races.in_the_game import run_game_race, setup_in_the_game
@@ -203,11 +220,16 @@ def _held(
                 watchers.append(Notes(log, args.track))
             return run_race(order, args.track, watchers=watchers, **options)
 
-        for race in run_races(
-            entrants, hold, races=args.races, grid=args.grid, field_size=args.field, seed=args.seed
-        ):
-            races.append(race)
-            tell(0.0)
+        try:
+            for race in run_races(
+                entrants, hold, races=args.races, grid=args.grid, field_size=args.field,
+                seed=args.seed,
+            ):  # fmt: skip
+                races.append(race)
+                tell(0.0)
+        except KeyboardInterrupt:
+            if not races:
+                raise
     return races
 
 
@@ -226,7 +248,7 @@ def _as_json(args: argparse.Namespace, races: list[Race]) -> dict[str, Any]:
     }
 
 
-def _show(races: list[Race], files: Mapping[str, Path]) -> None:
+def _show(races: list[Race]) -> None:
     """Print the figures of the drivers, and the standings of the last race."""
     from sb3_torcs.races.standings import driver_figures
 
@@ -249,5 +271,3 @@ def _show(races: list[Race], files: Mapping[str, Path]) -> None:
         )
         for s in races[-1].standings
     ]))  # fmt: skip
-    for what, path in files.items():
-        print(f"{what}: {path}")

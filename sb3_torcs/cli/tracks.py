@@ -54,22 +54,21 @@ def run(args: argparse.Namespace) -> int:
                 f"--plot draws one track, but {len(tracks)} are named; "
                 "type e.g.: sb3-torcs tracks aalborg --plot aalborg.png"
             )
-        path = writable_file(args.plot, (".png",))
-        from sb3_torcs.tracks.plot import plot_track
-        from sb3_torcs.tracks.racing_line import driven
-
-        line = driven(tracks[0]) if args.racing_line else (None, None)
-        plot_track(tracks[0], path, *line)
+        plot = writable_file(args.plot, (".png",))
     summaries = [track.summary() for track in tracks] if tracks else available_tracks()
     if args.json:
         print_json([summary._asdict() for summary in summaries])
-        return 0
-    rows = [
-        (s.name, s.category, f"{s.length_m:.1f}", f"{s.width_m:.1f}", f"{s.tightest_radius_m:.1f}",
-         s.source)
-        for s in summaries
-    ]  # fmt: skip
-    print(table(HEADERS, rows))
+    else:
+        print(table(HEADERS, [
+            (s.name, s.category, f"{s.length_m:.1f}", f"{s.width_m:.1f}",
+             f"{s.tightest_radius_m:.1f}", s.source)
+            for s in summaries
+        ]))  # fmt: skip
     if args.plot is not None:
-        print(f"drawn: {args.plot}")
+        from sb3_torcs.tracks.plot import plot_track
+        from sb3_torcs.tracks.racing_line import driven
+
+        plot_track(tracks[0], plot, *(driven(tracks[0]) if args.racing_line else ()))
+        if not args.json:
+            print(f"drawn: {plot}")
     return 0

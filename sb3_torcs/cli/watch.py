@@ -127,12 +127,17 @@ def _shows(game: Game, names: Sequence[str], args: argparse.Namespace) -> list[S
     :param names: of models or robots
     :param args: from the command line
     """
+    from sb3_torcs.agents.ghosts import is_ghost
     from sb3_torcs.agents.model_record import DRIVEN_WITH, TrainingRecord
     from sb3_torcs.agents.models import one_of
     from sb3_torcs.errors import InvalidOption
     from sb3_torcs.evaluation.watching import Show
 
     robots = [game.parse_robot(name) if game.has_robot(name) else None for name in names]
+    if args.robots and any(map(is_ghost, names)):
+        raise InvalidOption(
+            "a ghost drives as it did, alone on the road, whoever is there; leave --robots out"
+        )
     if args.car is not None and all(robots):
         raise InvalidOption(
             f"--car is for models; a robot has one for each index, e.g. {names[0]}:1, and "

@@ -135,9 +135,9 @@ def _check_tells(world: Backend, view: View, keep_distance: bool) -> None:
     lacking += ["keep_distance"] if keep_distance else []
     if lacking and not optional(world, "tells_race"):
         raise InvalidOption(
-            "without a race, of which this world does not tell, there is no "
-            f"{' and no '.join(map(repr, lacking))}; leave that out, or use backend 'native' of "
-            "Torcs-v0"
+            "this world does not tell of other cars, which is needed for "
+            f"{' and '.join(map(repr, lacking))}; use Torcs-v0 with backend 'native', or type "
+            "`sb3-torcs race`, which also makes videos (--video FILE.mp4 --view behind)"
         )
     if NEEDS_CAR.intersection(view.sensors) and optional(world, "facts") is None:
         raise InvalidOption(

@@ -15,7 +15,7 @@ import gymnasium as gym
 
 from sb3_torcs.agents.model_record import DRIVEN_WITH
 from sb3_torcs.agents.rollout import Driver, Timestep, drive
-from sb3_torcs.car import CONTROL_TICK
+from sb3_torcs.car import CONTROL_TICK, check_count
 from sb3_torcs.torcs.track_names import RANDOM_TRACK
 
 __all__ = [
@@ -187,7 +187,9 @@ def evaluate(
     :param episodes: how many
     :param seed: of the first reset; the next episodes go on from it
     :return: the results of each
+    :raises InvalidOption: if ``episodes`` is no whole number of at least 1
     """
+    check_count("episodes", episodes)
     results = []
     for number in range(episodes):
         lap_times, total = [], 0.0
