@@ -302,6 +302,22 @@ def test_reward_and_start_are_switched_and_given_back(n_envs, vec_env_cls):
     env.close()
 
 
+def test_what_an_interrupted_training_left_is_not_taken_for_the_environments_own():
+    """SB3 tells no callback that an exception has ended a training."""
+
+    class Stop(BaseCallback):
+        def _on_step(self):
+            raise KeyboardInterrupt
+
+    model = make_model()
+    before = model.get_env().env_method("settings")
+    callbacks = [RewardCallback(reward="blog"), RandomStartCallback()]
+    with pytest.raises(KeyboardInterrupt):
+        learn(model, 4, *callbacks, Stop())
+    learn(model, 4, *callbacks)
+    assert model.get_env().env_method("settings") == before
+
+
 def test_the_reward_changes_after_so_many_timesteps():
     model = make_model()
     spy = learn(model, 20, RewardCallback(reward="blog", timesteps=12))

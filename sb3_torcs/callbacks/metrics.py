@@ -26,7 +26,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_torcs.actions import ACTIONS, PEDALS, ActionLayout, layout_of_width
 from sb3_torcs.agents.rollout import drive
-from sb3_torcs.car import CarState, is_count
+from sb3_torcs.car import CarState, check_count
 from sb3_torcs.errors import InvalidOption, renamed
 from sb3_torcs.tracks.track import Track
 from sb3_torcs.vec_env import glance
@@ -312,8 +312,7 @@ class DrivingMetricsCallback(BaseCallback):
             ("q_size", q_size),
             ("line_timesteps", line_timesteps),
         ):
-            if not is_count(value):
-                raise InvalidOption(f"{name} is {value!r}; expected a whole number >= 1")
+            check_count(name, value)
         self.q_every = q_every
         self.q_size = q_size
         self.line = line

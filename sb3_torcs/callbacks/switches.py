@@ -29,6 +29,9 @@ class _SwitchUser(BaseCallback):
 
     _switches: Sequence[_Switch] = ()
 
+    def _on_training_start(self) -> None:
+        self._on_training_end()  # SB3 does not call it for a training that an exception ended
+
     def _on_step(self) -> bool:
         return True
 
@@ -65,6 +68,7 @@ class RewardCallback(_SwitchUser):
         self.timesteps = timesteps
 
     def _on_training_start(self) -> None:
+        super()._on_training_start()
         self._switches = ()
         if self.num_timesteps >= self.timesteps:
             self._change()
@@ -109,6 +113,7 @@ class RandomStartCallback(_SwitchUser):
         self.speed = None if speed is None else checked_start_speed(speed)
 
     def _on_training_start(self) -> None:
+        super()._on_training_start()
         settings: list[tuple[str, Any]] = [("set_start", self.start)]
         if self.speed is not None:
             settings.append(("set_random_speed", self.speed))
@@ -149,6 +154,7 @@ class ConditionsCallback(_SwitchUser):
             checked_delay(choice) if name == "delay" else checked_factor(name, choice)
 
     def _on_training_start(self) -> None:
+        super()._on_training_start()
         self._switches = [_Switch(self.training_env, "set_conditions", self.conditions)]
 
 
