@@ -120,7 +120,7 @@ PEDALS = ActionLayout(
 )
 """The layout of the original post."""
 
-_, ACTION_LOW, ACTION_HIGH = PEDALS[:3]
+ACTION_LOW, ACTION_HIGH = PEDALS.low, PEDALS.high
 
 _PEDAL = ActionLayout(("steering", "pedal"), (-1.0, -1.0), (1.0, 1.0), _read_pedal)
 _MANUAL = ("steering", "throttle", "brake", "gear", "clutch")

@@ -38,6 +38,7 @@ __all__ = [
     "Start",
     "StartName",
     "car_from_record",
+    "check_count",
     "checked_delay",
     "checked_factor",
     "checked_flag",
@@ -92,6 +93,18 @@ def is_number(value: Any) -> bool:
 def is_count(value: Any) -> bool:
     """Whether a value is a whole number of at least 1, NumPy's included; a bool is none."""
     return not isinstance(value, bool) and isinstance(value, Integral) and int(value) >= 1
+
+
+def check_count(name: str, value: Any) -> None:
+    """
+    Make sure that an option is a whole number of at least 1.
+
+    :param name: of the option
+    :param value: what was given
+    :raises InvalidOption: if it is not
+    """
+    if not is_count(value):
+        raise InvalidOption(f"{name} is {value!r}; expected a whole number >= 1")
 
 
 class Controls(NamedTuple):

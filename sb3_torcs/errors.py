@@ -195,7 +195,7 @@ class RayUnavailable(Sb3TorcsError, RuntimeError):
 
 
 class TrainingDiverged(Sb3TorcsError, ArithmeticError):
-    """The weights of a model that learns are not numbers any more."""
+    """A model that learns computes no numbers any more."""
 
 
 class WorkerLost(Sb3TorcsError, RuntimeError):

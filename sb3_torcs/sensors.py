@@ -235,6 +235,19 @@ def choices_of_size(size: int) -> tuple[View, ...]:
     return tuple(view for view in views if view.size == size)
 
 
+def choice_within(low: npt.ArrayLike, high: npt.ArrayLike) -> View | None:
+    """
+    Find the choice of groups whose observations have these bounds.
+
+    :param low: of each number of an observation
+    :param high: of each
+    :return: the choice; ``None`` if there is none
+    """
+    bounds = np.array((low, high), np.float32)
+    views = choices_of_size(bounds.shape[1]) if bounds.ndim == 2 else ()
+    return next((v for v in views if np.array_equal((v.low, v.high), bounds)), None)
+
+
 _measure = attrgetter(*(sensor.name for sensor in SENSORS))
 _SIZES = tuple(sensor.size for sensor in SENSORS)
 

@@ -27,12 +27,12 @@ OPTIONAL: dict[str, Any] = {
     "conditions": (),  # names of those that ``set_conditions(grip, mass)`` changes
     "draw_track": None,  # a method, of a world that has several; see :class:`Backend`
 }
-"""What a world may have besides, and what holds for one that has it not."""
+"""What a world may have besides, and what holds for one that does not have it."""
 
 
 def optional(world: Any, name: str) -> Any:
     """
-    Return what a world may have, or what holds for one that has it not.
+    Return what a world may have, or what holds for one that does not have it.
 
     :param world: a backend
     :param name: of :data:`OPTIONAL`

@@ -22,7 +22,7 @@ from sb3_torcs.car import (
     Start,
     checked_laps,
 )
-from sb3_torcs.errors import BackendUnavailable, InvalidOption, TrackFileError
+from sb3_torcs.errors import BackendUnavailable, EnvClosed, InvalidOption, TrackFileError
 from sb3_torcs.sensors import RangeFinderName, range_finder_angles
 from sb3_torcs.torcs.building import build_command
 from sb3_torcs.torcs.car_file import CarFacts
@@ -314,7 +314,10 @@ class NativeBackend:
         Keep the whole race, robots and noise included.
 
         :return: a moment, for :meth:`restore` of this backend
+        :raises EnvClosed: before the first reset
         """
+        if not self._drive:
+            raise EnvClosed("save before reset; call reset first")
         return self.engine.save(), list(self._drive), self._state
 
     def restore(self, moment: Any) -> CarState:

@@ -346,7 +346,7 @@ class Seat(Drawn):
     def __reduce__(self) -> NoReturn:
         raise InvalidOption(
             "an environment that shares its race with other agents cannot be copied or sent to "
-            "another process; make it there, and a vector of environments as a whole"
+            "another process; make another one there"
         )
 
     def __deepcopy__(self, memo: dict[int, Any]) -> NoReturn:

@@ -16,7 +16,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from sb3_torcs.backends.native import Fleet
 from sb3_torcs.backends.several import present_world, shared_worlds
-from sb3_torcs.car import CarState, is_count
+from sb3_torcs.car import CarState, check_count, is_count
 from sb3_torcs.envs.conditions import Part
 from sb3_torcs.envs.making import NO_LIMIT, checked_time_limit
 from sb3_torcs.envs.racing import Observation
@@ -64,8 +64,7 @@ class TorcsVectorEnv(SyncVectorEnv):
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         **options: Any,
     ) -> None:
-        if not is_count(num_envs):
-            raise InvalidOption(f"num_envs is {num_envs!r}; expected a whole number >= 1")
+        check_count("num_envs", num_envs)
         if threads is not None and not is_count(threads):
             raise InvalidOption(f"threads is {threads!r}; expected a whole number >= 1, or None")
         if options.get("backend", "native") != "native":

@@ -163,7 +163,7 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
             frames: list[npt.NDArray[np.uint8]] = []
 
             def show(car: CarState, controls: Controls) -> None:
-                del controls  # of the timestep, which the board shows
+                del controls  # the picture has those of the timestep
                 tick = next(ticks)
                 if tick > stretch.first * repeat and tick % VIDEO_TICKS == 0:
                     before, racing.car = racing.car, car  # within a timestep, for the picture

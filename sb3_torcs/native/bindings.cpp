@@ -257,13 +257,8 @@ PYBIND11_MODULE(_engine, module) {
              py::kw_only(), "data"_a, "libraries"_a, "plib"_a, "track"_a, "session"_a, "entries"_a,
              "cars"_a, "laps"_a, "angles"_a, "road_speed"_a = std::vector<bool>{},
              "flagged"_a = false)
-        .def(
-            "start",
-            [](Engine& engine) {
-                const WithoutPython released;
-                engine.start();
-            },
-            "Begin a race from the grid.")
+        .def("start", py::overload_cast<>(&Engine::start), py::call_guard<WithoutPython>(),
+             "Begin a race from the grid.")
         .def(
             "start_at",
             [](Engine& engine, double distance, double position, double error, double speed) {
@@ -313,20 +308,10 @@ PYBIND11_MODULE(_engine, module) {
             },
             "car"_a, "position"_a, "error"_a, "speed"_a,
             "Put an agent's car down in the middle of the longest free stretch of road, rolling.")
-        .def(
-            "advance",
-            [](Engine& engine, int ticks) {
-                const WithoutPython released;
-                engine.advance(ticks);
-            },
-            "ticks"_a, "Drive on, with the agents standing on their brakes.")
-        .def(
-            "drive",
-            [](Engine& engine, int ticks) {
-                const WithoutPython released;
-                engine.drive(ticks);
-            },
-            "ticks"_a, "Drive on; each agent does what it was last told to hold.")
+        .def("advance", &Engine::advance, py::call_guard<WithoutPython>(), "ticks"_a,
+             "Drive on, with the agents standing on their brakes.")
+        .def("drive", &Engine::drive, py::call_guard<WithoutPython>(), "ticks"_a,
+             "Drive on; each agent does what it was last told to hold.")
         .def(
             "read", [](Engine& engine, int car) { return as_state(engine.read(car)); }, "car"_a,
             "Return a car as the fields of CarState.")
@@ -454,13 +439,8 @@ PYBIND11_MODULE(_engine, module) {
             },
             "controls"_a, "sensors"_a,
             "Drive controls, a tick each, with or without sensors; for benchmarks.")
-        .def(
-            "update_physics",
-            [](Engine& engine, int steps) {
-                const WithoutPython released;
-                engine.update_physics(steps);
-            },
-            "steps"_a, "Move the bare physics on; for benchmarks.");
+        .def("update_physics", &Engine::update_physics, py::call_guard<WithoutPython>(), "steps"_a,
+             "Move the bare physics on; for benchmarks.");
 
     py::class_<Fleet>(module, "Fleet", "Engines that are driven at once, on threads that stay.")
         .def(py::init([](const std::vector<std::shared_ptr<Engine>>& engines, int threads) {
@@ -510,26 +490,16 @@ PYBIND11_MODULE(_engine, module) {
             },
             "races"_a, "seats"_a, "controls"_a, "ticks"_a, py::arg("cars").noconvert(),
             "Drive several at once; writes their cars, and returns the rows of those that failed.")
-        .def(
-            "finish",
-            [](Fleet& fleet) {
-                const WithoutPython released;
-                fleet.finish();
-            },
-            "Wait for all races that have begun to move.");
+        .def("finish", &Fleet::finish, py::call_guard<WithoutPython>(),
+             "Wait for all races that have begun to move.");
 
     py::class_<Rollouts>(module, "Rollouts", "Short drives from one moment, at once.")
         .def(py::init([](const std::vector<Engine*>& engines, int threads) {
                  return std::make_unique<Rollouts>(checked(engines), threads);
              }),
              py::keep_alive<1, 2>(), "engines"_a, "threads"_a)
-        .def(
-            "mark",
-            [](Rollouts& rollouts) {
-                const WithoutPython released;
-                rollouts.mark();
-            },
-            "Keep the moment of the first engine, from which all candidates begin.")
+        .def("mark", &Rollouts::mark, py::call_guard<WithoutPython>(),
+             "Keep the moment of the first engine, from which all candidates begin.")
         .def(
             "drive",
             [](Rollouts& rollouts, const py::array_t<double, py::array::c_style>& path, int ticks) {
@@ -538,13 +508,8 @@ PYBIND11_MODULE(_engine, module) {
                 rollouts.drive(line, ticks);
             },
             "path"_a, "ticks"_a, "Drive on from the mark, and mark there.")
-        .def(
-            "go_back",
-            [](Rollouts& rollouts, std::size_t drives) {
-                const WithoutPython released;
-                rollouts.go_back(drives);
-            },
-            "drives"_a, "Begin again where the last so many drives began.")
+        .def("go_back", &Rollouts::go_back, py::call_guard<WithoutPython>(), "drives"_a,
+             "Begin again where the last so many drives began.")
         .def("follow", &follow, "line"_a, "gains"_a, "offsets"_a, "ticks"_a,
              "Follow a line with offsets; returns the paths, and how many timesteps each lasted.");
 

@@ -59,7 +59,7 @@ void Fleet::work(std::size_t index) {
         for (Order& order : task.orders) {
             if (order.ticks != ticks)
                 throw Error("InvalidOption",
-                            "the cars of one race are driven for as many ticks, not for " +
+                            "the cars of one race are driven for equally many ticks, not for " +
                                 std::to_string(ticks) + " and " + std::to_string(order.ticks));
             if (order.car == FIRST_AGENT) order.car = Engine::first_agent(*race);
             Engine::check_agent(*race, order.car);

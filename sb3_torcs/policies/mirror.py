@@ -15,7 +15,7 @@ import torch as th
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_torcs.errors import InvalidOption
-from sb3_torcs.sensors import GROUPS, Sensor, choices_of_size, look_both_ways
+from sb3_torcs.sensors import GROUPS, Sensor, choice_within, look_both_ways
 
 __all__ = [
     "MirrorImage",
@@ -70,11 +70,8 @@ def sensors_of(space: Any) -> tuple[Sensor, ...]:
     :param space: of the observations, a ``Box``; or a :class:`~sb3_torcs.sensors.View`
     :return: rows of the sensor table; empty if the space is of no choice of groups
     """
-    low, high = (np.asarray(getattr(space, name, ()), np.float32) for name in ("low", "high"))
-    for view in choices_of_size(low.size) if low.ndim == 1 else ():
-        if np.array_equal(view.low, low) and np.array_equal(view.high, high):
-            return tuple(chain(*(GROUPS[name] for name in view.sensors)))
-    return ()
+    view = choice_within(getattr(space, "low", ()), getattr(space, "high", ()))
+    return () if view is None else tuple(chain(*(GROUPS[name] for name in view.sensors)))
 
 
 def mirror_image(space: Any) -> MirrorImage:
@@ -88,9 +85,9 @@ def mirror_image(space: Any) -> MirrorImage:
     rows = sensors_of(space)
     if not rows:
         raise InvalidOption(
-            "the mirror image is known of observations of Torcs-v0 or TorcsLite-v0, not of others "
-            f"of shape {getattr(space, 'shape', None)}; take out what changes their bounds or "
-            "size, as frame stacks do"
+            "only observations of Torcs-v0 and TorcsLite-v0 have a known mirror image, and these, "
+            f"of shape {getattr(space, 'shape', None)}, are none; take out what changes their "
+            "bounds or size, as frame stacks do"
         )
     return _image(rows)
 

@@ -255,9 +255,9 @@ def _check_symmetric(
     ours = sensors_of(observation_space) and layout_of_width(get_action_dim(action_space))
     if symmetric and not ours:
         raise InvalidOption(
-            "symmetric=True mirrors the sensors and actuators of Torcs-v0 and TorcsLite-v0, not "
-            f"observations of shape {observation_space.shape} within other bounds and actions of "
-            f"shape {action_space.shape}; pass symmetric=False"
+            "symmetric=True mirrors the sensors and actuators of Torcs-v0 and TorcsLite-v0, and "
+            f"these observations, of shape {observation_space.shape}, or these actions, of shape "
+            f"{action_space.shape}, are others; pass symmetric=False"
         )
 
 

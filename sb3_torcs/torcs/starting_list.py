@@ -40,7 +40,8 @@ def starting_list(
     """
     if not isinstance(opponents, (list, tuple)) or not all(isinstance(o, str) for o in opponents):
         raise InvalidOption(
-            f"opponents is {opponents!r}; expected a list of names, e.g. ['inferno', 'berniw:3']"
+            f"opponents is {opponents!r}; expected a list of names, e.g. ['inferno', 'berniw:3'], "
+            "or of paths as text"
         )
     numbers = itertools.count(agents if is_count(agents) else 1)
     entries = [

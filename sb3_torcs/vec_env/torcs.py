@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, MutableMapping, Sequence
 from functools import partial
-from typing import Any, Self
+from typing import Any, NoReturn, Self
 
 import gymnasium as gym
 import numpy as np
@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepR
 
 from sb3_torcs.backends.seats import Seat, SharedRace
 from sb3_torcs.backends.several import shared_worlds
-from sb3_torcs.car import is_count
+from sb3_torcs.car import check_count, is_count
 from sb3_torcs.envs.batch import Batch, Timestep
 from sb3_torcs.envs.making import EnvMaker, env_makers
 from sb3_torcs.envs.racing import RacingEnv, RacingInfo
@@ -147,8 +147,7 @@ class TorcsVecEnv(DummyVecEnv):
         **env_kwargs: Any,
     ) -> None:
         self._batch: Batch | None = None
-        if not is_count(agents):
-            raise InvalidOption(f"agents is {agents!r}; expected a whole number >= 1")
+        check_count("agents", agents)
         if threads is not None and not is_count(threads):
             raise InvalidOption(f"threads is {threads!r}; expected a whole number >= 1, or None")
         if isinstance(races, (list, tuple)) and races:
@@ -161,11 +160,10 @@ class TorcsVecEnv(DummyVecEnv):
                     "number of races"
                 )
             makers = list(races)
-        elif is_count(races):
+        else:
+            check_count("races", races)
             made = env_makers(int(races), agents, env_id, env_kwargs)  # type: ignore[arg-type]
             makers = [partial(_monitored, make) for make in made]
-        else:
-            raise InvalidOption(f"races is {races!r}; expected a whole number >= 1")
         super().__init__(makers)
         try:
             self._races = [_Race(env) for env in self._envs]
@@ -294,6 +292,15 @@ class TorcsVecEnv(DummyVecEnv):
             for i, race in enumerate(self._races):
                 self._batch.leave(i)
                 race.leave(int(self._elapsed[i]))
+
+    def __reduce__(self) -> NoReturn:
+        raise InvalidOption(
+            "a TorcsVecEnv, whose threads drive its races, cannot be copied or pickled; make "
+            "another one with the same arguments"
+        )
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> NoReturn:
+        self.__reduce__()
 
     def close(self) -> None:
         """Close all races and end the threads. Calling it twice does no harm."""
