@@ -24,7 +24,7 @@ from sb3_torcs import __version__
 from sb3_torcs.agents import model_record, models
 from sb3_torcs.bench.stages import KEYS
 from sb3_torcs.cli import VERBS, common, doctor, evaluate, main, train
-from sb3_torcs.errors import BackendUnavailable, InvalidOption
+from sb3_torcs.errors import BackendUnavailable, InvalidOption, ZooConfigError
 from sb3_torcs.evaluation import protocol as evaluation
 from sb3_torcs.evaluation import recording
 from sb3_torcs.telemetry import TELEMETRY_FIELDS
@@ -654,6 +654,13 @@ def test_a_mistake_is_told_before_anything_starts(tmp_path, changes, message):
         training_run.train(options(tmp_path, **changes))
     assert message in str(caught.value)
     assert not (tmp_path / "logs").exists()
+
+
+def test_an_algorithm_that_cannot_learn_here_is_told_and_leaves_no_run(tmp_path):
+    said = "dqn cannot learn in TorcsLite-v0 by this entry: The algorithm only supports .*Discrete"
+    with pytest.raises(ZooConfigError, match=said):
+        training_run.train(options(tmp_path, algo="dqn"))
+    assert not list((tmp_path / "logs" / "dqn").iterdir())
 
 
 def test_a_training_goes_on_in_the_environment_of_its_model(monkeypatch):
