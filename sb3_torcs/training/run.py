@@ -206,11 +206,12 @@ def _entry(
         entry = {**zoo.read_entry(*place), **entry}
     if options.track is not None:
         entry["env_kwargs"] = {**(entry.get("env_kwargs") or {}), "track": options.track}
-    if "track" in (entry.get("env_kwargs") or {}):  # of which the zoo writes a record
-        track = lasting_track(entry["env_kwargs"]["track"])
-        entry["env_kwargs"] = {**entry["env_kwargs"], "track": track}
     changed = {**entry, **_changes(options.zoo_args)}
     zoo.check_entry(changed, options.algo, options.env, place, trust=options.trust)
+    for each in (entry, changed):  # of which the zoo and we write records
+        kwargs = each.get("env_kwargs") or {}
+        if "track" in kwargs:
+            each["env_kwargs"] = {**kwargs, "track": lasting_track(kwargs["track"])}
     return entry, {**changed, "env_kwargs": changed.get("env_kwargs") or {}}, place
 
 
