@@ -557,7 +557,7 @@ class TestSensorsOfARace:
 
     @pytest.mark.parametrize("sensors", [("base", "rivals"), ("base", "race")])
     def test_a_world_without_races_cannot_tell_of_one(self, sensors):
-        with pytest.raises(InvalidOption, match="of which this world does not tell"):
+        with pytest.raises(InvalidOption, match="this world does not tell of other cars"):
             gym.make("TorcsLite-v0", sensors=sensors)
 
     def test_in_the_mirror_who_was_left_is_right(self):
