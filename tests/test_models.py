@@ -236,15 +236,16 @@ def learned(saved, env):
     model, path = saved
     zoo_record(path.parent)
     model.save_replay_buffer(path.parent / "replay_buffer.pkl")
-    return path, lambda env=env, algo="ddpg", n_envs=1, **more: check_resumable(
-        path, env, algo, n_envs, **more
-    )
+
+    def check(env=env, algo="ddpg", trust=False, **entry):
+        return check_resumable(path, env, algo, entry, trust=trust)
+
+    return path, check
 
 
 def test_what_belongs_together_is_gone_on_with(learned):
     path, check = learned
     assert check() is True
-    assert check(algo="td3") is True  # which is the same with other defaults
     (path.parent / "replay_buffer.pkl").unlink()
     assert check(n_envs=4) is False
 
@@ -253,6 +254,8 @@ def test_what_does_not_belong_together_is_not_gone_on_with(learned):
     path, check = learned
     with pytest.raises(ModelMismatch, match="a model of ddpg, not of sac; give --algo ddpg"):
         check(algo="sac")
+    with pytest.raises(ModelMismatch, match="a model of ddpg, not of td3"):
+        check(algo="td3")  # which can drive it
     with (
         gym.make("TorcsLite-v0", range_finders="narrow") as narrow,
         pytest.raises(ModelMismatch, match="learned with range_finders 'scr'"),
@@ -261,8 +264,10 @@ def test_what_does_not_belong_together_is_not_gone_on_with(learned):
     with pytest.raises(
         ModelMismatch, match="learned with frame_stack None, and would go on with 3"
     ):
-        check(frames=3)
-    with pytest.raises(ModelMismatch, match=r"replay_buffer.*of 1 cars at once, not 4.*remove it"):
+        check(frame_stack=3)
+    with pytest.raises(ModelMismatch, match=r"learned with normalize False.* go on with True"):
+        check(normalize=True)
+    with pytest.raises(ModelMismatch, match=r"replay_buffer.*of 1 cars .* give n_envs 1, or rem"):
         check(n_envs=4)
     buffer = path.parent / "replay_buffer.pkl"
     buffer.write_bytes(buffer.read_bytes()[:-10])

@@ -1,5 +1,8 @@
 """A training that is resumed goes on as it began."""
 
+import pickle
+import shutil
+
 import pytest
 import yaml
 
@@ -73,6 +76,42 @@ def test_options_of_one_run_are_not_those_of_the_next(run):
     assert kept["callback"] == [METRICS, INTERRUPT]
 
 
-@pytest.mark.parametrize(("algo", "env_id"), [("ddpg", "TorcsLite-v0"), ("ppo", "Torcs-v0")])
-def test_another_algorithm_or_world_has_entries_of_its_own(run, algo, env_id):
-    assert recorded_entry(find_model(run, prefer_last=True), algo, env_id) == {}
+def test_another_world_has_entries_of_its_own(run):
+    assert recorded_entry(find_model(run, prefer_last=True), "ppo", "Torcs-v0") == {}
+
+
+@pytest.mark.parametrize("beside", [True, False])
+def test_the_statistics_of_the_observations_go_on(run, tmp_path, beside):
+    """Those in the run's folder, or else those in the record of a model that was copied."""
+    own = {"TorcsLite-v0": {**ENTRY, "normalize": True, "n_timesteps": 60, "callback": []}}
+    (tmp_path / "own.yml").write_text(yaml.safe_dump(own))
+    words = ["train", "--algo", "ppo", "--no-progress", "--folder", str(tmp_path / "one")]
+    assert main([*words, "--conf-file", str(tmp_path / "own.yml")]) == 0
+    first = tmp_path / "one" / "ppo" / "TorcsLite-v0_1"
+    model = tmp_path / "copied.zip"
+    shutil.copy(first / "TorcsLite-v0.zip", model)
+    gone_on(first if beside else model, tmp_path / "two", "--timesteps", "20")
+    files = [
+        folder / "TorcsLite-v0" / "vecnormalize.pkl"
+        for folder in (first, tmp_path / "two" / "ppo" / "TorcsLite-v0_1")
+    ]
+    before, after = (pickle.loads(file.read_bytes()).obs_rms.count for file in files)
+    assert after == pytest.approx(before + 22, abs=2.01)
+
+
+def test_what_changes_how_it_sees_is_refused(run, tmp_path, capsys):
+    words = ["train", "--resume", str(run), "--folder", str(tmp_path / "none"), "--no-progress"]
+    assert main([*words, "--", "--hyperparams", "normalize:True"]) == 2
+    assert "has learned with normalize False, and would go on with True" in capsys.readouterr().err
+    assert main([*words, "--algo", "a2c"]) == 2
+    assert "is a model of ppo, not of a2c; give --algo ppo" in capsys.readouterr().err
+    assert not (tmp_path / "none").exists()
+
+
+def test_a_callback_that_refuses_to_begin_leaves_no_run(run, tmp_path, capsys):
+    bad = {"TorcsLite-v0": {**ENTRY, "callback": ["sb3_torcs.callbacks.MirrorCallback"]}}
+    (tmp_path / "own.yml").write_text(yaml.safe_dump(bad))
+    words = ["train", "--algo", "ppo", "--no-progress", "--folder", str(tmp_path)]
+    assert main([*words, "--conf-file", str(tmp_path / "own.yml")]) == 2
+    assert "MirrorCallback mirrors samples" in capsys.readouterr().err
+    assert list((tmp_path / "ppo").iterdir()) == []

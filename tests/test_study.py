@@ -126,22 +126,28 @@ def test_an_agent_that_diverges_is_measured_by_its_best_model_of_before(tmp_path
     assert store.checkpoint(trial) is None
     write_report(tmp_path / "out", tmp_path / "report")
     assert (
-        "Diverged, and measured by the best model of before: poisoned-seed0."
+        "poisoned-seed0: the training has diverged: after "
         in (tmp_path / "report" / "report.md").read_text()
     )
 
 
-def test_an_agent_that_diverges_before_its_first_evaluation_fails_once(tmp_path):
+def test_an_agent_that_diverges_before_its_first_evaluation_counts_as_one_without_a_lap(tmp_path):
     callback = {f"{__name__}.PoisonCallback": {"at": 150}}
     study = read_study(
         study_file(tmp_path, seeds=1, variants={"poisoned": {**TINY, "callback": callback}})
     )
     store = StudyFolder(tmp_path / "out", study)
     store.begin()
-    told = []
-    study_module._run_or_tell(study.trials[0], store, told.append)
-    assert [row["phase"] for row in told] == ["failed"]
-    assert "the training has diverged: after " in told[0]["error"]
+    (trial,) = study.trials
+    run_trial(trial, store, lambda row: None)
+    assert store.ended(trial)
+    rows = results(tmp_path / "out")
+    assert [(row["phase"], row["end"], row["completes"]) for row in rows] == [
+        ("train", "diverged", "0"), ("final", "diverged", "0"), ("final", "diverged", "0"),
+    ]  # fmt: skip
+    StudyFolder(tmp_path / "out", study).begin()
+    write_report(tmp_path / "out", tmp_path / "report")
+    assert "0 of 1" in (tmp_path / "report" / "report.md").read_text()
 
 
 def test_the_table_shows_how_far_everybody_is_and_the_best_so_far(begun, monkeypatch, capsys):

@@ -113,14 +113,16 @@ def is_sbx(data: dict[str, Any]) -> bool:
     return referenced_class(data.get("policy_class")).startswith("sbx.")
 
 
-def check_same(model: Path, saved: str | None, algo: str) -> None:
+def check_same(model: Path, saved: str | None, algo: str, *, to_learn: bool = False) -> None:
     """
     Make sure that a model is one of this algorithm.
 
     :param model: the file, for the message
     :param saved: the algorithm that it is of, if that is known
     :param algo: that it should be of
+    :param to_learn: whether it is to learn on: then TD3 is not DDPG, whose models drive alike
     :raises ModelMismatch: if it is not
     """
-    if saved is not None and SAVED_AS.get(saved, saved) != SAVED_AS.get(algo, algo):
+    as_saved = (lambda name: name) if to_learn else (lambda name: SAVED_AS.get(name, name))
+    if saved is not None and as_saved(saved) != as_saved(algo):
         raise ModelMismatch(f"'{model}' is a model of {saved}, not of {algo}; give --algo {saved}")

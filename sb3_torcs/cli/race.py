@@ -128,8 +128,7 @@ def run(args: argparse.Namespace) -> int:
         _show(races)
     stopped = len(races) < args.races
     if stopped:
-        for what in NEED_THE_LAST:
-            files.pop(what, None)
+        _drop_those_of_the_last(files)
     with quiet_output(args.json):
         if footage is not None:
             footage.save(files["video"], _followed(entrants, races[0]), args.laps)
@@ -138,6 +137,13 @@ def run(args: argparse.Namespace) -> int:
         for what, path in files.items():
             print(f"{what}: {path}")
     return INTERRUPTED if stopped else 0
+
+
+def _drop_those_of_the_last(files: dict[str, Path]) -> None:
+    """Leave out the files that need the last race, which was not held."""
+    for what in NEED_THE_LAST:
+        if files.pop(what, None) is not None:
+            print(f"sb3-torcs: no {what}, since the last race was not held", file=sys.stderr)
 
 
 def _footage(args: argparse.Namespace) -> Footage | None:
@@ -227,7 +233,7 @@ def _held(
             ):  # fmt: skip
                 races.append(race)
                 tell(0.0)
-        except KeyboardInterrupt:
+        except (KeyboardInterrupt, SystemExit):  # SIGTERM
             if not races:
                 raise
     return races

@@ -81,7 +81,7 @@ def run(args: argparse.Namespace) -> int:
     else:
         for name, why in diverged.items():
             if why is not None:
-                print(f"{name}: {why}; its best model of before was measured")
+                print(f"{name}: {why}; the results are those of its best model of before, if any")
         for name, error in failed.items():
             print(f"{name} failed: {error}")
         ended = len(study.trials) - len(left)

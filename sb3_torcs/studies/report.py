@@ -134,9 +134,11 @@ def _waiting(folder: Path) -> list[str]:
 
 def _diverged(folder: Path) -> list[str]:
     """List the agents whose training ended early."""
-    names = sorted(file.parent.name for file in folder.glob(f"*/{DIVERGED}"))
-    said = f"Diverged, and measured by the best model of before: {', '.join(names)}."
-    return [said] if names else []
+    return [
+        f"{file.parent.name}: {file.read_text(encoding='utf-8')}. Its figures are those of its "
+        "best model of before, or of no lap if there was none."
+        for file in sorted(folder.glob(f"*/{DIVERGED}"))
+    ]
 
 
 def _homes(trials: Sequence[Results]) -> str:

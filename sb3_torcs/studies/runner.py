@@ -78,9 +78,8 @@ def run_trial(trial: Trial, store: Any, report: Callable[[dict[str, Any]], None]
             try:
                 training.run(after_slice)
             except TrainingDiverged as error:
-                if not store.rows(trial):
-                    raise
-                store.put_diverged(trial, str(error))
+                store.put_diverged(trial, str(error), training.rows_of_nothing())
+                report(store.rows(trial)[-1])
         files, _, missing = store.state(trial)
     chosen = [row for row in store.rows(trial) if row["phase"] == "train" and row["kept"]][-1]
     with _unpacked(files) as folder:
@@ -303,7 +302,7 @@ def _run_or_tell(trial: Trial, store: Any, report: Callable[[dict[str, Any]], No
     """Run a trial. An error that would recur is reported as a row, so that Tune does not retry."""
     try:
         run_trial(trial, store, report)
-    except (StudyError, OutputNotWritable, TrainingDiverged) as error:
+    except (StudyError, OutputNotWritable) as error:
         report({"phase": FAILED, "error": _last_line(error)})
 
 

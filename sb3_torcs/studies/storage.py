@@ -32,13 +32,23 @@ from sb3_torcs.errors import OutputNotWritable, StudyError
 from sb3_torcs.files import read_yaml
 from sb3_torcs.studies.config import FIELDS, Study, Trial, track_name
 
-__all__ = ["DIVERGED", "RECIPE", "RESULTS", "ROWS", "Files", "StudyFolder", "write_whole"]
+__all__ = [
+    "DIVERGED",
+    "DIVERGES",
+    "RECIPE",
+    "RESULTS",
+    "ROWS",
+    "Files",
+    "StudyFolder",
+    "write_whole",
+]
 
 Files = dict[str, bytes]
 """Contents of files by name."""
 
 RESULTS = "results.csv"
 DIVERGED = "diverged.txt"
+DIVERGES = "diverged"  # the end of a race that no model is there to drive
 RECIPE, ROWS, LOCK = "recipe.yml", "rows.json", ".lock"
 CHECKPOINT = "checkpoint-"
 FOR_DRIVERS = (BEST_MODEL, STATISTICS, "config.yml", "args.yml")
@@ -117,7 +127,8 @@ class StudyFolder:
                     "another --folder, or remove that one to begin it anew"
                 )
             needed = BEST_MODEL if self.trained(trial) else f"{CHECKPOINT}*"
-            if self.rows(trial) and not any(self.of(trial).glob(needed)):
+            has_model = any(row["end"] != DIVERGES for row in self.rows(trial))
+            if has_model and not any(self.of(trial).glob(needed)):
                 raise StudyError(
                     f"'{file.parent}' has lost its {needed}; remove that folder to begin this "
                     "agent anew"
@@ -230,16 +241,20 @@ class StudyFolder:
             shutil.rmtree(old, ignore_errors=True)
         self.write_results()
 
-    def put_diverged(self, trial: Trial, why: str) -> None:
+    def put_diverged(self, trial: Trial, why: str, nothing: list[dict[str, Any]]) -> None:
         """
         End a training that has diverged. Its best model of before is what it has learned.
 
-        :param trial: of the study, with an evaluation at least
+        :param trial: of the study
         :param why: the message
+        :param nothing: its rows if there was no evaluation before
         """
+        if not self.rows(trial):
+            write_whole(self.of(trial) / ROWS, json.dumps(nothing).encode())
         write_whole(self.of(trial) / DIVERGED, why.encode())
         for old in self.of(trial).glob(f"{CHECKPOINT}*"):
             shutil.rmtree(old, ignore_errors=True)
+        self.write_results()
 
     def put_finals(self, trial: Trial, rows: Iterable[dict[str, Any]]) -> None:
         """

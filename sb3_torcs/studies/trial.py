@@ -30,6 +30,7 @@ from sb3_torcs.errors import StudyError
 from sb3_torcs.evaluation.ladder import rung
 from sb3_torcs.evaluation.protocol import Episode, Merit, evaluate, merit, race_environment
 from sb3_torcs.studies.config import FIELDS, Trial, track_name
+from sb3_torcs.studies.storage import DIVERGES
 from sb3_torcs.training.keeping import check_healthy
 from sb3_torcs.training.manager import build
 
@@ -143,15 +144,17 @@ class Training:
         kept = self._best is None or worth > self._best
         if kept:
             self._best, self._best_files = worth, self._model_files()
-        spent = self._spent + _clocks() - self._clock
-        progress = {
-            "decisions": self.model.num_timesteps,
-            "episodes": self.episodes,
-            "wall_s": round(float(spent[0]), 1),
-            "cpu_s": round(float(spent[1]), 1),
-        }
+        progress = {**self._progress(), "kept": kept}
         for track, race in races.items():
-            self.rows.append(_row(self.trial, "train", track, race, {**progress, "kept": kept}))
+            self.rows.append(_row(self.trial, "train", track, race, progress))
+
+    def rows_of_nothing(self) -> list[Row]:
+        """Return the rows of an agent that has diverged before its first evaluation."""
+        trial, race = self.trial, Episode(0, [], 0.0, DIVERGES, 0.0, 0.0)
+        progress = {**self._progress(), "kept": True}
+        phases = [("train", track) for track in trial.eval_tracks]
+        phases += [("final", track) for track in trial.final_tracks]
+        return [_row(trial, phase, track, race, progress) for phase, track in phases]
 
     def save(self, folder: Path) -> None:
         """
@@ -197,6 +200,16 @@ class Training:
             env.env_method("set_mishaps", mishaps, indices=car)
         names = (BEST_MODEL, STATISTICS)
         self._best_files = {n: (folder / n).read_bytes() for n in names if (folder / n).is_file()}
+
+    def _progress(self) -> Row:
+        """Say how far the training has come."""
+        spent = self._spent + _clocks() - self._clock
+        return {
+            "decisions": self.model.num_timesteps,
+            "episodes": self.episodes,
+            "wall_s": round(float(spent[0]), 1),
+            "cpu_s": round(float(spent[1]), 1),
+        }
 
     def _race(self, track: str) -> Episode:
         if track not in self._races:

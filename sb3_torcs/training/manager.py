@@ -31,11 +31,13 @@ from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import ALGOS
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 import sb3_torcs  # noqa: F401  registers the environments
 from sb3_torcs.agents.model_algorithm import algorithm_class
+from sb3_torcs.agents.model_record import STATISTICS
 from sb3_torcs.agents.model_writing import RecordCallback, recipe
+from sb3_torcs.callbacks import RacingProgressCallback
 from sb3_torcs.errors import (
     InvalidOption,
     Sb3TorcsError,
@@ -45,6 +47,7 @@ from sb3_torcs.errors import (
 )
 from sb3_torcs.signals import answered
 from sb3_torcs.training.keeping import SAVING, KeepCallback, WholeFiles
+from sb3_torcs.training.resuming import with_statistics
 from sb3_torcs.training.zoo import OURS
 from sb3_torcs.vec_env import TorcsVecEnv
 
@@ -165,6 +168,23 @@ class _Threaded(ExperimentManager):
         finally:
             self.vec_env_class = own
 
+    def _maybe_normalize(self, env: VecEnv, eval_env: bool) -> VecEnv:
+        """
+        Normalize as the zoo does; a training that is resumed with the statistics of its model.
+
+        The zoo knows them only in a run's own folder.
+
+        :param env: that is to be normalized, or not
+        :param eval_env: whether it is for evaluations, which change no statistics
+        :return: the environment, within ``VecNormalize`` if the entry asks for it
+        """
+        normalized = super()._maybe_normalize(env, eval_env)
+        model = Path(self.trained_agent)
+        in_its_run = model.parent / self.env_name / STATISTICS
+        if self.continue_training and isinstance(normalized, VecNormalize):
+            return normalized if in_its_run.is_file() else with_statistics(normalized, model)
+        return normalized
+
     def close_envs(self) -> None:
         """Close all environments, which the zoo leaves open where it cannot build the algorithm."""
         for env in self._made:
@@ -235,11 +255,14 @@ class Manager(_Threaded):
         """
         Put the zoo's callbacks between two of ours, and let them write to temporary names.
 
-        Our first callback writes the model's record before any other saves the model. Our last one
-        moves complete files to their names.
+        Our first callback writes the model's record before any other saves the model, and only the
+        progress bar stands before it: the zoo ends its first callback even if it has not begun. Our
+        last one moves complete files to their names.
         """
         asked = {**self._asked, "env_kwargs": self.env_kwargs, "n_timesteps": self.n_timesteps}
-        self.callbacks.append(RecordCallback(recipe(self.algo, self.env_name.gym_id, asked)))
+        place = 1 if any(isinstance(c, RacingProgressCallback) for c in self.callbacks[:1]) else 0
+        record = RecordCallback(recipe(self.algo, self.env_name.gym_id, asked))
+        self.callbacks.insert(place, record)
         super().create_callbacks()
         if self.optimize_hyperparameters:
             return
@@ -274,6 +297,10 @@ class Manager(_Threaded):
             with self._named_errors():
                 super().learn(model)
         except Exception as error:
+            if model.num_timesteps == 0 and isinstance(error, InvalidOption):
+                self.close_envs()  # a callback has refused to begin
+                shutil.rmtree(self.save_path)
+                raise
             try:
                 with contextlib.suppress(OSError):
                     self.keeper.keep()

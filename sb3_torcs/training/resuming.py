@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+import pickle
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_torcs.agents.model_algorithm import check_same, told_algorithm
 from sb3_torcs.agents.model_file import as_mismatch, saved_data
 from sb3_torcs.agents.models import check_spaces, saved_spaces, saved_timesteps, training_record
-from sb3_torcs.agents.wrapping import frames_of
+from sb3_torcs.agents.wrapping import frames_of, normalizes
 from sb3_torcs.errors import ModelMismatch, ModelNotTrusted
 from sb3_torcs.files import listed, path_and_arguments
 from sb3_torcs.sensors import range_finder_angles
 from sb3_torcs.training.keeping import REPLAY_BUFFER
 from sb3_torcs.training.zoo_data import as_data
 
-__all__ = ["check_resumable", "recorded_entry"]
+__all__ = ["check_resumable", "recorded_entry", "with_statistics"]
 
 SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf", "delta_std")
 """What the zoo lets fall to 0 over a training if it is written as ``lin_…``."""
@@ -38,10 +40,11 @@ def recorded_entry(
     :param env_id: of the environment in which it is to learn
     :param without: dotted paths of callbacks and wrappers that are left out
     :return: the entry; of a script's model only ``env_kwargs``, and empty if nothing fits
-    :raises ModelMismatch: if it cannot be read
+    :raises ModelMismatch: if it cannot be read, or is of another algorithm
     """
     record = training_record(model)
-    if record.env_id != env_id or record.algo not in (None, algo):
+    check_same(model, record.algo, algo, to_learn=True)
+    if record.env_id != env_id:
         return {}
     with as_mismatch(f"the hyperparameters in the record of '{model}' cannot be read", "give"):
         entry = as_data(record.hyperparameters)
@@ -62,13 +65,36 @@ def recorded_entry(
     return entry
 
 
+def with_statistics(env: VecNormalize, model: Path) -> VecNormalize:
+    """
+    Go on with the statistics of a model's training.
+
+    Its record holds those of the observations, without their count, for which the timesteps stand.
+
+    :param env: new, with the options of the entry
+    :param model: the file
+    :return: an environment with these statistics; as it is if none are known
+    """
+    record = training_record(model)
+    if record.statistics_file is not None:
+        said = f"'{record.statistics_file}' holds no statistics that can be gone on with"
+        with as_mismatch(said, "give"), record.statistics_file.open("rb") as file:
+            saved = pickle.load(file)
+            env.obs_rms, env.ret_rms = saved.obs_rms, saved.ret_rms
+    elif record.statistics is not None:
+        observed: Any = env.obs_rms  # one: no environment of racing has a dictionary
+        observed.mean = np.array(record.statistics.mean)
+        observed.var = np.array(record.statistics.var)
+        observed.count = saved_timesteps(model)
+    return env
+
+
 def check_resumable(
     model: Path,
     env: gym.Env[Any, Any],
     algo: str,
-    n_envs: int,
+    entry: Mapping[str, Any],
     *,
-    frames: int | None = None,
     trust: bool = False,
 ) -> bool:
     """
@@ -77,8 +103,7 @@ def check_resumable(
     :param model: the file; its replay buffer and its record lie beside it
     :param env: that the training is to go on in
     :param algo: that is to learn, as the zoo calls it
-    :param n_envs: number of environments in which it is to learn
-    :param frames: observations that it is to see at once
+    :param entry: the hyperparameters with which it is to learn
     :param trust: accept a model without a record
     :return: whether there is a replay buffer to resume with
     :raises ModelMismatch: if they do not belong together
@@ -99,14 +124,21 @@ def check_resumable(
             "a model runs whatever code is pickled in it and in the replay buffer beside it; if "
             "you know who made them, add --trust"
         )
-    sees = frames_of(record.hyperparameters)
-    if record.known and sees != frames:
-        raise ModelMismatch(
-            f"'{model}' has learned with frame_stack {sees}, and would go on with {frames}; give "
-            "the --conf-file or the --hyperparams of before"
-        )
+    if record.algo is None:
+        check_same(model, told_algorithm(data), algo)
+    else:
+        check_same(model, record.algo, algo, to_learn=True)
+    frames, before = frames_of(entry), record.hyperparameters
+    for what, was, now in (
+        ("frame_stack", frames_of(before), frames),
+        ("normalize", normalizes(before.get("normalize")), normalizes(entry.get("normalize"))),
+    ):
+        if record.known and was != now:
+            raise ModelMismatch(
+                f"'{model}' has learned with {what} {was}, and would go on with {now}; give the "
+                "--conf-file or the --hyperparams of before"
+            )
     check_spaces(model, saved_spaces(model, trust=True), env, frames)
-    check_same(model, record.algo or told_algorithm(data), algo)
     finders, name = record.env_kwargs.get("range_finders", "scr"), "range_finder_angles"
     angles = env.get_wrapper_attr(name) if env.has_wrapper_attr(name) else None
     if (
@@ -118,12 +150,17 @@ def check_resumable(
             f"'{model}' has learned with range_finders {finders!r}, and would go on with others; "
             "give the --env, --entry or --conf-file of before"
         )
-    buffer = model.parent / REPLAY_BUFFER
-    if not buffer.is_file():
+    file = model.parent / REPLAY_BUFFER
+    if not file.is_file():
         return False
-    said = f"'{buffer}' is no replay buffer that can be gone on with"
-    with as_mismatch(said, "remove it, or give"), buffer.open("rb") as file:
-        buffer = load_from_pkl(file)
+    n_envs = entry.get("n_envs", 1)
+    said = f"'{file}' is no replay buffer that can be gone on with"
+    with as_mismatch(said, "remove it, or give"), file.open("rb") as content:
+        buffer = load_from_pkl(content)
         if buffer.n_envs != n_envs:
-            raise ValueError(f"of {buffer.n_envs} cars at once, not {n_envs}")
+            raise ModelMismatch(
+                f"'{file}' is of {buffer.n_envs} cars at once, and the training would have "
+                f"{n_envs}; give n_envs {buffer.n_envs}, or remove the file to begin with an empty "
+                "one"
+            )
     return True

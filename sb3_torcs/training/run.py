@@ -258,11 +258,9 @@ def _check_resumed(
     from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
     from sb3_torcs.agents.model_algorithm import algorithm_class
-    from sb3_torcs.agents.wrapping import frames_of
     from sb3_torcs.training.resuming import check_resumable
 
-    n_envs, frames = changed.get("n_envs", 1), frames_of(changed)
-    buffer = check_resumable(resume, env, options.algo, n_envs, frames=frames, trust=options.trust)
+    buffer = check_resumable(resume, env, options.algo, changed, trust=options.trust)
     if "learning_starts" in entry and buffer:
         entry["learning_starts"] = 0
     if "n_steps" in entry and issubclass(algorithm_class(options.algo), OffPolicyAlgorithm):
@@ -350,17 +348,21 @@ def _told(
     error: OSError | WorkerLost | TrainingDiverged, result: Run, options: TrainOptions
 ) -> Exception:
     """Compose a message: why a training ended, what is saved, and what to type."""
+    why, kind = str(error), type(error)
+    if isinstance(error, TrainingDiverged):
+        remedy = "lower the learning_rate"
+    elif isinstance(error, WorkerLost):
+        remedy = "see above why"
+    else:
+        why = f"cannot write '{error.filename or result.folder}': {error.strerror or error}"
+        kind, remedy = OutputNotWritable, "make room, or choose another folder"
+    if result.timesteps >= result.wanted:
+        learned = f"kept: '{result.last_model}', which has learned from all timesteps"
+        return kind(f"{why}; {learned}; see it: sb3-torcs evaluate '{result.best_model}'")
     if result.timesteps > 0:
         kept = f"kept: '{result.last_model}', {result.timesteps} of {result.wanted} timesteps"
-        more = f"go on with: {going_on(options, result)}"
-    else:
-        kept, more = "nothing was kept yet", "start again"
-    if isinstance(error, TrainingDiverged):
-        return TrainingDiverged(f"{error}; {kept}; lower the learning_rate, and {more}")
-    if isinstance(error, WorkerLost):
-        return WorkerLost(f"{error}; {kept}; see above why, and {more}")
-    said = f"cannot write '{error.filename or result.folder}': {error.strerror or error}"
-    return OutputNotWritable(f"{said}; {kept}; make room, or choose another folder, and {more}")
+        return kind(f"{why}; {kept}; {remedy}, and go on with: {going_on(options, result)}")
+    return kind(f"{why}; nothing was kept yet; {remedy}, and start again")
 
 
 @contextlib.contextmanager
