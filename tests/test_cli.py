@@ -927,7 +927,8 @@ def test_the_doctor_compares_the_layout(capsys, monkeypatch, game):
     def check_layout(asked):
         raise BackendUnavailable(f"TORCS at {asked.root} is another version; install 1.3.7")
 
-    importlib.import_module("sb3_torcs.envs.torcs")  # with the true backend
+    for true in ("sb3_torcs.envs.torcs", "sb3_torcs._engine"):  # which go on to drive
+        importlib.import_module(true)
     native = types.ModuleType("sb3_torcs.backends.native")
     native.check_layout = check_layout
     engine = types.ModuleType("sb3_torcs._engine")
