@@ -106,8 +106,9 @@ class PoisonCallback(BaseCallback):
         return True
 
 
-def test_an_agent_that_diverges_is_measured_by_its_best_model_of_before(tmp_path, capsys):
-    callback = {f"{__name__}.PoisonCallback": {"at": 500}}
+def poisoned(tmp_path, at):
+    """Run a study of one agent that diverges after so many timesteps."""
+    callback = {f"{__name__}.PoisonCallback": {"at": at}}
     study = read_study(
         study_file(tmp_path, seeds=1, variants={"poisoned": {**TINY, "callback": callback}})
     )
@@ -115,6 +116,11 @@ def test_an_agent_that_diverges_is_measured_by_its_best_model_of_before(tmp_path
     store.begin()
     (trial,) = study.trials
     run_trial(trial, store, lambda row: None)
+    return store, trial
+
+
+def test_an_agent_that_diverges_is_measured_by_its_best_model_of_before(tmp_path, capsys):
+    store, trial = poisoned(tmp_path, at=500)
     assert store.ended(trial)
     rows = results(tmp_path / "out")
     assert [(row["phase"], row["decisions"]) for row in rows[:2]] == [
@@ -132,20 +138,13 @@ def test_an_agent_that_diverges_is_measured_by_its_best_model_of_before(tmp_path
 
 
 def test_an_agent_that_diverges_before_its_first_evaluation_counts_as_one_without_a_lap(tmp_path):
-    callback = {f"{__name__}.PoisonCallback": {"at": 150}}
-    study = read_study(
-        study_file(tmp_path, seeds=1, variants={"poisoned": {**TINY, "callback": callback}})
-    )
-    store = StudyFolder(tmp_path / "out", study)
-    store.begin()
-    (trial,) = study.trials
-    run_trial(trial, store, lambda row: None)
+    store, trial = poisoned(tmp_path, at=150)
     assert store.ended(trial)
     rows = results(tmp_path / "out")
     assert [(row["phase"], row["end"], row["completes"]) for row in rows] == [
         ("train", "diverged", "0"), ("final", "diverged", "0"), ("final", "diverged", "0"),
     ]  # fmt: skip
-    StudyFolder(tmp_path / "out", study).begin()
+    store.begin()
     write_report(tmp_path / "out", tmp_path / "report")
     assert "0 of 1" in (tmp_path / "report" / "report.md").read_text()
 

@@ -123,6 +123,6 @@ def check_same(model: Path, saved: str | None, algo: str, *, to_learn: bool = Fa
     :param to_learn: whether it is to learn on: then TD3 is not DDPG, whose models drive alike
     :raises ModelMismatch: if it is not
     """
-    as_saved = (lambda name: name) if to_learn else (lambda name: SAVED_AS.get(name, name))
-    if saved is not None and as_saved(saved) != as_saved(algo):
+    names = {algo} if saved is None else {saved, algo}
+    if len(names if to_learn else {SAVED_AS.get(name, name) for name in names}) > 1:
         raise ModelMismatch(f"'{model}' is a model of {saved}, not of {algo}; give --algo {saved}")

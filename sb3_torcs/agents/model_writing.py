@@ -34,7 +34,7 @@ from sb3_torcs.agents.model_record import (
     record_within,
 )
 from sb3_torcs.errors import ModelNotTrusted
-from sb3_torcs.torcs.track_names import lasting_track
+from sb3_torcs.torcs.track_names import lasting_kwargs
 
 __all__ = ["RecordCallback", "recipe", "write_driver", "write_record"]
 
@@ -55,10 +55,7 @@ def recipe(
     :param hyperparameters: the entry of the hyperparameter file, changes applied
     :return: the first part of a record
     """
-    said = dict(hyperparameters.get("env_kwargs") or {})
-    if "track" in said:
-        said["track"] = lasting_track(said["track"])
-    kwargs = _plain_part(said)
+    kwargs = _plain_part(lasting_kwargs(hyperparameters.get("env_kwargs") or {}))
     entry = {**_plain_part(hyperparameters), **({"env_kwargs": kwargs} if kwargs else {})}
     return {"algo": algo, "env_id": env_id, "env_kwargs": kwargs, "hyperparameters": entry}
 

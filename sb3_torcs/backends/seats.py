@@ -349,9 +349,6 @@ class Seat(Drawn):
             "another process; make another one there"
         )
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> NoReturn:
-        self.__reduce__()
-
 
 class LoneSeat(Seat):
     """The world of the only agent of a shared race that is stepped; a crew drives the others."""

@@ -64,10 +64,10 @@ def run(args: argparse.Namespace) -> int:
         report = compare(*args.drivers, track=args.track, laps=args.laps, trust=args.trust)
     if args.json:
         print_json(report.comparison.as_dict(str(html)))
-        report.save(html)
     else:
         _show(report.comparison, html)
-        report.save(html)
+    report.save(html)
+    if not args.json:
         print(f"page: {html}")
     return 0
 

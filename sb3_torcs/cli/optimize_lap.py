@@ -107,12 +107,12 @@ def run(args: argparse.Namespace) -> int:
     }
     if args.json:
         print_json(figures)
-        ghost.write(out)
     else:
         print(f"{track}, {kwargs['car']}: {state.rollouts} rollouts, {seconds:.0f} s")
         rows = [(f"{number}", f"{time:.3f}") for number, time in enumerate(ghost.lap_times, 1)]
         print(table(HEADERS, rows))
-        ghost.write(out)
+    ghost.write(out)
+    if not args.json:
         print(f"ghost: {out}")
     return INTERRUPTED if stopped else 0
 

@@ -198,7 +198,7 @@ def _held(
     """
     Hold the races behind a progress bar; the first one is recorded, the last one is noted.
 
-    After Ctrl-C those that were held are all.
+    Ctrl-C ends them early; those that are over are returned.
     """
     from tqdm import tqdm
 

@@ -18,7 +18,7 @@ from sb3_torcs.studies.estimates import Estimate, estimate
 from sb3_torcs.studies.page import Section, study_page
 from sb3_torcs.studies.pictures import NO_LAP, draw_together, draw_variant
 from sb3_torcs.studies.results import Results
-from sb3_torcs.studies.storage import DIVERGED, RECIPE, RESULTS, ROWS, write_whole
+from sb3_torcs.studies.storage import RECIPE, RESULTS, ROWS, WHY_DIVERGED, write_whole
 
 __all__ = ["read_results", "write_report"]
 
@@ -137,7 +137,7 @@ def _diverged(folder: Path) -> list[str]:
     return [
         f"{file.parent.name}: {file.read_text(encoding='utf-8')}. Its figures are those of its "
         "best model of before, or of no lap if there was none."
-        for file in sorted(folder.glob(f"*/{DIVERGED}"))
+        for file in sorted(folder.glob(f"*/{WHY_DIVERGED}"))
     ]
 
 

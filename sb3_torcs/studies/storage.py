@@ -34,10 +34,10 @@ from sb3_torcs.studies.config import FIELDS, Study, Trial, track_name
 
 __all__ = [
     "DIVERGED",
-    "DIVERGES",
     "RECIPE",
     "RESULTS",
     "ROWS",
+    "WHY_DIVERGED",
     "Files",
     "StudyFolder",
     "write_whole",
@@ -47,8 +47,8 @@ Files = dict[str, bytes]
 """Contents of files by name."""
 
 RESULTS = "results.csv"
-DIVERGED = "diverged.txt"
-DIVERGES = "diverged"  # the end of a race that no model is there to drive
+WHY_DIVERGED = "diverged.txt"
+DIVERGED = "diverged"  # the end of a race that no model is there to drive
 RECIPE, ROWS, LOCK = "recipe.yml", "rows.json", ".lock"
 CHECKPOINT = "checkpoint-"
 FOR_DRIVERS = (BEST_MODEL, STATISTICS, "config.yml", "args.yml")
@@ -127,7 +127,7 @@ class StudyFolder:
                     "another --folder, or remove that one to begin it anew"
                 )
             needed = BEST_MODEL if self.trained(trial) else f"{CHECKPOINT}*"
-            has_model = any(row["end"] != DIVERGES for row in self.rows(trial))
+            has_model = any(row["end"] != DIVERGED for row in self.rows(trial))
             if has_model and not any(self.of(trial).glob(needed)):
                 raise StudyError(
                     f"'{file.parent}' has lost its {needed}; remove that folder to begin this "
@@ -162,7 +162,7 @@ class StudyFolder:
         :param trial: of the study
         :return: how it diverged; ``None`` if it did not
         """
-        file = self.of(trial) / DIVERGED
+        file = self.of(trial) / WHY_DIVERGED
         return file.read_text(encoding="utf-8") if file.is_file() else None
 
     def missing(self, trial: Trial) -> list[str]:
@@ -251,7 +251,7 @@ class StudyFolder:
         """
         if not self.rows(trial):
             write_whole(self.of(trial) / ROWS, json.dumps(nothing).encode())
-        write_whole(self.of(trial) / DIVERGED, why.encode())
+        write_whole(self.of(trial) / WHY_DIVERGED, why.encode())
         for old in self.of(trial).glob(f"{CHECKPOINT}*"):
             shutil.rmtree(old, ignore_errors=True)
         self.write_results()

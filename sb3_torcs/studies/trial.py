@@ -30,7 +30,7 @@ from sb3_torcs.errors import StudyError
 from sb3_torcs.evaluation.ladder import rung
 from sb3_torcs.evaluation.protocol import Episode, Merit, evaluate, merit, race_environment
 from sb3_torcs.studies.config import FIELDS, Trial, track_name
-from sb3_torcs.studies.storage import DIVERGES
+from sb3_torcs.studies.storage import DIVERGED
 from sb3_torcs.training.keeping import check_healthy
 from sb3_torcs.training.manager import build
 
@@ -150,7 +150,7 @@ class Training:
 
     def rows_of_nothing(self) -> list[Row]:
         """Return the rows of an agent that has diverged before its first evaluation."""
-        trial, race = self.trial, Episode(0, [], 0.0, DIVERGES, 0.0, 0.0)
+        trial, race = self.trial, Episode(0, [], 0.0, DIVERGED, 0.0, 0.0)
         progress = {**self._progress(), "kept": True}
         phases = [("train", track) for track in trial.eval_tracks]
         phases += [("final", track) for track in trial.final_tracks]

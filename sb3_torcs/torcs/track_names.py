@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -15,6 +16,7 @@ __all__ = [
     "TrackFile",
     "find_track",
     "known_tracks",
+    "lasting_kwargs",
     "lasting_track",
 ]
 
@@ -83,6 +85,17 @@ def lasting_track(track: Any) -> Any:
         Path(track).suffix.lower() in (XML, COMPACT)
     )
     return str(Path(os.path.expanduser(track)).absolute()) if is_path else track
+
+
+def lasting_kwargs(env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    Say the track in arguments of an environment as :func:`lasting_track` does.
+
+    :param env_kwargs: as of ``gym.make``
+    :return: a copy
+    """
+    track = {"track": lasting_track(env_kwargs["track"])} if "track" in env_kwargs else {}
+    return {**env_kwargs, **track}
 
 
 def known_tracks(game: Game | None = None) -> dict[str, TrackFile]:

@@ -47,7 +47,7 @@ from sb3_torcs.errors import (
 )
 from sb3_torcs.signals import answered
 from sb3_torcs.training.keeping import SAVING, KeepCallback, WholeFiles
-from sb3_torcs.training.resuming import with_statistics
+from sb3_torcs.training.resuming import restore_statistics
 from sb3_torcs.training.zoo import OURS
 from sb3_torcs.vec_env import TorcsVecEnv
 
@@ -180,9 +180,9 @@ class _Threaded(ExperimentManager):
         """
         normalized = super()._maybe_normalize(env, eval_env)
         model = Path(self.trained_agent)
-        in_its_run = model.parent / self.env_name / STATISTICS
-        if self.continue_training and isinstance(normalized, VecNormalize):
-            return normalized if in_its_run.is_file() else with_statistics(normalized, model)
+        known_to_zoo = (model.parent / self.env_name / STATISTICS).is_file()
+        if self.continue_training and isinstance(normalized, VecNormalize) and not known_to_zoo:
+            restore_statistics(normalized, model)
         return normalized
 
     def close_envs(self) -> None:
@@ -231,8 +231,7 @@ class Manager(_Threaded):
         try:
             return super().setup_experiment()
         except (AssertionError, NotImplementedError, TypeError, ValueError) as error:
-            self.close_envs()
-            shutil.rmtree(self.save_path)
+            self._leave_nothing()
             if isinstance(error, Sb3TorcsError):
                 raise
             why = " ".join(str(error).split())
@@ -240,6 +239,11 @@ class Manager(_Threaded):
                 f"{self.algo} cannot learn in {self.env_name.gym_id} by this entry: {why}; change "
                 "the entry, or choose another --algo"
             ) from error
+
+    def _leave_nothing(self) -> None:
+        """Close the environments, and remove the folder of a run that has not begun."""
+        self.close_envs()
+        shutil.rmtree(self.save_path)
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """
@@ -260,9 +264,9 @@ class Manager(_Threaded):
         last one moves complete files to their names.
         """
         asked = {**self._asked, "env_kwargs": self.env_kwargs, "n_timesteps": self.n_timesteps}
-        place = 1 if any(isinstance(c, RacingProgressCallback) for c in self.callbacks[:1]) else 0
         record = RecordCallback(recipe(self.algo, self.env_name.gym_id, asked))
-        self.callbacks.insert(place, record)
+        behind_bar = isinstance(next(iter(self.callbacks), None), RacingProgressCallback)
+        self.callbacks.insert(int(behind_bar), record)
         super().create_callbacks()
         if self.optimize_hyperparameters:
             return
@@ -298,8 +302,7 @@ class Manager(_Threaded):
                 super().learn(model)
         except Exception as error:
             if model.num_timesteps == 0 and isinstance(error, InvalidOption):
-                self.close_envs()  # a callback has refused to begin
-                shutil.rmtree(self.save_path)
+                self._leave_nothing()  # a callback has refused to begin
                 raise
             try:
                 with contextlib.suppress(OSError):

@@ -21,7 +21,7 @@ from sb3_torcs.sensors import range_finder_angles
 from sb3_torcs.training.keeping import REPLAY_BUFFER
 from sb3_torcs.training.zoo_data import as_data
 
-__all__ = ["check_resumable", "recorded_entry", "with_statistics"]
+__all__ = ["check_resumable", "recorded_entry", "restore_statistics"]
 
 SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf", "delta_std")
 """What the zoo lets fall to 0 over a training if it is written as ``lin_…``."""
@@ -65,15 +65,14 @@ def recorded_entry(
     return entry
 
 
-def with_statistics(env: VecNormalize, model: Path) -> VecNormalize:
+def restore_statistics(env: VecNormalize, model: Path) -> None:
     """
     Go on with the statistics of a model's training.
 
     Its record holds those of the observations, without their count, for which the timesteps stand.
 
-    :param env: new, with the options of the entry
+    :param env: new, with the options of the entry; stays as it is if none are known
     :param model: the file
-    :return: an environment with these statistics; as it is if none are known
     """
     record = training_record(model)
     if record.statistics_file is not None:
@@ -86,7 +85,6 @@ def with_statistics(env: VecNormalize, model: Path) -> VecNormalize:
         observed.mean = np.array(record.statistics.mean)
         observed.var = np.array(record.statistics.var)
         observed.count = saved_timesteps(model)
-    return env
 
 
 def check_resumable(
@@ -124,10 +122,8 @@ def check_resumable(
             "a model runs whatever code is pickled in it and in the replay buffer beside it; if "
             "you know who made them, add --trust"
         )
-    if record.algo is None:
-        check_same(model, told_algorithm(data), algo)
-    else:
-        check_same(model, record.algo, algo, to_learn=True)
+    known = record.algo is not None
+    check_same(model, record.algo or told_algorithm(data), algo, to_learn=known)
     frames, before = frames_of(entry), record.hyperparameters
     for what, was, now in (
         ("frame_stack", frames_of(before), frames),

@@ -17,7 +17,7 @@ from sb3_torcs.car import check_count, is_count
 from sb3_torcs.errors import InvalidOption, OutputNotWritable, TrainingDiverged, WorkerLost
 from sb3_torcs.files import listed, writable_folder
 from sb3_torcs.signals import answered
-from sb3_torcs.torcs.track_names import lasting_track
+from sb3_torcs.torcs.track_names import lasting_kwargs
 
 __all__ = ["Run", "TrainOptions", "going_on", "train", "train_run"]
 
@@ -123,6 +123,7 @@ def train_run(options: TrainOptions) -> Run:
         read, or would move the model
     :raises OutputNotWritable: if a folder cannot be written
     """
+    from sb3_torcs.agents.models import find_model
     from sb3_torcs.training import zoo
 
     _check_numbers(options)
@@ -132,10 +133,11 @@ def train_run(options: TrainOptions) -> Run:
                 f"'{word}' after -- is refused: sb3-torcs would not find the model; before -- "
                 "there are --algo, --env, --timesteps, --folder and --conf-file"
             )
-    resume = _resumed(options)
+    resume = None if options.resume is None else find_model(options.resume, prefer_last=True)
     entry, changed, place = _entry(options, resume)
     with contextlib.closing(zoo.checked_env(changed, options.env, place)) as env:
-        _check_resumed(options, resume, entry, env, changed)
+        if resume is not None:
+            _check_resumed(options, resume, entry, env, changed)
     folder = writable_folder(options.folder)
     tensorboard = _for_tensorboard(options.tensorboard or folder / "tensorboard")
     wanted = zoo.timesteps(changed) if options.timesteps is None else options.timesteps
@@ -171,15 +173,6 @@ def _for_tensorboard(folder: str | Path) -> Path:
     return path
 
 
-def _resumed(options: TrainOptions) -> Path | None:
-    """Find the model to resume; ``None`` begins anew."""
-    if options.resume is None:
-        return None
-    from sb3_torcs.agents.models import find_model
-
-    return find_model(options.resume, prefer_last=True)
-
-
 def _entry(
     options: TrainOptions, resume: Path | None
 ) -> tuple[dict[str, Any], dict[str, Any], Place]:
@@ -187,7 +180,8 @@ def _entry(
     Read and check the hyperparameters.
 
     :param options: what to train
-    :param resume: the model to resume, which knows its own, unless others are given
+    :param resume: the model to resume, which knows its own, unless others are given; ``None``
+        begins anew
     :return: the entry, before and after the changes of the zoo's arguments, and where it stands
     """
     from sb3_torcs.training import zoo
@@ -209,9 +203,8 @@ def _entry(
     changed = {**entry, **_changes(options.zoo_args)}
     zoo.check_entry(changed, options.algo, options.env, place, trust=options.trust)
     for each in (entry, changed):  # of which the zoo and we write records
-        kwargs = each.get("env_kwargs") or {}
-        if "track" in kwargs:
-            each["env_kwargs"] = {**kwargs, "track": lasting_track(kwargs["track"])}
+        if each.get("env_kwargs"):
+            each["env_kwargs"] = lasting_kwargs(each["env_kwargs"])
     return entry, {**changed, "env_kwargs": changed.get("env_kwargs") or {}}, place
 
 
@@ -239,7 +232,7 @@ def _changes(zoo_args: Sequence[str]) -> dict[str, Any]:
 
 def _check_resumed(
     options: TrainOptions,
-    resume: Path | None,
+    resume: Path,
     entry: dict[str, Any],
     env: Any,
     changed: Mapping[str, Any],
@@ -248,13 +241,11 @@ def _check_resumed(
     Check the model to resume. With its replay buffer it needs no new warm-up.
 
     :param options: what to train
-    :param resume: the model; ``None`` begins anew
+    :param resume: the model
     :param entry: its hyperparameters; is adapted
     :param env: one of those to train in
     :param changed: the entry after the changes of the zoo's arguments
     """
-    if resume is None:
-        return
     from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
     from sb3_torcs.agents.model_algorithm import algorithm_class

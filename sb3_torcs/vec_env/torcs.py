@@ -299,9 +299,6 @@ class TorcsVecEnv(DummyVecEnv):
             "another one with the same arguments"
         )
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> NoReturn:
-        self.__reduce__()
-
     def close(self) -> None:
         """Close all races and end the threads. Calling it twice does no harm."""
         super().close()
