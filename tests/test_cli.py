@@ -823,6 +823,7 @@ def test_a_training_in_processes_that_is_ended_from_outside_keeps_what_it_learne
         process.wait(60)
     finally:
         process.kill()
+        process.wait()
     assert models.saved_timesteps(folder / "TorcsLite-v0.zip") >= 200
     assert models.find_model(folder, prefer_last=True).name == "TorcsLite-v0.zip"
 

@@ -67,6 +67,25 @@ class TestTheVirtualDisplay:
             os.kill(display.pid, signal.SIGKILL)
         assert not traces(display.name)
 
+    def test_closing_it_leaves_another_process_that_has_taken_its_name(self):
+        """A server ends with its last client, be it one that only looks whether it is there."""
+        with VirtualDisplay(SIZE) as display:
+            os.kill(display.pid, signal.SIGKILL)
+            assert gone_within(10, lambda: runs(display.pid))
+            number, written = os.pipe()
+            call = ["Xvfb", display.name, "-terminate", "-displayfd", str(written)]
+            heir = subprocess.Popen(call, stderr=subprocess.DEVNULL, pass_fds=(written,))
+            os.close(written)
+            with os.fdopen(number) as ready:
+                ready.readline()
+        try:
+            with pytest.raises(subprocess.TimeoutExpired):
+                heir.wait(1.0)
+            assert traces(display.name)
+        finally:
+            heir.terminate()
+            heir.wait(10)
+
     def test_it_goes_with_the_process_that_has_it(self):
         code = (
             "from sb3_torcs.torcs.display import VirtualDisplay\n"

@@ -193,8 +193,19 @@ def _end(
     if client is None:
         return
     # A server that was killed leaves this; another may have taken it over since.
+    left = SOCKETS / f"X{name[1:]}"
     with suppress(OSError):
-        try:
-            _connect(name).close()
-        except ConnectionRefusedError:
-            (SOCKETS / f"X{name[1:]}").unlink()
+        if not _is_open(left):
+            left.unlink()
+
+
+def _is_open(path: Path) -> bool:
+    """
+    Say whether a process has opened a socket.
+
+    To connect would tell the same, but a server that nobody uses yet would end with us.
+
+    :param path: of the socket
+    """
+    opened = Path("/proc/net/unix").read_bytes().splitlines()
+    return any(line.endswith((b" %b" % bytes(path), b" @%b" % bytes(path))) for line in opened)

@@ -31,7 +31,7 @@ from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import ALGOS
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecNormalize
 
 import sb3_torcs  # noqa: F401  registers the environments
 from sb3_torcs.agents.model_algorithm import algorithm_class
@@ -48,6 +48,7 @@ from sb3_torcs.errors import (
 from sb3_torcs.signals import answered
 from sb3_torcs.training.keeping import SAVING, KeepCallback, WholeFiles
 from sb3_torcs.training.resuming import restore_statistics
+from sb3_torcs.training.workers import WorkersVecEnv
 from sb3_torcs.training.zoo import OURS
 from sb3_torcs.vec_env import TorcsVecEnv
 
@@ -154,13 +155,17 @@ class _Threaded(ExperimentManager):
         """
         Make environments as the zoo does, but in :class:`TorcsVecEnv` where threads can drive them.
 
+        Those in processes are in :class:`WorkersVecEnv`, which Ctrl-C cannot hang.
+
         :param n_envs: how many
         :param eval_env: whether they are for evaluations
         :param no_log: whether to write no ``monitor.csv``
         :return: what ``DummyVecEnv`` would be, to the bit
         """
         own = self.vec_env_class
-        if own is DummyVecEnv and n_envs > 1 and self._on_threads():
+        if own is SubprocVecEnv:
+            self.vec_env_class = WorkersVecEnv
+        elif own is DummyVecEnv and n_envs > 1 and self._on_threads():
             self.vec_env_class = TorcsVecEnv
         try:
             self._made.append(super().create_envs(n_envs, eval_env, no_log))
