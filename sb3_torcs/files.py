@@ -92,23 +92,37 @@ def writable_file(file: str | Path, suffixes: tuple[str, ...]) -> Path:
 
 
 @contextlib.contextmanager
-def whole_file(path: Path) -> Iterator[Path]:
+def whole_file(
+    path: Path, advice: str = "choose another file", *, parents: bool = False
+) -> Iterator[Path]:
     """
-    Write a file completely or not at all.
+    Write a file completely or not at all, also if the power fails.
 
     :param path: of the file, which appears when the block ends
+    :param advice: what to do where it cannot be written
+    :param parents: whether to make the folder that it is in
     :return: a path beside it with the same ending, which the block writes
     :raises OutputNotWritable: if the file cannot be written; the previous one is kept
     """
-    aside = path.with_name(f".{path.name}")
+    aside = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
     try:
         try:
+            if parents:
+                path.parent.mkdir(parents=True, exist_ok=True)
+            aside.touch()  # a path that cannot be written raises here, before the work
             yield aside
+            with aside.open("rb") as written:
+                os.fsync(written.fileno())
             aside.replace(path)
         finally:
-            aside.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):  # no folder, no file
+                aside.unlink()
+    except OutputNotWritable:
+        raise
     except OSError as error:
-        raise OutputNotWritable(f"{path}: {error}; choose another file") from error
+        raise OutputNotWritable(
+            f"cannot write '{path}': {error.strerror or error}; {advice}"
+        ) from error
 
 
 def read_yaml(text: str, loader_class: type[yaml.SafeLoader] = yaml.SafeLoader) -> Any:

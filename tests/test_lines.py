@@ -190,7 +190,8 @@ def test_a_full_disk_ends_the_series_and_not_the_training(oval, monkeypatch, tmp
     stream = io.StringIO()
     pictures = LinePicturesCallback(folder=str(tmp_path))
     learned(oval, [driven(oval, 296.0)] * 2, stream=stream, callbacks=[pictures])
-    told = f"no more pictures: cannot write to {tmp_path}: No space left on device"
+    file = tmp_path / "001.png"
+    told = f"no more pictures: cannot write '{file}': No space left on device; give another folder"
     assert stream.getvalue().splitlines().count(told) == 1
     assert "64/64 timesteps" in stream.getvalue()
     assert list(tmp_path.iterdir()) == []

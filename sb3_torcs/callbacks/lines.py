@@ -15,6 +15,7 @@ from sb3_torcs.callbacks.metrics import DrivenLine, DrivingMetricsCallback, call
 from sb3_torcs.callbacks.progress import RacingProgressCallback, spoken_moment
 from sb3_torcs.car import is_number
 from sb3_torcs.errors import InvalidOption
+from sb3_torcs.files import whole_file
 
 if TYPE_CHECKING:
     from matplotlib.figure import SubFigure
@@ -126,7 +127,7 @@ class LinePicturesCallback(BaseCallback):
             self._write(lap)
         except OSError as error:
             self.writable = False
-            self._say(f"no more pictures: cannot write to {self.folder}: {error.strerror or error}")
+            self._say(f"no more pictures: {error}")
 
     def _draw(self, line: DrivenLine, lap: DrivenLap) -> Path:
         # Graphics load only when there is something to draw.
@@ -134,17 +135,13 @@ class LinePicturesCallback(BaseCallback):
 
         number = max((int(path.stem) for path in _pictures(self.folder)), default=0) + 1
         path = self.folder / f"{number:03d}.png"
-        aside = path.with_name(f".{path.name}")
         driven = f"{lap.lap_time:.2f} s" if lap.lap_time else f"{max(lap.distance, 0.0):.0f} m"
         title = f"{spoken_moment(lap.seconds)}, {lap.timesteps:,} timesteps: {driven}"
         points = np.column_stack([line.x, line.y])
-        try:
+        with whole_file(path, "give another folder") as aside:
             plot_track(
                 line.track, aside, line=points, speed=line.speed, title=title, fastest=FASTEST
             )
-            aside.replace(path)
-        finally:
-            aside.unlink(missing_ok=True)
         self._say(f"{spoken_moment(lap.seconds)}: the line it drives, {path}")
         return path
 

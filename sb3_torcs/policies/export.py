@@ -16,7 +16,8 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from torch import nn
 
-from sb3_torcs.errors import ModelMismatch, OutputNotWritable, PackageMissing
+from sb3_torcs.errors import ModelMismatch, PackageMissing
+from sb3_torcs.files import whole_file
 
 __all__ = ["INPUT", "OUTPUT", "export_actor"]
 
@@ -108,19 +109,8 @@ def export_actor(model: Any, path: str | os.PathLike[str]) -> Path:
     policy, statistics = _parts(model)
     _check_policy(policy, statistics)
     path = Path(path)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        part.touch()  # a path that cannot be written raises here, before the work
+    with whole_file(path, "choose a file in an existing folder that you may write to") as part:
         part.write_bytes(_graph(_RawDriver(policy, statistics), policy.observation_space))
-        part.replace(path)
-    except OSError as error:
-        raise OutputNotWritable(
-            f"cannot write '{path}': {error.strerror or error}; choose a file in an existing "
-            "folder that you may write to"
-        ) from error
-    finally:
-        with contextlib.suppress(OSError):  # no folder, no part
-            part.unlink()
     return path
 
 

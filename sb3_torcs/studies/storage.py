@@ -19,7 +19,6 @@ import csv
 import fcntl
 import io
 import json
-import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
@@ -28,8 +27,8 @@ from typing import Any
 import yaml
 
 from sb3_torcs.agents.model_record import BEST_MODEL, STATISTICS
-from sb3_torcs.errors import OutputNotWritable, StudyError
-from sb3_torcs.files import read_yaml
+from sb3_torcs.errors import StudyError
+from sb3_torcs.files import read_yaml, whole_file
 from sb3_torcs.studies.config import FIELDS, Study, Trial, track_name
 
 __all__ = [
@@ -51,6 +50,9 @@ WHY_DIVERGED = "diverged.txt"
 DIVERGED = "diverged"  # the end of a race that no model is there to drive
 RECIPE, ROWS, LOCK = "recipe.yml", "rows.json", ".lock"
 CHECKPOINT = "checkpoint-"
+GOING_ON = (
+    "make room, or give another folder, and type the command again: what was written before is kept"
+)
 FOR_DRIVERS = (BEST_MODEL, STATISTICS, "config.yml", "args.yml")
 
 
@@ -362,25 +364,11 @@ def _parsed(file: Path, parse: Callable[[str], Any]) -> Any:
 
 def write_whole(file: Path, content: bytes) -> None:
     """
-    Write a file completely or not at all, also if the power fails.
+    Write a file of a study completely or not at all.
 
     :param file: to be written, in a folder that is made
     :param content: of it
     :raises OutputNotWritable: if it cannot be written; the previous file is kept
     """
-    aside = file.with_name(f".{file.name}")
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            with aside.open("wb") as output:
-                output.write(content)
-                output.flush()
-                os.fsync(output.fileno())
-            aside.replace(file)
-        finally:
-            aside.unlink(missing_ok=True)
-    except OSError as error:
-        raise OutputNotWritable(
-            f"cannot write '{file}': {error.strerror or error}; make room, or give another "
-            "folder, and type the command again: what was written before is kept"
-        ) from error
+    with whole_file(file, GOING_ON, parents=True) as aside:
+        aside.write_bytes(content)
