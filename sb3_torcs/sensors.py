@@ -3,7 +3,8 @@
 Its rows stand in groups, which an environment's ``sensors`` names: ``"base"`` are sensors of the
 SCR manual (arXiv:1304.1672, table 1), ``"preview"`` is the road ahead, ``"limits"`` are the speeds
 that it allows, ``"line"`` is the racing line, ``"opponents"``, ``"rivals"`` and ``"race"`` are the
-other cars, and ``"car"`` is the car that is driven. The observation space, the encoder, the mirror
+other cars, ``"car"`` is the car that is driven, and ``"car_line"`` the racing line as fast as this
+car may be on it. The observation space, the encoder, the mirror
 image, the documentation and the policy's view of the observation are all derived from the table.
 
 To add a group, write its rows, put them into :data:`GROUPS`, and its function into ``_WRITERS``.
@@ -27,7 +28,14 @@ from sb3_torcs.car import RIVALS, CarState, FloatArray
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.rivals import see_rivals
 from sb3_torcs.tracks.profile import INTERVALS, QUANTITIES, RoadProfile, look_ahead, speed_margins
-from sb3_torcs.tracks.racing_line import LINE_PLACES, look_along, racing_line
+from sb3_torcs.tracks.racing_line import (
+    LINE_PLACES,
+    USUAL_PACE,
+    Pace,
+    look_along,
+    pace_of,
+    racing_line,
+)
 
 __all__ = [
     "GROUPS",
@@ -51,7 +59,9 @@ __all__ = [
     "sensor_table",
 ]
 
-SensorsName = Literal["base", "preview", "limits", "line", "opponents", "rivals", "race", "car"]
+SensorsName = Literal[
+    "base", "preview", "limits", "line", "opponents", "rivals", "race", "car", "car_line"
+]
 Mirror = Literal["same", "opposite", "reversed", "sides"]
 
 
@@ -158,7 +168,16 @@ CAR = (
 :class:`~sb3_torcs.torcs.car_file.CarFacts`. They stay the same all through an episode: the factors
 ``mass`` and ``grip`` of an episode's conditions are not in them, nor fuel that is burnt."""
 
-NEEDS_CAR = frozenset({"car"})
+CAR_LINE = (
+    Sensor("car_line_offsets", "", LINE_PLACES, "m", -20.0, 20.0, 1.0 / 5.0, "opposite"),
+    Sensor("car_line_bends", "", LINE_PLACES, "-", -1.0, 1.0, 1.0, "opposite"),
+    Sensor("car_line_margins", "", LINE_PLACES, "m/s", -50.0, 50.0, 1.0 / 20.0),
+)
+"""The racing line ahead as in ``"line"``, but with margins of the car that is driven, by the grip
+of its tyres and its downforce. Margins of ``"line"`` are always those of the default car. They have
+other bounds here, so that an observation space tells which line it has."""
+
+NEEDS_CAR = frozenset({"car", "car_line"})
 """Groups that only a world that knows its car's file can tell."""
 
 GROUPS: Mapping[SensorsName, tuple[Sensor, ...]] = {
@@ -170,6 +189,7 @@ GROUPS: Mapping[SensorsName, tuple[Sensor, ...]] = {
     "rivals": RIVAL_ROWS,
     "race": RACE,
     "car": CAR,
+    "car_line": CAR_LINE,
 }
 """The whole table. An observation has the groups that are named, in this order."""
 
@@ -388,12 +408,23 @@ def _write_limits(world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -
     _scale_into(margins, _PARTS["limits"].start, numbers)
 
 
-def _write_line(world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> None:
-    table, step = racing_line(_profile(world))
+def _write_the_line(
+    group: str, world: Any, car: CarState, pace: Pace, numbers: npt.NDArray[np.float32]
+) -> None:
+    table, step = racing_line(_profile(world), pace)
     seen = np.empty((3, LINE_PLACES))
     look_along(table, step, car.distance_from_start, car.track_position, car.speed_x, seen)
     seen[1] /= np.abs(seen[1]) + USUAL_BEND
-    _scale_into(seen.ravel(), _PARTS["line"].start, numbers)
+    _scale_into(seen.ravel(), _PARTS[group].start, numbers)
+
+
+def _write_line(world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> None:
+    _write_the_line("line", world, car, USUAL_PACE, numbers)
+
+
+def _write_car_line(world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> None:
+    pace = pace_of(world.facts.grip, world.facts.downforce)
+    _write_the_line("car_line", world, car, pace, numbers)
 
 
 def _write_opponents(_world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> None:
@@ -421,6 +452,7 @@ _WRITERS: dict[str, Callable[[Any, CarState, npt.NDArray[np.float32]], None]] = 
     "rivals": _write_rivals,
     "race": _write_race,
     "car": _write_car,
+    "car_line": _write_car_line,
 }
 """Of each group but ``"base"``: fills its numbers, from the world and the state of the car."""
 

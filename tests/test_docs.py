@@ -175,6 +175,7 @@ GENERATED = {
         "rivals": functools.partial(sensor_table, "rivals"),
         "race": functools.partial(sensor_table, "race"),
         "car": functools.partial(sensor_table, "car"),
+        "car-line": functools.partial(sensor_table, "car_line"),
         "range-finders": range_finders_table,
         "terms": terms_table,
         "presets": presets_table,

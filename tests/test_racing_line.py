@@ -24,6 +24,7 @@ from sb3_torcs.tracks.racing_line import (
     TURN,
     driven,
     look_along,
+    pace_of,
     racing_line,
 )
 
@@ -125,6 +126,20 @@ def test_speed_goes_with_the_surface_and_the_banking():
     assert falls_to_the_left == pytest.approx(flat * 1.6 / 1.4, rel=1e-3)
     assert slowest(ring(banking=0.2)) == pytest.approx(flat * 1.2 / 1.4, rel=1e-3)
     assert slowest(ring(banking=0.2, side=-1.0)) == pytest.approx(falls_to_the_left, rel=1e-3)
+
+
+def test_speed_goes_with_the_car():
+    """Its tyres count as the surface does, and its downforce by what it adds to the load."""
+    bend = 1.0 / 96.5
+    usual = racing_line(ring())
+    slow = racing_line(ring(), pace_of(0.8, 0.0))
+    assert slow.table[:, SPEED].min() == pytest.approx(0.7 * 9.81 / bend, rel=1e-3)
+    np.testing.assert_allclose(slow.table[:, SLOWING], 6.0)
+    fast = racing_line(ring(), pace_of(1.6, 0.00448))
+    pressed = 1.4 * 9.81 / (bend - 1.4 * 0.006)
+    assert fast.table[:, SPEED].min() == pytest.approx(pressed, rel=1e-3)
+    for line in (slow, fast):
+        np.testing.assert_array_equal(line.table[:, :SPEED], usual.table[:, :SPEED])
 
 
 def test_a_crest_is_slower_than_a_dip_and_brakes_do_more_uphill():

@@ -139,10 +139,11 @@ def _check_tells(world: Backend, view: View, keep_distance: bool) -> None:
             f"{' and '.join(map(repr, lacking))}; use Torcs-v0 with backend 'native', or type "
             "`sb3-torcs race`, which also makes videos (--video FILE.mp4 --view behind)"
         )
-    if NEEDS_CAR.intersection(view.sensors) and optional(world, "facts") is None:
+    untold = sorted(NEEDS_CAR.intersection(view.sensors))
+    if untold and optional(world, "facts") is None:
         raise InvalidOption(
-            "sensors 'car' are of the car's file in the game, which this world does not read; "
-            "leave them out, or use backend 'native' of Torcs-v0"
+            f"sensors {' and '.join(map(repr, untold))} are of the car's file in the game, which "
+            "this world does not read; leave them out, or use backend 'native' of Torcs-v0"
         )
 
 

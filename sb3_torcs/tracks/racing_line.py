@@ -24,9 +24,12 @@ from sb3_torcs.tracks.track import Track
 __all__ = [
     "LINE_DISTANCES",
     "LINE_PLACES",
+    "USUAL_PACE",
+    "Pace",
     "RacingLine",
     "driven",
     "look_along",
+    "pace_of",
     "racing_line",
 ]
 
@@ -45,13 +48,25 @@ EDGE = 1.5  # [m] from the edge of the road to the middle of the car, at least
 
 GRAVITY = 9.81  # [m/s²]
 USUAL_FRICTION = 1.1  # [-] of asphalt
-# What a careful driver dares in the default car on usual asphalt. The best agents and robots take
-# bends 10 to 30 % faster.
-TYRES = 1.4  # [-] force across per load
-DOWNFORCE = 0.003  # [1/m] load of the air per mass and speed²
-BRAKING = 12.0  # [m/s²]
+USUAL_GRIP = 1.6  # [-] the default car's own factor on the friction of the ground
+USUAL_DOWNFORCE = 0.00224  # [1/m] of the default car by its file
 LEAST = 1.0  # [m/s²] across that every road bears
 HILLS = 20.0  # [m] before and after a place, over which the road's rise and fall are measured
+
+
+class Pace(NamedTuple):
+    """
+    What a careful driver dares on usual asphalt, by default in the default car.
+
+    The best agents and robots take bends 10 to 30 % faster.
+    """
+
+    tyres: float = 1.4  # [-] force across per load
+    downforce: float = 0.003  # [1/m] load of the air per mass and speed²
+    braking: float = 12.0  # [m/s²]
+
+
+USUAL_PACE = Pace()
 
 
 class RacingLine(NamedTuple):
@@ -120,14 +135,56 @@ def _between(offsets: FloatArray, stride: int) -> None:
     offsets[:] = np.interp(np.arange(n), coarse, known)
 
 
-@lru_cache(maxsize=64)
-def racing_line(road: RoadProfile) -> RacingLine:
+class _Path(NamedTuple):
+    """Where a racing line lies, and what decides how fast it may be driven."""
+
+    offsets: FloatArray  # (n,) from the axis, left positive [m]
+    turned: FloatArray  # (n,) since the start line [rad]
+    lap: float  # [rad] that a whole lap turns
+    half_widths: FloatArray  # (n,) of the road [m]
+    curvature: FloatArray  # (n,) left positive [1/m]
+    grip: FloatArray  # (n,) of the surface, against usual asphalt [-]
+    banking: FloatArray  # (n,) by how much the road rises to the left [m/m]
+    climb: FloatArray  # (n + 1,) since the start line [m]
+    step: float  # [m] along the axis from one place to the next
+
+
+@lru_cache(maxsize=512)
+def racing_line(road: RoadProfile, pace: Pace = USUAL_PACE) -> RacingLine:
     """
-    Find the racing line of a road. It takes some hundredths of a second, once per road.
+    Find the racing line of a road, and how fast it may be driven.
+
+    It takes some hundredths of a second, once per road.
 
     :param road: closed
+    :param pace: of the driver
     :return: the line
     """
+    path = _path(road)
+    speed, slowing = _limits(path, pace)
+    table = np.stack([path.offsets, path.turned, speed, slowing, path.half_widths], axis=1)
+    table = np.vstack([table, table[0]])
+    table[-1, TURN] += path.lap
+    table.setflags(write=False)
+    return RacingLine(table, path.step)
+
+
+def pace_of(grip: float, downforce: float) -> Pace:
+    """
+    Return how a careful driver drives a car.
+
+    :param grip: its tyres' factor on the friction of the ground [-]
+    :param downforce: of the air, per speed squared and mass [1/m]
+    :return: the usual pace, changed as the car differs from the default one
+    """
+    holds, pressed = grip / USUAL_GRIP, downforce / USUAL_DOWNFORCE
+    usual = USUAL_PACE
+    return Pace(usual.tyres * holds, usual.downforce * pressed, usual.braking * holds)
+
+
+@lru_cache(maxsize=64)
+def _path(road: RoadProfile) -> _Path:
+    """Find where the racing line of a closed road lies."""
     length = road.step * (len(road.sums) - 1)
     n = COARSEST * max(round(length / (SPACING * COARSEST)), 1)
     step = length / n
@@ -153,12 +210,8 @@ def racing_line(road: RoadProfile) -> RacingLine:
 
     line = axis + offsets[:, None] * normals
     turned, curvature = _turn(line, heading[0], lap)
-    speed, slowing = _limits(curvature, friction / USUAL_FRICTION, banking, climb, step)
-    table = np.stack([offsets, turned, speed, slowing, half_widths], axis=1)
-    table = np.vstack([table, table[0]])
-    table[-1, TURN] += lap
-    table.setflags(write=False)
-    return RacingLine(table, step)
+    grip = friction / USUAL_FRICTION
+    return _Path(offsets, turned, lap, half_widths, curvature, grip, banking, climb, step)
 
 
 def _closed(turn: FloatArray, lap: float, step: float) -> tuple[FloatArray, FloatArray]:
@@ -195,31 +248,28 @@ def _turn(line: FloatArray, heading: float, lap: float) -> tuple[FloatArray, Flo
     return 0.5 * (before + after), 2.0 * (after - before) / (lengths + np.roll(lengths, 1))
 
 
-def _limits(
-    curvature: FloatArray, grip: FloatArray, banking: FloatArray, climb: FloatArray, step: float
-) -> tuple[FloatArray, FloatArray]:
+def _limits(path: _Path, pace: Pace) -> tuple[FloatArray, FloatArray]:
     """
-    Find how fast the places of a closed line can be driven.
+    Find how fast the places of a line can be driven.
 
     Tyres hold a car by a share of its load, which is less on a crest, more in a dip, and more with
     the air's downforce; and gravity holds it by the banking:
-    v² · curvature = grip · 1.4 · (g + v² · (rounding + downforce)) + g · banking.
+    v² · curvature = grip · tyres · (g + v² · (rounding + downforce)) + g · banking.
 
-    :param curvature: (n,) of the line [1/m], left positive
-    :param grip: (n,) of the surface, against usual asphalt [-]
-    :param banking: (n,) by how much the road rises to the left [m/m]
-    :param climb: (n + 1,) since the start line [m]
-    :param step: from one place to the next [m]
+    :param path: of the line
+    :param pace: of the driver
     :return: (n,) squares of the speeds [m²/s²], and (n,) how fast brakes slow down [m/s²]
     """
+    climb, step, curvature, banking = path.climb, path.step, path.curvature, path.banking
     level = (climb - climb[-1] * np.linspace(0.0, 1.0, len(climb)))[:-1]
     reach = max(round(HILLS / step), 1)
     rounding = np.roll(level, reach) - 2.0 * level + np.roll(level, -reach)
     rounding /= (reach * step) ** 2
-    held = GRAVITY * (grip * TYRES - np.sign(curvature) * banking)
-    needed = np.abs(curvature) - grip * TYRES * (rounding + DOWNFORCE)
+    tyres = path.grip * pace.tyres
+    held = GRAVITY * (tyres - np.sign(curvature) * banking)
+    needed = np.abs(curvature) - tyres * (rounding + pace.downforce)
     speed = np.maximum(held, LEAST) / np.maximum(needed, LEAST / FASTEST**2)
-    slowing = grip * BRAKING + GRAVITY * np.diff(climb) / step
+    slowing = path.grip * pace.braking + GRAVITY * np.diff(climb) / step
     return np.minimum(speed, FASTEST**2), np.maximum(slowing, LEAST)
 
 
