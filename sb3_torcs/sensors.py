@@ -174,8 +174,8 @@ CAR_LINE = (
     Sensor("car_line_margins", "", LINE_PLACES, "m/s", -50.0, 50.0, 1.0 / 20.0),
 )
 """The racing line ahead as in ``"line"``, but with margins of the car that is driven, by the grip
-of its tyres and its downforce. Margins of ``"line"`` are always those of the default car. They have
-other bounds here, so that an observation space tells which line it has."""
+of its tyres and its downforce, and with short crests. Margins of ``"line"`` are always those of the
+default car. They have other bounds here, so that an observation space tells which line it has."""
 
 NEEDS_CAR = frozenset({"car", "car_line"})
 """Groups that only a world that knows its car's file can tell."""

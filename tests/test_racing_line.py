@@ -153,6 +153,15 @@ def test_a_crest_is_slower_than_a_dip_and_brakes_do_more_uphill():
     assert table[middle + middle // 2, SLOWING] == pytest.approx(12.0 - 9.81 * slope, rel=1e-6)
 
 
+def test_the_pace_of_a_car_minds_short_crests_and_no_short_dips():
+    """A kink counts by the distance over which it is measured: five times as much over a fifth."""
+    road = ring(climbs=(20.0, -20.0))
+    usual, careful = racing_line(road).table, racing_line(road, pace_of(1.6, 0.00224)).table
+    top = (len(usual) - 1) // 2
+    assert careful[top, SPEED] < 0.5 * usual[top, SPEED]
+    assert careful[0, SPEED] == usual[0, SPEED]
+
+
 def test_the_line_of_a_track_is_drawn_as_fast_as_brakes_allow(oval):
     """Never faster than a place allows, and slower only on the way to a slower one."""
     places, speeds = driven(oval)

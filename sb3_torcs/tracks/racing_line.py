@@ -52,6 +52,8 @@ USUAL_GRIP = 1.6  # [-] the default car's own factor on the friction of the grou
 USUAL_DOWNFORCE = 0.00224  # [1/m] of the default car by its file
 LEAST = 1.0  # [m/s²] across that every road bears
 HILLS = 20.0  # [m] before and after a place, over which the road's rise and fall are measured
+# Shorter ones throw a car up, too. The margins that the first agents learned by leave that out.
+CREST = 4.0  # [m]
 
 
 class Pace(NamedTuple):
@@ -64,6 +66,7 @@ class Pace(NamedTuple):
     tyres: float = 1.4  # [-] force across per load
     downforce: float = 0.003  # [1/m] load of the air per mass and speed²
     braking: float = 12.0  # [m/s²]
+    crest: float = HILLS  # [m] before and after a place, over which a crest is measured
 
 
 USUAL_PACE = Pace()
@@ -179,7 +182,7 @@ def pace_of(grip: float, downforce: float) -> Pace:
     """
     holds, pressed = grip / USUAL_GRIP, downforce / USUAL_DOWNFORCE
     usual = USUAL_PACE
-    return Pace(usual.tyres * holds, usual.downforce * pressed, usual.braking * holds)
+    return Pace(usual.tyres * holds, usual.downforce * pressed, usual.braking * holds, CREST)
 
 
 @lru_cache(maxsize=64)
@@ -262,15 +265,26 @@ def _limits(path: _Path, pace: Pace) -> tuple[FloatArray, FloatArray]:
     """
     climb, step, curvature, banking = path.climb, path.step, path.curvature, path.banking
     level = (climb - climb[-1] * np.linspace(0.0, 1.0, len(climb)))[:-1]
-    reach = max(round(HILLS / step), 1)
-    rounding = np.roll(level, reach) - 2.0 * level + np.roll(level, -reach)
-    rounding /= (reach * step) ** 2
+    rounding = np.minimum(_rounding(level, HILLS, step), _rounding(level, pace.crest, step))
     tyres = path.grip * pace.tyres
     held = GRAVITY * (tyres - np.sign(curvature) * banking)
     needed = np.abs(curvature) - tyres * (rounding + pace.downforce)
     speed = np.maximum(held, LEAST) / np.maximum(needed, LEAST / FASTEST**2)
     slowing = path.grip * pace.braking + GRAVITY * np.diff(climb) / step
     return np.minimum(speed, FASTEST**2), np.maximum(slowing, LEAST)
+
+
+def _rounding(level: FloatArray, reach: float, step: float) -> FloatArray:
+    """
+    Measure how a closed road rounds up and down.
+
+    :param level: (n,) of its places [m]
+    :param reach: before and after a place [m]
+    :param step: from one place to the next [m]
+    :return: (n,) the change of its slope [1/m], negative on crests
+    """
+    n = max(round(reach / step), 1)
+    return (np.roll(level, n) - 2.0 * level + np.roll(level, -n)) / (n * step) ** 2
 
 
 def driven(track: Track) -> tuple[FloatArray, FloatArray]:
