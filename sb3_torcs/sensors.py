@@ -169,13 +169,14 @@ CAR = (
 ``mass`` and ``grip`` of an episode's conditions are not in them, nor fuel that is burnt."""
 
 CAR_LINE = (
-    Sensor("car_line_offsets", "", LINE_PLACES, "m", -20.0, 20.0, 1.0 / 5.0, "opposite"),
+    Sensor("car_line_offsets", "", LINE_PLACES, "m", -25.0, 25.0, 1.0 / 5.0, "opposite"),
     Sensor("car_line_bends", "", LINE_PLACES, "-", -1.0, 1.0, 1.0, "opposite"),
-    Sensor("car_line_margins", "", LINE_PLACES, "m/s", -50.0, 50.0, 1.0 / 20.0),
+    Sensor("car_line_margins", "", LINE_PLACES, "m/s", -40.0, 40.0, 1.0 / 20.0),
 )
 """The racing line ahead as in ``"line"``, but with margins of the car that is driven, by the grip
 of its tyres and its downforce, and with short crests. Margins of ``"line"`` are always those of the
-default car. They have other bounds here, so that an observation space tells which line it has."""
+default car. Offsets have other bounds here, so that an observation space tells which line it has.
+"""
 
 NEEDS_CAR = frozenset({"car", "car_line"})
 """Groups that only a world that knows its car's file can tell."""
