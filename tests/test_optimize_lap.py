@@ -343,11 +343,12 @@ def test_a_budget_without_a_whole_race_is_said(tiny, tmp_path, capsys):
     assert not list(tmp_path.iterdir())
 
 
-def test_an_interrupted_search_keeps_what_it_found(tiny, ghost, tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize("by", [KeyboardInterrupt, SystemExit(143)])
+def test_an_interrupted_search_keeps_what_it_found(tiny, ghost, tmp_path, monkeypatch, capsys, by):
     def interrupted(search, budget):
         search.ghost = ghost
         yield search.state()
-        raise KeyboardInterrupt
+        raise by
 
     monkeypatch.setattr(LapSearch, "run", interrupted)
     assert main(words(tmp_path / "lap.npz")) == 130

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import json
 
+import gymnasium as gym
 import numpy as np
 import pytest
+import torch as th
+from stable_baselines3 import PPO
 
 from sb3_torcs.agents.models import find_model
 from sb3_torcs.agents.pilots import Crew
@@ -208,6 +211,52 @@ def test_an_agent_that_answers_no_number_is_out_and_the_others_race_on(monkeypat
     first, second = race.standings
     assert (first.driver, first.out, second.driver, second.out) == ("bt", False, "scripted", True)
     assert "steering is nan" in race.failures["scripted"]
+
+
+def test_a_policy_that_refuses_to_draw_from_no_numbers_is_out_too(game, tmp_path):
+    """PyTorch's distributions raise where a deterministic policy answers NaN."""
+    env = gym.make("Torcs-v0", track=SHORT)
+    model = PPO("MlpPolicy", env, device="cpu")
+    env.close()
+    with th.no_grad():
+        for weights in model.policy.parameters():
+            weights.copy_(3e38 * th.sign(weights + 1e-9))
+    model.save(tmp_path / "astray")
+    entrants = find_entrants([str(tmp_path / "astray.zip"), "bt"], game)
+    race = run_race(entrants, SHORT, laps=1)
+    assert [standing.out for standing in race.standings] == [False, True]
+    assert "computes no numbers" in next(iter(race.failures.values()))
+
+
+@pytest.mark.slow
+def test_a_robot_whose_car_the_physics_loses_is_out_and_the_others_race_on(game):
+    """In this race a contact puts the robot's car nowhere."""
+    race = run_race(find_entrants(["inferno", "ppo-racer"], game), "aalborg", laps=3)
+    assert [(one.driver, one.out) for one in race.standings] == [
+        ("ppo-racer", False), ("inferno", True),
+    ]  # fmt: skip
+    assert "divided by zero" in race.failures["inferno"]
+    assert np.isfinite(race.distances).all()
+
+
+@pytest.mark.parametrize("laps", [0, 1 << 31])
+def test_a_race_of_no_laps_or_too_many_is_refused(game, laps):
+    with pytest.raises(InvalidOption, match=f"laps is {laps}; expected a whole number"):
+        run_race(find_entrants(["bt"], game), SHORT, laps=laps)
+
+
+def test_no_report_is_made_of_a_race_without_a_whole_lap(capsys, game, monkeypatch, tmp_path):
+    """What else was asked for is there."""
+    monkeypatch.setattr(protocol, "SLOWEST", 1e4)  # the race ends after the time for a pit stop
+    monkeypatch.setattr(protocol, "PIT_STOP", 1.0)
+    report, picture = tmp_path / "race.html", tmp_path / "race.png"
+    words = ["race", "bt", "inferno", "--track", SHORT, "--laps", "1", "--races", "1"]
+    assert main([*words, "--report", str(report), "--picture", str(picture)]) == 0
+    printed = capsys.readouterr()
+    assert "no report: nobody drove a whole lap" in printed.err
+    assert (report.exists(), picture.is_file()) == (False, True)
+    assert f"picture: {picture}" in printed.out
+    assert "report:" not in printed.out
 
 
 def test_policies_of_one_driver_are_asked_at_once(monkeypatch, game):

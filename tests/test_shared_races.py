@@ -419,6 +419,17 @@ class TestVectorEnvironment:
             envs.step(action)
         assert np.array_equal(envs.reset(), first)
 
+    def test_a_field_may_be_empty_wherever_it_stands(self, make):
+        for fields in ([[], ["bt"]], [["bt"], []]):
+            envs = make(1, 2, opponents=fields, max_episode_steps=1)
+            envs.seed(0)
+            envs.reset()
+            places = set()
+            for _ in range(12):
+                places.add(envs.get_attr("car")[0].race_position)
+                envs.step(np.array([GAS] * 2, np.float32))
+            assert places == {1, 2}  # behind nobody, or behind the robot
+
     def test_tracks_fields_and_grid_slots_are_drawn_for_each_race(self, make):
         envs = make(
             1, 2, track=[TRACK, "aalborg"], opponents=[["bt"], ["inferno", "berniw"]],

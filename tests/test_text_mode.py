@@ -135,6 +135,11 @@ class TestRefusals:
             ([], {"session": "race"}, r"robots are none; expected at least one"),
             ([("racer", 3)] * 2, {"session": "race"}, r"racer:3, racer:3; expected .* twice"),
             (
+                [("racer", n) for n in range(21)],
+                {"session": "race"},
+                r"21 cars are named; a grid of the game has room for 20",
+            ),
+            (
                 [("racer", 3)],
                 {"laps": 0},
                 r"laps is 0; expected .* from 1 to 1073741824",

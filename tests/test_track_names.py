@@ -82,6 +82,15 @@ def test_a_path_means_the_same_in_another_folder(tmp_path, monkeypatch):
     assert lasting_track(["~/a.xml", "aalborg"]) == [str(Path("~/a.xml").expanduser()), "aalborg"]
 
 
+def test_a_path_means_the_same_for_the_game_s_own_process(game, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(find_track("g-track-1", game).path, "mine.xml")
+    env = gym.make("Torcs-v0", track="mine.xml", backend="scr")
+    monkeypatch.chdir("/")
+    env.reset(seed=0)
+    env.close()
+
+
 def test_a_record_names_the_whole_path_of_a_track(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     asked = {"env_kwargs": {"track": "mine.xml"}}

@@ -34,6 +34,7 @@ from sb3_torcs.agents.model_record import (
 from sb3_torcs.agents.scripted import SCRIPTED, ScriptedDriver
 from sb3_torcs.agents.wrapping import frames_of, normalizes, stacked_space, unrebuilt
 from sb3_torcs.errors import (
+    InvalidAction,
     InvalidOption,
     ModelMismatch,
     ModelNotTrusted,
@@ -61,6 +62,8 @@ __all__ = [
 ]
 
 AGENTS = Path(__file__).parent
+
+NO_NUMBERS = "to satisfy the constraint"  # in what PyTorch says of a distribution's parameters
 
 UNTRUSTED = (
     "'{model}' cannot be driven from plain data alone: {why}. Loading the rest runs whatever code "
@@ -99,18 +102,31 @@ class ModelDriver:
         :param episode_start: (1,) whether an episode begins here
         :param deterministic: whether to choose without randomness
         :return: the action, and the state for the next call
+        :raises InvalidAction: if the model computes no numbers
         """
-        from sb3_torcs.policies.threads import one_thread
-
         if self.statistics is not None:
             observation = self.statistics.normalize_obs(observation)
-        with one_thread():
-            if self.frames is None:
-                return self.model.predict(observation, state, episode_start, deterministic)
-            stack, state = (None, None) if state is None else state
-            stack = self._stacked(observation, stack, episode_start)
-            action, state = self.model.predict(stack, state, episode_start, deterministic)
-            return action, (stack, state)
+        if self.frames is None:
+            return self._asked(observation, state, episode_start, deterministic)
+        stack, state = (None, None) if state is None else state
+        stack = self._stacked(observation, stack, episode_start)
+        action, state = self._asked(stack, state, episode_start, deterministic)
+        return action, (stack, state)
+
+    def _asked(self, observation: Any, *how: Any) -> tuple[npt.NDArray[np.float32], Any]:
+        """Ask the model, whose distribution refuses what is no number."""
+        from sb3_torcs.policies.threads import one_thread
+
+        try:
+            with one_thread():
+                return self.model.predict(observation, *how)
+        except ValueError as error:
+            if NO_NUMBERS not in str(error):
+                raise
+            raise InvalidAction(
+                "the model computes no numbers; take one that was saved before its training went "
+                "astray"
+            ) from error
 
     def _stacked(
         self,

@@ -108,19 +108,29 @@ class Pilots:
             env = self._envs[number]
             env.car = world.engine.read(world.seat)
             seen.append(env.view.encode(env.car, self._race.seats[number]))
-        actions, self._states[driver] = self._drivers[driver].predict(
-            np.stack(seen), self._states.get(driver), begins, deterministic=True
-        )
+        try:
+            actions, self._states[driver] = self._drivers[driver].predict(
+                np.stack(seen), self._states.get(driver), begins, deterministic=True
+            )
+        except InvalidAction as error:
+            for number in team:
+                self._take_out(number, error)
+            return
         for number, world, action in zip(team, worlds, actions, strict=True):
             if number in self.failed:
                 continue
             try:
                 ((controls, _),) = self._envs[number].begin_step(action)
             except InvalidAction as error:
-                self.failed[number] = str(error)
-                world.engine.retire(world.seat)
+                self._take_out(number, error)
                 continue
             world.engine.hold(world.seat, *controls)
+
+    def _take_out(self, number: int, error: InvalidAction) -> None:
+        """Take a car out of the race, and note why."""
+        self.failed.setdefault(number, str(error))
+        world = self._race.world(number)
+        world.engine.retire(world.seat)
 
     def close(self) -> None:
         """Close the race."""

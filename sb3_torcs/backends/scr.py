@@ -113,7 +113,7 @@ class ScrBackend:
         if not is_count(self._address[1]) or self._address[1] > MAX_PORT:
             raise InvalidOption(f"port is {port!r}; expected 1 to {MAX_PORT}")
         self._race = RaceSetup(
-            track,
+            self._settings["track"],
             [DRIVER if entry == AGENT else entry for entry in entries],
             laps=laps if len(entries) > 1 and laps else MANY_LAPS,
             session="race" if len(entries) > 1 else "practice",

@@ -137,7 +137,7 @@ def _search(args: argparse.Namespace, kwargs: dict[str, Any]) -> tuple[Ghost | N
     try:
         for _ in _shown(search, budget):
             pass
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, SystemExit):  # SIGTERM
         stopped = True
     finally:
         search.close()

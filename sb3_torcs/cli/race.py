@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -168,11 +168,11 @@ def _followed(entrants: Sequence[Entrant], race: Race) -> str:
     return next(iter(places), entrants[0].name)
 
 
-def _write(files: Mapping[str, Path], race: Race, log: DriveLog | None, first: str) -> None:
+def _write(files: dict[str, Path], race: Race, log: DriveLog | None, first: str) -> None:
     """
     Write the files that show the last race.
 
-    :param files: by what they hold
+    :param files: by what they hold; loses those that cannot be made of it
     :param race: the last one
     :param log: of its drives
     :param first: driver that the others are measured against
@@ -186,7 +186,11 @@ def _write(files: Mapping[str, Path], race: Race, log: DriveLog | None, first: s
     if log is not None and "report" in files:
         from sb3_torcs.evaluation.comparing import report_of
 
-        report_of(log.frame(), first=first).save(files["report"])
+        if any(standing.laps for standing in race.standings):
+            report_of(log.frame(), first=first).save(files["report"])
+        else:
+            print("sb3-torcs: no report: nobody drove a whole lap", file=sys.stderr)
+            del files["report"]
 
 
 def _held(
@@ -247,7 +251,11 @@ def _as_json(args: argparse.Namespace, races: list[Race]) -> dict[str, Any]:
         "laps": args.laps,
         "grid": args.grid,
         "races": [
-            {"seed": race.seed, "standings": [standing.as_dict() for standing in race.standings]}
+            {
+                "seed": race.seed,
+                "standings": [standing.as_dict() for standing in race.standings],
+                "taken_out": race.failures,
+            }
             for race in races
         ],
         "drivers": driver_figures(races),

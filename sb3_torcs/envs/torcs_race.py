@@ -176,7 +176,7 @@ def make_shared_race(
     :param shared: of all races, as of :func:`make_grid`
     """
     listed = isinstance(opponents, (list, tuple))
-    several = listed and any(is_several(field, "opponents") for field in opponents)
+    several = listed and any(isinstance(field, (list, tuple)) for field in opponents)
     fields: Any = opponents if several else [opponents]
     choices = itertools.product(
         track if is_several(track) else [track],

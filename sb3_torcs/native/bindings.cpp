@@ -352,6 +352,14 @@ PYBIND11_MODULE(_engine, module) {
         .def_property_readonly("agents",
                                [](Engine& engine) { return Engine::Access(engine)->agents(); })
         .def(
+            "lost",
+            [](Engine& engine, int car) {
+                Engine::Access race(engine);
+                Engine::check_car(*race, car);
+                return race->lost(car);
+            },
+            "car"_a, "Whether the game's physics lost a car, which is out of the race then.")
+        .def(
             "finished",
             [](Engine& engine, int car) {
                 const Engine::Access race(engine);

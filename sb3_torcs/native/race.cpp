@@ -144,11 +144,29 @@ void Race::drive(int ticks) {
         step();
         while (!call_is_due() && !over()) step();
     }
-    for (int i = 0; i < cars_number(); i++)
-        if (!std::isfinite(car(i).pub.local.vel.x) || !std::isfinite(car(i).pub.local.pos.x))
+    take_out_lost();
+}
+
+// A robot that is nowhere is out, and so is an agent in a race under a flag; the others race on. An
+// environment has to end the episode of its agent.
+void Race::take_out_lost() {
+    for (int i = 0; i < cars_number(); i++) {
+        CarElement& car = world_->cars[i];
+        CarPublic& state = car.pub;
+        if (std::isfinite(state.local.vel.x) && std::isfinite(state.local.pos.x)) continue;
+        if (options_.entries[static_cast<std::size_t>(i)].is_agent() && !options_.flagged)
             throw Error("CarLost", "the game's physics has divided by zero, " +
-                                       std::string(car(i).info.name) +
+                                       std::string(car.info.name) +
                                        " is nowhere; call reset to go on");
+        retire(i);
+        world_->records[i].lost = true;
+        // What is read of it stays finite: it stands where its last segment of road begins.
+        state.local = state.global = Motion{};
+        state.speed = 0.0f;
+        state.track.to_start = state.track.to_right = state.track.to_middle = 0.0f;
+        state.track.to_left = 0.0f;
+        measure_distance(car);
+    }
 }
 
 void Race::update_physics(int steps) {

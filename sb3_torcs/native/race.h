@@ -121,6 +121,8 @@ public:
     void update_physics(int steps);
     bool ended() const;
     bool finished(int index) const { return world_->records[index].finished; }
+    // Whether the physics has divided by zero for a car, so that it was taken out of the race.
+    bool lost(int index) const { return world_->records[index].lost; }
 
     Snapshot save() const;
     void restore(const Snapshot& snapshot);
@@ -159,6 +161,7 @@ private:
         int lane_state;         // of race_rules.cpp
         double start_distance;  // [m] by the race's count, where the episode began
         bool finished;          // drove all its laps
+        bool lost;              // was nowhere, see `take_out_lost`
         bool flying;            // began on the way: the first crossing starts the clock
         int contacts, faults;   // with other cars; of these by its own fault
         double contact_time;    // [s] of the last moment of contact
@@ -186,6 +189,7 @@ private:
         return static_cast<T*>(std::memset(arena_.allocate(size), 0, size));
     }
     void close();
+    void take_out_lost();
 
     void load_track();
     void load_cars();

@@ -11,7 +11,7 @@ import numpy as np
 from sb3_torcs.agents.pilots import Pilots
 from sb3_torcs.backends.native import load_race
 from sb3_torcs.backends.seats import SeatWorld, SharedRace
-from sb3_torcs.car import CONTROL_TICK, Controls, FloatArray
+from sb3_torcs.car import CONTROL_TICK, Controls, FloatArray, checked_laps
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.races.entrants import Entrant
 from sb3_torcs.telemetry import DriveLabel, DriveLog
@@ -39,6 +39,7 @@ GRIDS = get_args(GridName)
 LOOK = 50  # [control ticks] a second, after which the race is looked at
 SLOWEST = 10.0  # [m/s] below which the game takes a car out, for a lap and ...
 PIT_STOP = 84.5  # [s] ... for a stop in it
+LOST = "the game's physics has divided by zero, and its car is nowhere"
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ class Race:
 
     seed: int
     standings: list[Standing]  # the winner first
-    failures: dict[str, str]  # drivers that were taken out for what they answered
+    failures: dict[str, str]  # why drivers were taken out: what they answered, or a lost car
     drivers: list[str]  # by grid slot
     distances: Any  # (moments, cars) [m] from the start line on
     places: Any  # (moments, cars)
@@ -197,6 +198,7 @@ def run_race(
     :param progress: called now and then with the share of the race that is over, 0 to 1
     :raises ModelMismatch: if an agent does not fit this race
     """
+    checked_laps(laps)
     agents = [entrant.agent for entrant in order if entrant.agent is not None]
     numbers = iter(range(len(agents)))
     entries = [entrant.robot or ("", next(numbers)) for entrant in order]
@@ -234,6 +236,8 @@ def run_race(
         failed = {} if pilots is None else pilots.failed
         seats = engine.agents
         failures = {names[seats[number]]: why for number, why in failed.items()}
+        lost = [name for slot, name in enumerate(names) if engine.lost(slot)]
+        failures |= dict.fromkeys(lost, LOST)
     finally:
         engine.close()
     trace = np.array(moments)

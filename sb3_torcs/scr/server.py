@@ -10,7 +10,7 @@ import errno
 import socket
 from collections.abc import Sequence
 
-from sb3_torcs.errors import PortTaken
+from sb3_torcs.errors import InvalidOption, PortTaken
 from sb3_torcs.torcs.installation import Game
 from sb3_torcs.torcs.process import GameProcess
 from sb3_torcs.torcs.race_setup import RaceSetup
@@ -38,6 +38,8 @@ def open_ports(
     :return: the sockets; the caller closes them
     :raises PortTaken: if one cannot be bound; then all are closed
     """
+    if not host:
+        raise InvalidOption("host is empty; give an address of this machine, or 0.0.0.0 for all")
     sockets: list[socket.socket] = []
     for number in range(drivers):
         wanted = 0 if port is None else port + number

@@ -13,6 +13,7 @@ from sb3_torcs.car import DEFAULT_CAR, MANY_LAPS, checked_laps
 from sb3_torcs.errors import GameIncomplete, InvalidOption
 from sb3_torcs.torcs.installation import Game
 from sb3_torcs.torcs.params import Node
+from sb3_torcs.torcs.starting_list import GRID_SLOTS
 
 __all__ = [
     "RACE_FILE",
@@ -79,6 +80,10 @@ class RaceSetup:
         if not drivers or len(set(drivers)) < len(drivers):
             named = ", ".join(f"{name}:{index}" for name, index in drivers) or "none"
             raise InvalidOption(f"robots are {named}; expected at least one, none of them twice")
+        if len(drivers) > GRID_SLOTS:
+            raise InvalidOption(
+                f"{len(drivers)} cars are named; a grid of the game has room for {GRID_SLOTS}"
+            )
         for name, index in drivers:
             if name == SCR_SERVER and not 0 <= index < SCR_DRIVERS:
                 raise InvalidOption(
