@@ -120,8 +120,8 @@ def _race_result(row: Node, rank: int, cars: Mapping[tuple[str, int], str]) -> R
     return RobotResult(
         *key, cars[key], laps=[], total_time=row.number("time"), rank=rank,
         damage=int(row.number("dammages")), out=False,
-        # The game counts -1 laps before the start.
-        laps_completed=max(int(row.number("laps")), 0), best_lap=row.number("best lap time") or None,
+        laps_completed=max(int(row.number("laps")), 0),  # the game counts -1 before the start
+        best_lap=row.number("best lap time") or None,
         client=row.text("name") if key[0] == SCR_SERVER else "",
     )  # fmt: skip
 
