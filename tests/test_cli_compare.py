@@ -18,7 +18,7 @@ from sb3_torcs.cli import main
 from sb3_torcs.evaluation import comparing
 from sb3_torcs.evaluation.comparing import compare
 from sb3_torcs.telemetry import DriveLog
-from sb3_torcs.torcs.track_names import BUNDLED_FOLDER
+from sb3_torcs.torcs.track_names import BUNDLED_FOLDER, find_track
 from sb3_torcs.tracks.catalogue import load_track
 
 TRACK = "g-track-1"
@@ -195,3 +195,16 @@ def test_a_race_of_several_makes_a_page_too(oval, monkeypatch):
     monkeypatch.setattr(comparing, "load_track", lambda name: oval)
     report = comparing.report_of(log_of(oval, ("ana", 25.0), ("ben", 20.0)).frame())
     assert [one.drive.driver for one in report.comparison.drivers] == ["ana", "ben"]
+
+
+def test_a_report_of_an_own_track_needs_no_name(game, tmp_path):
+    shutil.copy(find_track("g-track-1", game).path, tmp_path / "mine.xml")
+    page = tmp_path / "lap.html"
+    words = ["evaluate", "scripted", "--env", "Torcs-v0", "--track", str(tmp_path / "mine.xml")]
+    assert main([*words, "--laps", "1", "--report", str(page)]) == 0
+    assert page.is_file()
+
+
+def test_a_csv_of_a_drive_is_not_taken_for_a_model(capsys):
+    assert main(["compare", "drive.csv", "bt"]) == 2
+    assert "'drive.csv' is a CSV file" in capsys.readouterr().err

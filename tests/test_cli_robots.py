@@ -192,3 +192,9 @@ class TestRefusals:
         status, out, err = run(capsys, "racer", "--track", "loop", "--with", f"racer:3,{rivals}")
         assert (status, out) == (2, "")
         assert "expected NAME or NAME:INDEX, e.g. inferno:3" in err
+
+
+def test_telemetry_in_another_format_is_refused(capsys, fake, tmp_path):
+    status, out, err = run(capsys, "racer", "--telemetry", str(tmp_path / "drive.txt"))
+    assert (status, out) == (2, "")
+    assert "should end in .parquet or .csv" in err

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -135,6 +136,13 @@ def test_nobody_with_a_whole_lap_is_an_error(oval):
     log = drive(DriveLog(), oval, laps=0, end=120.0)
     with pytest.raises(DriveFileError, match=r"nobody drove a whole lap of oval.*ana drove 120 m"):
         compared(log, oval)
+
+
+def test_a_lap_of_another_road_of_that_name_is_an_error(oval):
+    log = log_of(oval, ("ana", 20.0))
+    longer = dataclasses.replace(oval, segments=oval.segments * 2)
+    with pytest.raises(DriveFileError, match=r"ana drove laps of 91\d m, but oval has 1828 m"):
+        compared(log, longer)
 
 
 def test_a_page_says_who_drove_no_whole_lap_and_what_differs(oval):

@@ -354,3 +354,9 @@ def test_an_interrupted_search_keeps_what_it_found(tiny, ghost, tmp_path, monkey
     assert main(words(tmp_path / "lap.npz")) == 130
     assert "ghost: " in capsys.readouterr().out
     assert read_ghost(tmp_path / "lap.npz").lap_times == ghost.lap_times
+
+
+def test_a_ghost_on_a_track_file_holds_in_another_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    kwargs = ghost_environment("scripted", "mine.xml", None)
+    assert kwargs["track"] == str(tmp_path / "mine.xml")

@@ -151,6 +151,18 @@ def test_what_is_no_drive_is_told(tmp_path, oval):
         read_drives(path)
 
 
+@pytest.mark.parametrize(("change", "says"), [
+    (lambda frame: frame.assign(driver=None), "who drove where"),
+    (lambda frame: frame.assign(distance_from_start=float("nan")), "distance is no number"),
+    (lambda frame: frame.iloc[::-1], "out of order"),
+])  # fmt: skip
+def test_rows_that_are_no_drive_are_told(tmp_path, oval, change, says):
+    path = written(tmp_path, log_of(oval, ("ana", 20.0)))
+    change(pd.read_parquet(path)).to_parquet(path)
+    with pytest.raises(DriveFileError, match=rf"is damaged: .*{says}; write it anew"):
+        read_drives(path)
+
+
 def test_an_evaluation_writes_its_drives_as_parquet(tmp_path, capsys):
     path = tmp_path / "drive.parquet"
     words = "evaluate scripted --env TorcsLite-v0 --track g-track-1 --laps 1 --episodes 2"

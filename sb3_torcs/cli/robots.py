@@ -74,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
         raise InvalidOption("--telemetry is written by the engine only; leave out --game")
     telemetry = None
     if args.telemetry is not None:
-        telemetry = writable_file(args.telemetry, (Path(args.telemetry).suffix.lower(),))
+        telemetry = writable_file(args.telemetry, (".parquet", ".csv"))
     name = args.name if args.index is None else f"{args.name}:{args.index}"
     rivals = [] if args.rivals is None else args.rivals.split(",")
     robots = [game.parse_robot(word) for word in (name, *rivals)]

@@ -94,6 +94,12 @@ def compare(
     checked_laps(laps)
     if not drivers:
         raise InvalidOption("there is nobody to compare; name drivers, e.g. ddpg-aalborg inferno")
+    for driver in drivers:
+        if Path(driver).suffix.lower() == ".csv":
+            raise DriveFileError(
+                f"'{driver}' is a CSV file; saved drives are compared from files that --telemetry "
+                f"writes with the ending {' or '.join(SAVED)}"
+            )
     saved = {driver: saved_drives(driver) for driver in drivers if is_saved(driver)}
     where = _track(track, drivers, saved)
     drives = []
@@ -116,8 +122,9 @@ def report_of(
     :raises DriveFileError: if nobody drove a whole lap
     """
     drives = sorted(drives_of(frame), key=lambda drive: drive.driver != first)
-    name = _track(None, (), {"": drives})
-    return LapReport(compare_drives(drives, load_track(name) if track is None else track))
+    if track is None:
+        track = load_track(_track(None, (), {"": drives}))
+    return LapReport(compare_drives(drives, track))
 
 
 def is_saved(driver: str | Path) -> bool:

@@ -17,6 +17,7 @@ from sb3_torcs.tracks.track import Track
 __all__ = ["Comparison", "CornerPass", "DriverLap", "compare_drives"]
 
 SECTORS = 3  # of one length each; the game's tracks have none
+NEAR_THE_LINE = 20.0  # [m] within which each lap is seen; a car is noted after each control tick
 BRAKING = 0.05  # [-] of the pedal's travel; networks seldom give exactly 0
 
 
@@ -90,7 +91,7 @@ def compare_drives(drives: Sequence[Drive], track: Track) -> Comparison:
 
     :param drives: on this track
     :param track: that they were driven on
-    :raises DriveFileError: if nobody drove a whole lap
+    :raises DriveFileError: if nobody drove a whole lap, or a lap is of another road
     """
     able = [drive for drive in drives if drive.laps]
     if not able:
@@ -102,6 +103,8 @@ def compare_drives(drives: Sequence[Drive], track: Track) -> Comparison:
     flying = all(drive.best(flying=True) for drive in able)
     grid = grid_of(track)
     laps = [drive.best(flying=flying) for drive in able]
+    for drive, lap in zip(able, laps, strict=True):
+        _check_road(drive, lap, track)
     sampled = [sample(lap, grid) for lap in laps if lap is not None]
     corners = corners_of(track)
     first = sampled[0]
@@ -117,6 +120,16 @@ def compare_drives(drives: Sequence[Drive], track: Track) -> Comparison:
     ]
     left_out = [drive for drive in drives if not drive.laps]
     return Comparison(track, grid, corners, drivers, left_out, list(drives))
+
+
+def _check_road(drive: Drive, lap: Lap | None, track: Track) -> None:
+    """Refuse a lap of a road that only has the same name."""
+    reached = track.length if lap is None else float(lap.rows["distance_from_start"].max())
+    if abs(reached - track.length) > NEAR_THE_LINE:
+        raise DriveFileError(
+            f"{drive.driver} drove laps of {reached:.0f} m, but {track.name} has "
+            f"{track.length:.0f} m: another road of that name; say which with --track FILE"
+        )
 
 
 def _passes(

@@ -178,4 +178,19 @@ def read_drives(path: str | Path) -> pd.DataFrame:
         )
     if frame.empty:
         raise DriveFileError(f"'{path}' holds no rows: nobody has driven; {again}")
+    damage = _damage(frame)
+    if damage is not None:
+        raise DriveFileError(f"'{path}' is damaged: {damage}; {again}")
     return frame
+
+
+def _damage(frame: pd.DataFrame) -> str | None:
+    """Say what keeps rows from being drives, if anything does."""
+    if frame[list(LABELS)].isna().any(axis=None):
+        return "it does not say of each row who drove where"
+    if not np.isfinite(frame[["time", "distance_from_start"]].to_numpy(np.float64)).all():
+        return "a time or a distance is no number"
+    drives = frame.groupby(list(LABELS), sort=False, observed=True)
+    if (drives["time"].diff() < 0.0).any():
+        return "its rows are out of order"
+    return None

@@ -18,6 +18,7 @@ from sb3_torcs.car import DEFAULT_CAR, CarState, Controls, FloatArray
 from sb3_torcs.errors import InvalidOption, RobotUnavailable
 from sb3_torcs.evaluation.protocol import KEPT, RACE_LAPS, time_limit
 from sb3_torcs.torcs.installation import find_game
+from sb3_torcs.torcs.track_names import lasting_track
 from sb3_torcs.training.lap_line import waypoint
 
 __all__ = ["Start", "find_starts", "ghost_environment"]
@@ -52,6 +53,7 @@ def ghost_environment(agent: str, track: str | None, car: str | None) -> dict[st
     kwargs.update({name: value for name, value in given.items() if value is not None})
     one_of("track", kwargs["track"])
     one_of("car", kwargs["car"])
+    kwargs["track"] = lasting_track(kwargs["track"])
     if kwargs["action"] == "manual":  # the search leaves the gears to the gearbox
         kwargs["action"] = "pedals"
     return kwargs
