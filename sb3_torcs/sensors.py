@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import accumulate, chain, combinations, pairwise
 from operator import attrgetter
 from typing import Any, Literal, NamedTuple
@@ -31,7 +31,6 @@ from sb3_torcs.tracks.profile import INTERVALS, QUANTITIES, RoadProfile, look_ah
 from sb3_torcs.tracks.racing_line import (
     LINE_PLACES,
     USUAL_PACE,
-    Pace,
     look_along,
     pace_of,
     racing_line,
@@ -56,7 +55,6 @@ __all__ = [
     "feature_slices",
     "look_both_ways",
     "range_finder_angles",
-    "sensor_table",
 ]
 
 SensorsName = Literal[
@@ -169,9 +167,8 @@ CAR = (
 ``mass`` and ``grip`` of an episode's conditions are not in them, nor fuel that is burnt."""
 
 CAR_LINE = (
-    Sensor("car_line_offsets", "", LINE_PLACES, "m", -25.0, 25.0, 1.0 / 5.0, "opposite"),
-    Sensor("car_line_bends", "", LINE_PLACES, "-", -1.0, 1.0, 1.0, "opposite"),
-    Sensor("car_line_margins", "", LINE_PLACES, "m/s", -40.0, 40.0, 1.0 / 20.0),
+    LINE[0]._replace(name="car_line_offsets", low=-25.0, high=25.0),
+    *(row._replace(name=f"car_{row.name}") for row in LINE[1:]),
 )
 """The racing line ahead as in ``"line"``, but with margins of the car that is driven, by the grip
 of its tyres and its downforce, and with short crests. Margins of ``"line"`` are always those of the
@@ -409,23 +406,15 @@ def _write_limits(world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -
     _scale_into(margins, _PARTS["limits"].start, numbers)
 
 
-def _write_the_line(
-    group: str, world: Any, car: CarState, pace: Pace, numbers: npt.NDArray[np.float32]
+def _write_line(
+    group: SensorsName, world: Any, car: CarState, numbers: npt.NDArray[np.float32]
 ) -> None:
+    pace = pace_of(world.facts.grip, world.facts.downforce) if group == "car_line" else USUAL_PACE
     table, step = racing_line(_profile(world), pace)
     seen = np.empty((3, LINE_PLACES))
     look_along(table, step, car.distance_from_start, car.track_position, car.speed_x, seen)
     seen[1] /= np.abs(seen[1]) + USUAL_BEND
     _scale_into(seen.ravel(), _PARTS[group].start, numbers)
-
-
-def _write_line(world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> None:
-    _write_the_line("line", world, car, USUAL_PACE, numbers)
-
-
-def _write_car_line(world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> None:
-    pace = pace_of(world.facts.grip, world.facts.downforce)
-    _write_the_line("car_line", world, car, pace, numbers)
 
 
 def _write_opponents(_world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> None:
@@ -448,12 +437,12 @@ def _write_car(world: Any, _car: CarState, numbers: npt.NDArray[np.float32]) -> 
 _WRITERS: dict[str, Callable[[Any, CarState, npt.NDArray[np.float32]], None]] = {
     "preview": _write_preview,
     "limits": _write_limits,
-    "line": _write_line,
+    "line": partial(_write_line, "line"),
     "opponents": _write_opponents,
     "rivals": _write_rivals,
     "race": _write_race,
     "car": _write_car,
-    "car_line": _write_car_line,
+    "car_line": partial(_write_line, "car_line"),
 }
 """Of each group but ``"base"``: fills its numbers, from the world and the state of the car."""
 
@@ -506,29 +495,6 @@ class View:
         """
         for write, where in self._more:
             write(world, car, observation[where])
-
-
-def sensor_table(name: SensorsName = "base") -> str:
-    """
-    A group of the table as Markdown, for the documentation.
-
-    :param name: of the group
-    """
-    lines = [
-        "| Num | Sensor | SCR | Unit | Min | Max | Scale | Observation min | Observation max |",
-        "|----:|--------|-----|------|----:|----:|------:|----:|----:|",
-    ]
-    where = feature_slices(("base",) if name == "base" else ("base", name))
-    for sensor in GROUPS[name]:
-        first, end = where[sensor.name].start, where[sensor.name].stop
-        number = f"{first}" if sensor.size == 1 else f"{first}-{end - 1}"
-        key = f"`{sensor.key}`" if sensor.key else ""
-        lines.append(
-            f"| {number} | `{sensor.name}` | {key} | {sensor.unit} | {sensor.low:.5g} | "
-            f"{sensor.high:.5g} | {sensor.scale:.5g} | {sensor.low * sensor.scale:.5g} | "
-            f"{sensor.high * sensor.scale:.5g} |"
-        )
-    return "\n".join(lines)
 
 
 RangeFinderName = Literal["scr", "narrow"]

@@ -72,7 +72,7 @@ HAS_THE_GAME_RUN = {  # and nothing else: no world but one needs another process
 USES_A_NETWORK = {"rendering/game_camera.py", "scr/client.py", "scr/server.py", "torcs/display.py"}
 LOADS_THE_ENGINE = {"backends/native.py", "torcs/trial_child.py"}
 ASKS_DRIVERS = {
-    "agents/models.py",  # hands on what it is asked
+    "agents/model_driver.py",  # hands on what it is asked
     "agents/pilots.py",  # several at once, in one race
     "agents/rollout.py",
     "bench/torcs.py",  # on threads, where nobody looks at what is driven

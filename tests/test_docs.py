@@ -32,7 +32,7 @@ from sb3_torcs.callbacks.metrics import DrivingMetricsCallback
 from sb3_torcs.envs.torcs import TorcsEnv
 from sb3_torcs.envs.torcs_lite import TorcsLiteEnv
 from sb3_torcs.noise import BLOG
-from sb3_torcs.sensors import RANGE_FINDERS, sensor_table
+from sb3_torcs.sensors import GROUPS, RANGE_FINDERS, feature_slices
 from sb3_torcs.studies.config import read_study
 from sb3_torcs.torcs.packages import VIDEO_PACKAGES
 from sb3_torcs.torcs.track_names import BUNDLED_FOLDER
@@ -160,6 +160,25 @@ def verbs_table():
     for verb in cli.VERBS:
         verb.add_parser(collector)
     return markdown(["verb", "does"], collector.rows)
+
+
+def sensor_table(name="base"):
+    """A group of sensors."""
+    lines = [
+        "| Num | Sensor | SCR | Unit | Min | Max | Scale | Observation min | Observation max |",
+        "|----:|--------|-----|------|----:|----:|------:|----:|----:|",
+    ]
+    where = feature_slices(("base",) if name == "base" else ("base", name))
+    for sensor in GROUPS[name]:
+        first, end = where[sensor.name].start, where[sensor.name].stop
+        number = f"{first}" if sensor.size == 1 else f"{first}-{end - 1}"
+        key = f"`{sensor.key}`" if sensor.key else ""
+        lines.append(
+            f"| {number} | `{sensor.name}` | {key} | {sensor.unit} | {sensor.low:.5g} | "
+            f"{sensor.high:.5g} | {sensor.scale:.5g} | {sensor.low * sensor.scale:.5g} | "
+            f"{sensor.high * sensor.scale:.5g} |"
+        )
+    return "\n".join(lines)
 
 
 GENERATED = {

@@ -147,7 +147,7 @@ def show_in_window(show: Show, window: Window) -> None:
             try:
                 show.agent.drive(AFTERMATH)
             except ServerLost as error:
-                if process.poll() is None:
+                if not process.is_ending():
                     raise
                 raise GameFailed(process.epitaph()) from error
             if show.agent.end is not None:
@@ -232,7 +232,7 @@ def _begin(show: Show, video: GameVideo) -> threading.Thread:
             show.agent.drive(AFTERMATH)
         except BaseException as error:
             # If the game ended by itself, its own error is more precise.
-            if not isinstance(error, ServerLost) or video.game.poll() is None:
+            if not isinstance(error, ServerLost) or not video.game.is_ending():
                 show.agent.error = error
             video.game.stop()  # the game would wait for an answer
 

@@ -30,6 +30,7 @@ __all__ = ["GameProcess", "TrackCheck", "compiled_library", "game_environment"]
 PREFIX = "sb3-torcs-game-"  # of private folders
 LAST_LINES = 5  # [lines] of the game's output, for an error
 OWN_TRACKS = "own"  # the category of a track that is not the game's
+ENDING = 1.0  # [s] from the end of a process's connections to its own, at most
 GRACE = 5.0  # [s] for a process to end after a signal
 LOOK = 0.1  # [s] between two looks at what the game prints
 
@@ -131,6 +132,12 @@ class GameProcess:
     def poll(self) -> int | None:
         """Return the exit status, negative for a signal; ``None`` while the game runs."""
         return self._process.poll()
+
+    def is_ending(self) -> bool:
+        """Whether the game has ended, or does so now: its ports close before it is gone."""
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(ENDING)
+        return self.poll() is not None
 
     def wait(self, timeout: float | None = None) -> None:
         """
