@@ -129,8 +129,7 @@ class Pilots:
     def _take_out(self, number: int, error: InvalidAction) -> None:
         """Take a car out of the race, and note why."""
         self.failed.setdefault(number, str(error))
-        world = self._race.world(number)
-        world.engine.retire(world.seat)
+        self._race.seats[number].retire()
 
     def close(self) -> None:
         """Close the race."""

@@ -52,8 +52,7 @@ USUAL_GRIP = 1.6  # [-] the default car's own factor on the friction of the grou
 USUAL_DOWNFORCE = 0.00224  # [1/m] of the default car by its file
 LEAST = 1.0  # [m/s²] across that every road bears
 HILLS = 20.0  # [m] before and after a place, over which the road's rise and fall are measured
-# Shorter ones throw a car up, too. The margins that the first agents learned by leave that out.
-CREST = 4.0  # [m]
+CREST = 4.0  # [m] the same for crests alone: short ones throw a car up, too
 
 
 class Pace(NamedTuple):
@@ -157,10 +156,10 @@ def racing_line(road: RoadProfile, pace: Pace = USUAL_PACE) -> RacingLine:
     """
     Find the racing line of a road, and how fast it may be driven.
 
-    It takes some hundredths of a second, once per road.
+    It takes some hundredths of a second, once per road, and little more for each other pace.
 
     :param road: closed
-    :param pace: of the driver
+    :param pace: of the driver; the usual one leaves short crests out
     :return: the line
     """
     path = _path(road)
