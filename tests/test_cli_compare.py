@@ -17,7 +17,8 @@ from sb3_torcs.agents.scripted import ScriptedDriver
 from sb3_torcs.cli import main
 from sb3_torcs.evaluation import comparing
 from sb3_torcs.evaluation.comparing import compare
-from sb3_torcs.telemetry import DriveLog
+from sb3_torcs.telemetry import DriveLog, read_drives
+from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.track_names import BUNDLED_FOLDER, find_track
 from sb3_torcs.tracks.catalogue import load_track
 
@@ -136,6 +137,41 @@ def test_a_track_may_be_somebodys_own_file(tmp_path, capsys):
     assert main([*words.split(), "--report", str(page)]) == 0
     assert page.read_text().startswith("<!DOCTYPE html>")
     assert run(capsys, drives, "--track", own, "--html", page)[0] == 0
+
+
+def test_a_drive_on_an_own_track_names_its_file(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(BUNDLED_FOLDER / "road" / "g-track-1.csv", "aalborg.csv")
+    words = (
+        "evaluate scripted --env TorcsLite-v0 --track aalborg.csv --laps 1 --telemetry a.parquet"
+    )
+    assert main(words.split()) == 0
+    assert set(read_drives("a.parquet")["track"]) == {str(tmp_path / "aalborg.csv")}
+    monkeypatch.chdir("/")
+    assert compare(tmp_path / "a.parquet").comparison.track.file == tmp_path / "aalborg.csv"
+    status, _, err = run(
+        capsys, tmp_path / "a.parquet", "--track", "aalborg", "--html", tmp_path / "a.html"
+    )
+    assert status == 2
+    assert "but aalborg has 2588 m: another road of that name" in err
+    (tmp_path / "aalborg.csv").unlink()
+    status, _, err = run(capsys, tmp_path / "a.parquet", "--html", tmp_path / "a.html")
+    assert status == 2
+    assert f"there is no track file '{tmp_path / 'aalborg.csv'}'" in err
+
+
+@pytest.mark.usefixtures("game")
+@pytest.mark.parametrize("driver", ["evaluate scripted --env Torcs-v0", "robots inferno"])
+def test_others_drive_where_a_saved_drive_was(tmp_path, monkeypatch, driver):
+    """And not on the track of the game that has the file's name."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(find_track("a-speedway", find_game()).path, "aalborg.xml")
+    words = "--track aalborg.xml --laps 1 --telemetry a.parquet"
+    assert main([*driver.split(), *words.split()]) == 0
+    assert set(read_drives("a.parquet")["track"]) == {str(tmp_path / "aalborg.xml")}
+    report = compare("a.parquet", "bt", laps=1)
+    assert [len(one.drive.laps) for one in report.comparison.drivers] == [1, 1]
+    assert report.comparison.track.length == load_track("a-speedway").length
 
 
 def test_in_a_notebook_the_report_shows_itself(saved):

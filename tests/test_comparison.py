@@ -186,3 +186,9 @@ def test_names_are_text_in_the_page(oval):
 def test_the_same_drives_give_the_same_page(oval):
     log = log_of(oval, ("ana", 25.0), ("ben", 20.0))
     assert lap_report(compared(log, oval)) == lap_report(compared(log, oval))
+
+
+def test_rows_may_lie_far_apart(oval):
+    """As those of an agent with long timesteps."""
+    frame = log_of(oval, ("ana", 80.0)).frame()
+    assert compare_drives(drives_of(frame.iloc[::25]), oval).drivers  # 40 m

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import zipfile
 
 import gymnasium as gym
@@ -22,6 +23,7 @@ from sb3_torcs.scr.server import open_ports, start_server
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.race_setup import RaceSetup
 from sb3_torcs.torcs.starting_list import AGENT
+from sb3_torcs.torcs.track_names import find_track
 from sb3_torcs.training import lap_search
 from sb3_torcs.training.lap_line import Line, lap_of, repeated
 from sb3_torcs.training.lap_search import Budget, LapSearch
@@ -265,6 +267,18 @@ def test_a_ghost_is_a_driver_like_others(file):
 )  # fmt: skip
 def test_a_ghost_drives_no_other_race(file, kwargs, said):
     with gym.make("Torcs-v0", **kwargs) as env, pytest.raises(ModelMismatch, match=said):
+        load_driver(file, env)
+
+
+def test_a_ghost_drives_on_no_other_road_of_the_same_name(file, tmp_path):
+    own = tmp_path / f"{TRACK}.xml"
+    shutil.copy(find_track("b-speedway", find_game()).path, own)
+    with (
+        gym.make("Torcs-v0", track=str(own)) as env,
+        pytest.raises(ModelMismatch, match=rf"with track '.*{TRACK}.xml', not '{own}'"),
+    ):
+        load_driver(file, env)
+    with gym.make("Torcs-v0", track=str(find_track(TRACK, find_game()).path), laps=3) as env:
         load_driver(file, env)
 
 

@@ -94,6 +94,17 @@ def test_an_agents_drive_is_noted_tick_by_tick_and_stays_the_same():
 
 
 @pytest.mark.usefixtures("game")
+@pytest.mark.parametrize("env_id", ["Torcs-v0", "TorcsLite-v0"])
+@pytest.mark.parametrize("track", ["aalborg", "road/forza"])
+def test_a_track_of_the_game_is_stored_by_its_name(env_id, track):
+    with gym.make(f"sb3_torcs:{env_id}", track=track) as env:
+        log = log_drives(env, "x")
+        env.reset(seed=0)
+        env.step(env.action_space.sample())
+    assert set(log.frame()["track"]) == {track.removeprefix("road/")}
+
+
+@pytest.mark.usefixtures("game")
 @pytest.mark.parametrize("kwargs", [{}, {"delay": 2}, {"opponents": ["scripted"]}])
 def test_who_looks_on_draws_no_noise(kwargs):
     """What an agent sees is the same to the bit, where each control tick is noted."""

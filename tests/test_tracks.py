@@ -263,6 +263,7 @@ class TestCompactFile:
             ("segment,157", "segment,-157", 8, "it has to be above 0"),
             ("10.0,10.0,1.0", "10.0,0.0,1.0", 8, "the road's width has to be above 0"),
             ("1.0,2.0,3.0,4.0", "1.0,-2.0,3.0,4.0", 8, "may not be negative"),
+            ("0.02,10", "-0.3,10", 8, "bend is 3.33 m, less than half the road's width, 5 m"),
         ],
     )
     def test_a_broken_line_is_named(self, tmp_path, old, new, line, message):

@@ -226,15 +226,17 @@ def check_fits(ghost: Ghost, env: gym.Env[Any, Any], name: str | Path) -> None:
         **USUAL,
         **(env.spec.kwargs if env.spec is not None else {}),  # cars of one race have none
         **env.get_wrapper_attr("conditions").choice,
-        "track": backend.track.name,
         "car": backend.car,
         "action_repeat": env.get_wrapper_attr("action_repeat"),
         "action": env.get_wrapper_attr("action"),
         "unstick": aids.unstick,
         "keep_distance": aids.keep_distance,
     }
-    own_track = load_track(find_track(ghost.env_kwargs["track"], find_game()).path).name
-    needs = {**USUAL, **ghost.env_kwargs, "track": own_track}
+    needs = {**USUAL, **ghost.env_kwargs}
+    own_track = load_track(find_track(needs["track"], find_game()).path)
+    needs["track"], has["track"] = own_track.name, backend.track.name
+    if needs["track"] == has["track"]:  # which two roads may have
+        needs["track"], has["track"] = str(own_track.file), str(backend.track.file)
     for what in ("track", "car", "action_repeat", *USUAL):
         value = needs[what] or USUAL.get(what)  # no opponents may be None, [] or ()
         if (has[what] or USUAL.get(what)) != value:

@@ -51,7 +51,7 @@ def add_parser(subparsers: Any) -> None:
     add(
         "--telemetry",
         metavar="FILE",
-        help="write the drive: a .parquet, or else CSV; not with --game",
+        help="write the drive to a .parquet or a .csv; not with --game",
     )
     add("--json", action="store_true", help="print JSON and nothing else")
     parser.set_defaults(run=run)
@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
     """
     from sb3_torcs.errors import InvalidOption
     from sb3_torcs.torcs.installation import find_game
-    from sb3_torcs.torcs.track_names import find_track
+    from sb3_torcs.torcs.track_names import find_track, lasting_track
 
     game = find_game()
     if args.name is None:
@@ -81,7 +81,7 @@ def run(args: argparse.Namespace) -> int:
     file = find_track(args.track, game)
     track = args.track if file.source == "file" else file.name
     with quiet_output(args.json):
-        results = _drive(game, robots, track, args, telemetry)
+        results = _drive(game, robots, lasting_track(track), args, telemetry)
     if args.json:
         print_json(results_as_json(results, robots[0], track))
         return 0

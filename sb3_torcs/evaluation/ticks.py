@@ -12,6 +12,7 @@ from sb3_torcs.backends.base import Backend
 from sb3_torcs.backends.several import present_world
 from sb3_torcs.car import CarState, Controls, Start
 from sb3_torcs.telemetry.drives import DriveLabel, DriveLog
+from sb3_torcs.tracks.catalogue import lasting_name
 
 __all__ = ["LoggedWorld", "TickedWorld", "log_drives"]
 
@@ -67,7 +68,7 @@ class LoggedWorld(TickedWorld):
     def reset(self, rng: np.random.Generator, start: Start | None) -> CarState:
         """Begin an episode; see :class:`~sb3_torcs.backends.base.Backend`."""
         state = super().reset(rng, start)
-        track = self._world.track.name  # a random one is drawn before the reset
+        track = lasting_name(self._world.track)  # a random one is drawn before the reset
         self._label = self._label._replace(track=track, episode=self._label.episode + 1)
         return state
 

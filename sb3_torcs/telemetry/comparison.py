@@ -17,7 +17,7 @@ from sb3_torcs.tracks.track import Track
 __all__ = ["Comparison", "CornerPass", "DriverLap", "compare_drives"]
 
 SECTORS = 3  # of one length each; the game's tracks have none
-NEAR_THE_LINE = 20.0  # [m] within which each lap is seen; a car is noted after each control tick
+NEAR_THE_LINE = 20.0  # [m] within which a lap is seen, unless its rows lie farther apart
 BRAKING = 0.05  # [-] of the pedal's travel; networks seldom give exactly 0
 
 
@@ -124,8 +124,11 @@ def compare_drives(drives: Sequence[Drive], track: Track) -> Comparison:
 
 def _check_road(drive: Drive, lap: Lap | None, track: Track) -> None:
     """Refuse a lap of a road that only has the same name."""
-    reached = track.length if lap is None else float(lap.rows["distance_from_start"].max())
-    if abs(reached - track.length) > NEAR_THE_LINE:
+    if lap is None:
+        return
+    reached = float(lap.rows["distance_from_start"].max())
+    longest = float(lap.rows["distance_raced"].diff().max())  # [m] between two rows
+    if abs(reached - track.length) > max(NEAR_THE_LINE, longest):
         raise DriveFileError(
             f"{drive.driver} drove laps of {reached:.0f} m, but {track.name} has "
             f"{track.length:.0f} m: another road of that name; say which with --track FILE"

@@ -41,7 +41,7 @@ class DriveLabel(NamedTuple):
     """Whose drive it is; the first columns of the table."""
 
     driver: str  # as it is named on the command line
-    track: str  # a name, or the path of a file
+    track: str  # a name, or the absolute path of somebody's own file
     car: str
     world: str  # the environment's id
     episode: int = 1  # the driver's races are counted

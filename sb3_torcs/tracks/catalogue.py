@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 
 from sb3_torcs.errors import InvalidOption, TrackFileError
-from sb3_torcs.torcs.installation import torcs_folders
+from sb3_torcs.torcs.installation import torcs_folders, track_files
 from sb3_torcs.torcs.params import digests
 from sb3_torcs.torcs.track_names import RANDOM_TRACK, TrackFile, find_track, known_tracks
 from sb3_torcs.tracks.compact import read_track_file
@@ -19,7 +19,7 @@ from sb3_torcs.tracks.generator import random_track
 from sb3_torcs.tracks.torcs_xml import read_track_xml
 from sb3_torcs.tracks.track import Track, TrackSummary, closed
 
-__all__ = ["CATEGORIES", "available_tracks", "load_track"]
+__all__ = ["CATEGORIES", "available_tracks", "lasting_name", "load_track"]
 
 
 CATEGORIES = ("road", "oval", "dirt")
@@ -59,6 +59,20 @@ def available_tracks() -> list[TrackSummary]:
     )
 
 
+def lasting_name(track: Track) -> str:
+    """
+    Name a track so that :func:`load_track` finds it again, in any folder.
+
+    :param track: of a world
+    :return: its name; of somebody's own file the path, since other roads may have its name
+    """
+    named = [file.path for file in known_tracks().values()]
+    for folder in torcs_folders()[:1]:  # whose tracks may have bundled ones before them
+        named += track_files(folder).values()
+    known = track.file is None or track.file in {path.resolve() for path in named}
+    return track.name if known else str(track.file)
+
+
 def _read(file: TrackFile) -> Track:
     """Read a track file of either kind, once per content."""
     content = digests(file.path, torcs_folders())
@@ -79,7 +93,7 @@ def _read_once(
     """
     del content
     read = read_track_xml if path.suffix.lower() == ".xml" else read_track_file
-    track = replace(read(path), source=source)
+    track = replace(read(path), source=source, file=path)
     try:
         return replace(track, segments=closed(track.segments))
     except ValueError as error:

@@ -115,6 +115,12 @@ class _Reader:
             raise self.fail(f"a curvature of {segment.curvature} 1/m is none; write 0")
         if min(segment.width_start, segment.width_end) <= 0.0:
             raise self.fail("the road's width has to be above 0")
+        half = 0.5 * max(segment.width_start, segment.width_end)
+        if abs(segment.curvature) * half > 1.0:  # its inner edge would run backwards
+            raise self.fail(
+                f"the radius of the bend is {1.0 / abs(segment.curvature):.3g} m, less than half "
+                f"the road's width, {half:.3g} m; make the bend wider or the road narrower"
+            )
         if min(numbers[4:]) < 0.0:
             raise self.fail("the width of the ground beside the road may not be negative")
         return segment

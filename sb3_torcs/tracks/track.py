@@ -12,6 +12,7 @@ import math
 from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -121,6 +122,7 @@ class Track:
     :param grid: the first grid slot
     :param steps: the same road as the game's loader lays it, step by step and with its gap at the
         start line; empty for what is no file of the game
+    :param file: that it was read from, if any; absolute, links followed
     """
 
     name: str
@@ -132,6 +134,7 @@ class Track:
     start_heading: float = 0.0
     grid: Grid = field(default=Grid(distance=10.0, offset=0.0))
     steps: tuple[Segment, ...] = field(default=(), repr=False)
+    file: Path | None = field(default=None, repr=False)
 
     @functools.cached_property
     def length(self) -> float:
