@@ -1,4 +1,4 @@
-"""The cars around a car: how an agent sees them, and when it has to brake for one."""
+"""The cars around a car: how an agent sees them, and when it has to make room for one."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import math
 import numpy as np
 from numba import njit
 
-from sb3_torcs.car import FIRST_RIVAL, RIVALS, CarState, FloatArray
+from sb3_torcs.car import CAR_WIDTH, FIRST_RIVAL, RIVALS, CarState, FloatArray
 
-__all__ = ["clarity", "needed_brake", "see_rivals"]
+__all__ = ["clarity", "needed_brake", "needed_turn", "see_rivals"]
 
 NEARBY = 80.0  # [m] along the road, within which cars are seen
 HALF_ALONG, HALF_ACROSS = 10.0, 3.0  # [m] distances that are seen as 0.5
@@ -24,6 +24,14 @@ REACTION = 0.12  # [s] until the brake works
 HOLD = 0.2  # [s] for which a car goes on sidewise
 ROOM, SIDE = 0.4, 0.3  # [m] that a car keeps lengthwise and sidewise
 STRONGEST = 0.6  # of the brake, about 25 m/s²
+
+ASIDE = 1.5  # [m] sidewise to a car beside, below which a car makes room
+CLOSING = 1.0  # [s] for which it reckons that both go on as they do
+BEHIND = 1.0, 0.3  # [m] and [s] of the other's speed, within which its front counts as beside
+HALF_HIDDEN = 0.9  # [m] of overlap across the road, from which on a car is ahead, not beside
+TURN = 1.5  # [m/s] steering × speed that makes room; with the default car a yaw rate of 0.2 rad/s
+MOST, SLOWEST = 0.25, 5.0  # of the steering; [m/s]
+VERGE = 0.5  # [m] to the edge of the road, from which on a car makes less room
 
 
 @njit(cache=True)
@@ -97,3 +105,34 @@ def needed_brake(car: CarState) -> float:
             short = (needed - max(room, 0.0)) / max(needed, 0.5)
             most = max(most, min(short, 1.0))
     return STRONGEST * float(most)
+
+
+def needed_turn(car: CarState) -> float:
+    """
+    Return how much to steer away from cars beside, left positive, at most 0.25 to either side.
+
+    A car makes room for another that would be nearer than 1.5 m sidewise in a second, the harder
+    the nearer, unless it would leave the road. The game's robots do likewise ("filterSColl" of
+    `bt`). Compiled code calls it, too.
+
+    :param car: at the begin of a timestep
+    """
+    turn = 0.0
+    rivals = car.race[FIRST_RIVAL:]
+    for i in range(RIVALS):
+        along, across = rivals[i], rivals[RIVALS + i]
+        faster, aside = rivals[2 * RIVALS + i], rivals[3 * RIVALS + i]
+        length, width = rivals[4 * RIVALS + i], rivals[5 * RIVALS + i]
+        reach, soon = length + BEHIND[0], along + BEHIND[1] * faster
+        if abs(along) > 2.0 * length or min(abs(along), abs(soon)) > reach:
+            continue
+        side = 1.0 if across > 0.0 else -1.0
+        gap = abs(across) - width
+        left = gap - CLOSING * max(-side * aside, 0.0)
+        if gap < -HALF_HIDDEN or left >= ASIDE:
+            continue
+        verge = 0.5 * (car.track_width - CAR_WIDTH) + side * car.distance_from_axis
+        short = min((ASIDE - left) / ASIDE, ASIDE)
+        turn -= side * short * min(max(verge / VERGE, 0.0), 1.0)
+    turn *= TURN / max(car.speed_x, SLOWEST)
+    return float(min(max(turn, -MOST), MOST))

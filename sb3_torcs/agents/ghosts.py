@@ -203,7 +203,7 @@ class GhostDriver:
 
 USUAL: Mapping[str, Any] = {
     "action": "pedals", "gearbox": "automatic", "start": "grid", "opponents": (), "delay": 0,
-    "grip": 1.0, "mass": 1.0, "unstick": False, "keep_distance": False,
+    "grip": 1.0, "mass": 1.0, "unstick": False, "keep_distance": False, "keep_clear": False,
 }  # fmt: skip
 """Options that change a drive, and their usual values."""
 
@@ -231,6 +231,7 @@ def check_fits(ghost: Ghost, env: gym.Env[Any, Any], name: str | Path) -> None:
         "action": env.get_wrapper_attr("action"),
         "unstick": aids.unstick,
         "keep_distance": aids.keep_distance,
+        "keep_clear": aids.keep_clear,
     }
     needs = {**USUAL, **ghost.env_kwargs}
     own_track = load_track(find_track(needs["track"], find_game()).path)

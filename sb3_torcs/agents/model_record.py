@@ -35,6 +35,7 @@ __all__ = [
 
 DRIVEN_WITH = (
     "action_repeat", "range_finders", "sensors", "action", "gearbox", "unstick", "keep_distance",
+    "keep_clear",
 )  # fmt: skip
 """Options of its environment without which an agent does not drive as in its training."""
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from sb3_torcs.car import CarState, Controls, checked_flag
 from sb3_torcs.envs.unstick import freeing_controls, needs_freeing
-from sb3_torcs.rivals import needed_brake
+from sb3_torcs.rivals import needed_brake, needed_turn
 
 __all__ = ["Aids"]
 
@@ -17,12 +17,14 @@ class Aids:
 
     :param unstick: whether a car that is stuck frees itself
     :param keep_distance: whether a car brakes by itself for the one ahead
+    :param keep_clear: whether a car steers away by itself from those beside it
     :raises InvalidOption: if one is neither ``True`` nor ``False``
     """
 
-    def __init__(self, unstick: Any, keep_distance: Any) -> None:
+    def __init__(self, unstick: Any, keep_distance: Any, keep_clear: Any) -> None:
         self.unstick = checked_flag("unstick", unstick)
         self.keep_distance = checked_flag("keep_distance", keep_distance)
+        self.keep_clear = checked_flag("keep_clear", keep_clear)
 
     def change(self, controls: Controls, car: CarState) -> Controls:
         """
@@ -36,5 +38,8 @@ class Aids:
         if self.keep_distance:
             brake = needed_brake(car)
             if brake > 0.0:
-                return controls._replace(throttle=0.0, brake=max(controls.brake, brake))
+                controls = controls._replace(throttle=0.0, brake=max(controls.brake, brake))
+        if self.keep_clear:
+            steering = min(max(controls.steering + needed_turn(car), -1.0), 1.0)
+            controls = controls._replace(steering=steering)
         return controls

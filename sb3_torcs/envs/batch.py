@@ -142,6 +142,7 @@ class Batch:
         self._recovery = np.zeros(number, np.int64)
         self._unstick = np.zeros(number, np.bool_)
         self._keep_distance = np.zeros(number, np.bool_)
+        self._keep_clear = np.zeros(number, np.bool_)
         self._ticks, self._patience, self._standing = np.ones((3, number), np.int64)
         self._driven: list[list[list[Held]]] = [[] for _ in self.envs]
         self._controls = np.zeros((number, len(Controls._fields)))
@@ -177,6 +178,7 @@ class Batch:
         self._runoff[race], self._recovery[race] = env.runoff, env.recovery_ticks
         self._unstick[race] = env.aids.unstick
         self._keep_distance[race] = env.aids.keep_distance
+        self._keep_clear[race] = env.aids.keep_clear
         self._ticks[race] = env.action_repeat
         self._patience[race], self._standing[race] = env.patience, env.standing
         self._driven[race] = []
@@ -216,9 +218,9 @@ class Batch:
             has been driven
         """
         controls = self._read(asked)
-        if self._unstick.any() or self._keep_distance.any():
-            cars = self._cars.view(CAR_RECORD)[:, 0]
-            aid_cars(cars, self._unstick, self._keep_distance, controls)
+        aids = self._unstick, self._keep_distance, self._keep_clear
+        if any(aid.any() for aid in aids):
+            aid_cars(self._cars.view(CAR_RECORD)[:, 0], *aids, controls)
         before, after = self._cars, np.empty_like(self._cars)
         waiting = [env.delay.waiting for env in self.envs]
         parts = self._parts(controls)

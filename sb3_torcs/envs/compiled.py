@@ -16,9 +16,9 @@ from numba.extending import overload_attribute, register_jitable
 
 from sb3_torcs import actions, rewards
 from sb3_torcs.car import CarState, FloatArray
-from sb3_torcs.envs.racing import STUCK_TICKS, end_of, stands
+from sb3_torcs.envs.ends import STUCK_TICKS, end_of, stands
 from sb3_torcs.envs.unstick import freeing_controls, needs_freeing
-from sb3_torcs.rivals import needed_brake
+from sb3_torcs.rivals import needed_brake, needed_turn
 from sb3_torcs.sensors import encode_record
 
 __all__ = ["COMPILED", "aid_cars", "read_actions", "value_timesteps"]
@@ -48,7 +48,7 @@ def _derived(name: str) -> None:
 for _name in ("track_position", "off_track", "gap_ahead", "gap_behind", "contacts", "faults"):
     _derived(_name)
 _readers = (actions.action_layout(name).read for name in actions.ACTIONS)
-_aids = (needed_brake, needs_freeing, freeing_controls)
+_aids = (needed_brake, needed_turn, needs_freeing, freeing_controls)
 for _function in (end_of, stands, rewards.safe_speed, *_aids, *_readers):
     register_jitable(_function)
 _read_pedals, _read_pedal, _read_manual = (
@@ -99,6 +99,7 @@ def aid_cars(
     cars: Any,
     unstick: npt.NDArray[np.bool_],
     keep_distance: npt.NDArray[np.bool_],
+    keep_clear: npt.NDArray[np.bool_],
     controls: FloatArray,
 ) -> None:
     """
@@ -107,6 +108,7 @@ def aid_cars(
     :param cars: (n,) at the begin of a timestep
     :param unstick: (n,) which cars may free themselves
     :param keep_distance: (n,) which cars brake by themselves for the one ahead
+    :param keep_clear: (n,) which cars steer away by themselves from those beside
     :param controls: (n, 5) that were asked for, changed
     """
     for row in range(len(cars)):
@@ -115,10 +117,14 @@ def aid_cars(
             fields = (steering, throttle, brake, float(gear), 0.0)
             for i in range(5):
                 controls[row, i] = fields[i]
-        elif keep_distance[row]:
+            continue
+        if keep_distance[row]:
             brake = needed_brake(cars[row])
             if brake > 0.0:
                 controls[row, 1], controls[row, 2] = 0.0, max(controls[row, 2], brake)
+        if keep_clear[row]:
+            steering = controls[row, 0] + needed_turn(cars[row])
+            controls[row, 0] = min(max(steering, -1.0), 1.0)
 
 
 def _one_of(terms: Sequence[rewards.Term]) -> Any:

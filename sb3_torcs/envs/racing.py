@@ -16,7 +16,6 @@ from sb3_torcs.actions import ActionName, action_layout, controls_from_action
 from sb3_torcs.backends.base import Backend, optional
 from sb3_torcs.car import (
     CONTROL_TICK,
-    MAX_DAMAGE,
     CarState,
     Controls,
     FloatArray,
@@ -32,6 +31,7 @@ from sb3_torcs.car import (
 )
 from sb3_torcs.envs.aids import Aids
 from sb3_torcs.envs.conditions import Conditions, Delay, Part
+from sb3_torcs.envs.ends import ENDS, GRACE_TICKS, STUCK_TICKS, TRUNCATING, end_of, stands
 from sb3_torcs.envs.starts import Starts, read_start
 from sb3_torcs.errors import CarLost, EnvClosed, InvalidOption
 from sb3_torcs.rewards import CRASHES, Reward, RewardChoice
@@ -44,11 +44,6 @@ Observation = npt.NDArray[np.float32]
 RenderMode = Literal["rgb_array", "human"]
 
 MAX_ACTION_REPEAT = 50_000  # [-] a timestep of 1,000 s
-
-STUCK_SPEED = 5.0 / 3.6  # [m/s] along the road; slower than walking counts as standing
-STUCK_TICKS = 75  # control ticks of standing that end an episode: 1.5 s
-GRACE_TICKS = 150  # 3 s to get going after a standing start
-BACKWARDS_ANGLE = 0.5 * math.pi  # [rad] to the road from which the car faces backwards
 
 
 class RacingInfo(TypedDict):
@@ -90,49 +85,10 @@ def racing_info(
     return info  # type: ignore[return-value]  # Gymnasium says dict, and it is one
 
 
-TRUNCATING = ("laps", "race")
-"""The ends of an episode that are no fault of the driver's."""
-
-ENDS = ("", "laps", "off_track", "backwards", "damage")
-"""Why an episode ends because of the state of the car, by the index that :func:`end_of` returns."""
-
-
-def end_of(car: CarState, laps: float, runoff: float, recovery: float) -> int:
-    """
-    Check whether the state of the car ends the episode. Compiled code calls it, too.
-
-    :param car: at the end of a timestep
-    :param laps: whole laps after which the episode ends
-    :param runoff: how far the car may be beside the road [m]
-    :param recovery: how long a car may be without headway [control ticks]; 0 ends the episode of
-        one that faces backwards at once
-    :return: the index of the reason in :data:`ENDS`, 0 if the episode goes on
-    """
-    if car.laps >= laps:
-        return 1
-    if abs(car.distance_from_axis) > 0.5 * car.track_width + runoff:
-        return 2
-    if recovery == 0 and abs(car.heading_error) > BACKWARDS_ANGLE:
-        return 3
-    return 4 if car.damage >= MAX_DAMAGE else 0
-
-
-def stands(car: CarState) -> bool:
-    """
-    Check whether a car makes no headway: is slower along the road than walking, or faces backwards.
-
-    Compiled code calls it, too.
-
-    :param car: at the end of a timestep
-    """
-    along = math.cos(car.heading_error)
-    return along < 0.0 or car.speed_x * along < STUCK_SPEED
-
-
-def _check_tells(world: Backend, view: View, keep_distance: bool) -> None:
+def _check_tells(world: Backend, view: View, aids: Aids) -> None:
     """Refuse what needs a race, or a car's file, in a world that does not know of it."""
     lacking = sorted(NEEDS_RACE.intersection(view.sensors))
-    lacking += ["keep_distance"] if keep_distance else []
+    lacking += [name for name in ("keep_distance", "keep_clear") if getattr(aids, name)]
     if lacking and not optional(world, "tells_race"):
         raise InvalidOption(
             "this world does not tell of other cars, which is needed for "
@@ -165,6 +121,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
     :param unstick: whether a car that is stuck across the road or beside it frees itself; actions
         count for nothing meanwhile
     :param keep_distance: whether a car brakes by itself where it is too close to the car ahead
+    :param keep_clear: whether a car steers away by itself from cars beside it
     :param delay: control ticks by which controls arrive late; or a pair, between which each
         episode draws
     :param grip: factor on the friction of all ground; or a pair, as for the delay
@@ -189,6 +146,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         recovery: float = 0.0,
         unstick: bool = False,
         keep_distance: bool = False,
+        keep_clear: bool = False,
         delay: int | Sequence[int] = 0,
         grip: float | Sequence[float] = 1.0,
         mass: float | Sequence[float] = 1.0,
@@ -208,14 +166,14 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         self.laps = checked_laps(laps)
         self.runoff = checked_runoff(runoff)
         self.recovery_ticks = round(checked_recovery(recovery) / CONTROL_TICK)
-        self.aids = Aids(unstick, keep_distance)
+        self.aids = Aids(unstick, keep_distance, keep_clear)
         self.render_mode = render_mode
         self.metadata = {
             **self.metadata,
             "render_fps": 1.0 / (action_repeat * CONTROL_TICK),
         }
         self.view = View(sensors)
-        _check_tells(backend, self.view, keep_distance)
+        _check_tells(backend, self.view, self.aids)
         self.observation_space = spaces.Box(self.view.low, self.view.high, dtype=np.float32)
         self.action = action
         self.layout = action_layout(action, optional(backend, "gears"))

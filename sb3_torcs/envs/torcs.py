@@ -78,6 +78,8 @@ class TorcsEnv(RacingEnv):
         game's robots do; actions count for nothing meanwhile
     :param keep_distance: whether a car brakes by itself where it is too close to the car ahead;
         for the backend ``"native"``
+    :param keep_clear: whether a car steers away by itself from cars beside it; for the backend
+        ``"native"``
     :param delay: control ticks of 0.02 s from an observation until the controls that answer it
         arrive; or a pair, e.g. ``(0, 5)``, between which each episode draws
     :param grip: factor on the friction of all ground; or a pair, e.g. ``(0.8, 1.1)``, between which
@@ -127,6 +129,7 @@ class TorcsEnv(RacingEnv):
         recovery: float = 0.0,
         unstick: bool = False,
         keep_distance: bool = False,
+        keep_clear: bool = False,
         delay: int | Sequence[int] = 0,
         grip: float | Sequence[float] = 1.0,
         mass: float | Sequence[float] = 1.0,
@@ -193,6 +196,7 @@ class TorcsEnv(RacingEnv):
             recovery=recovery,
             unstick=unstick,
             keep_distance=keep_distance,
+            keep_clear=keep_clear,
             delay=delay,
             grip=grip,
             mass=mass,

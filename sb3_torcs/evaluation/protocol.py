@@ -138,7 +138,7 @@ def time_limit(kwargs: Mapping[str, Any]) -> int:
     :param kwargs: of the environment, with ``laps``
     :return: timesteps
     """
-    from sb3_torcs.envs.racing import STUCK_SPEED
+    from sb3_torcs.envs.ends import STUCK_SPEED
     from sb3_torcs.tracks.catalogue import load_track
 
     track = kwargs.get("track", "aalborg")

@@ -1,4 +1,4 @@
-"""Cars that keep their distance brake for the car ahead, whatever they are asked."""
+"""Driver aids make room for others, whatever is asked: by the brake, and by steering."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ from vectors import assert_they_see_the_same, both_kinds
 
 from sb3_torcs.car import NO_RACE, RIVALS
 from sb3_torcs.errors import InvalidOption
-from sb3_torcs.rivals import needed_brake, see_rivals
+from sb3_torcs.rivals import needed_brake, needed_turn, see_rivals
 from sb3_torcs.vec_env import TorcsVecEnv
 
 GAS = np.array([0.0, 1.0, 0.0], np.float32)
 LONG, WIDE = 4.5, 2.0
+AIDS = ("keep_distance", "keep_clear")
 
 
 def race_with(along, across=0.0, faster=0.0, aside=0.0):
@@ -28,7 +29,11 @@ def brake(speed, *rival):
     return needed_brake(car_state(speed_x=speed, race=race_with(*rival)))
 
 
-class TestTheRule:
+def turn(*rival, **car):
+    return needed_turn(car_state(**{"speed_x": 20.0, **car}, race=race_with(*rival)))
+
+
+class TestBraking:
     @pytest.mark.parametrize(
         "rival",
         [
@@ -68,6 +73,64 @@ class TestTheRule:
 
     def test_it_is_a_plain_number(self):
         assert type(brake(50.0, 10.0)) is float
+
+
+class TestSteering:
+    @pytest.mark.parametrize(
+        "rival",
+        [
+            (),
+            (0.0, WIDE + 1.6),  # beside, and far enough
+            (0.0, WIDE + 1.6, 0.0, 2.0),  # goes away
+            (6.0, 0.5),  # ahead, which is for the brake
+            (10.0, 2.5),
+            (-6.0, 2.5, -5.0),  # behind, and falls back
+        ],
+    )
+    def test_who_has_room_goes_on(self, rival):
+        race = race_with(*rival) if rival else NO_RACE
+        assert needed_turn(car_state(speed_x=20.0, race=race)) == 0.0
+
+    @pytest.mark.parametrize(
+        "rival",
+        [
+            (0.0, 2.5),
+            (3.0, 2.5),
+            (-5.0, 2.5),
+            (0.0, 1.5),  # already touched
+            (0.0, 4.5, 0.0, -2.0),  # comes near
+            (-7.0, 2.5, 10.0),  # will be beside in no time
+        ],
+    )
+    def test_who_has_none_turns_away(self, rival):
+        along, across, *speeds = rival
+        assert -0.25 <= turn(*rival) < 0.0
+        mirrored = along, -across, *speeds[:1], *(-speed for speed in speeds[1:])
+        assert turn(*mirrored) == -turn(*rival)
+
+    def test_the_nearer_the_harder(self):
+        turns = [turn(0.0, 0.1 * across) for across in range(40, 10, -1)]
+        assert turns == sorted(turns, reverse=True)
+        assert turns[0] == 0.0 > turns[-1]
+
+    def test_it_turns_as_fast_at_each_speed(self):
+        rates = [speed * turn(0.0, 3.0, speed_x=speed) for speed in (10.0, 30.0, 70.0)]
+        assert rates == pytest.approx([rates[0]] * 3)
+        assert turn(0.0, 2.1, speed_x=0.0) == turn(0.0, 2.1, speed_x=5.0) == -0.25
+
+    def test_nobody_is_driven_off_the_road(self):
+        """Of 10 m, with 1.94 m of car: from 4.03 m on it would be beside it."""
+        assert turn(0.0, 2.5, track_width=10.0, distance_from_axis=-4.03) == 0.0
+        some = turn(0.0, 2.5, track_width=10.0, distance_from_axis=-3.78)
+        assert some == pytest.approx(0.5 * turn(0.0, 2.5, track_width=10.0, distance_from_axis=0.0))
+
+    def test_between_two_it_stays_in_the_middle(self):
+        race = race_with(0.0, 2.5)
+        race[5:].reshape(6, RIVALS)[:, 3] = 0.0, -2.5, 0.0, 0.0, LONG, WIDE
+        assert needed_turn(car_state(speed_x=20.0, race=race)) == 0.0
+
+    def test_it_is_a_plain_number(self):
+        assert type(turn(0.0, 2.5)) is float
 
 
 class TestWhatIsSeen:
@@ -118,21 +181,55 @@ def test_a_car_that_is_asked_to_rams_nobody(game):
     assert contacts(keep_distance=True) == 0
 
 
-def test_races_driven_at_once_brake_as_single_ones_do(game):
-    options = {"opponents": ["bt", "tita"], "keep_distance": True, "unstick": True}
+def contacts_beside(keep_clear):
+    """Count the contacts of two cars that are side by side, and both want to the middle."""
+    envs = TorcsVecEnv(1, agents=2, track="b-speedway", keep_clear=keep_clear)
+    try:
+        envs.seed(0)
+        envs.reset()
+        actions = np.stack([0.5 * GAS, 0.5 * GAS])
+        aims = np.array([4.0, -4.0])
+        for step in range(200):
+            envs.step(actions)
+            cars = envs.get_attr("car")
+            ahead, behind = (car.distance_from_start for car in cars)
+            lead = (ahead - behind + 100.0) % envs.get_attr("backend")[0].track.length - 100.0
+            lack = 0.05 * lead + 0.1 * (cars[0].speed_x - cars[1].speed_x)
+            if step > 60 and abs(lack) < 0.05:
+                aims[:] = 0.0
+            for i, car in enumerate(cars):
+                off = np.clip(car.distance_from_axis - aims[i], -3.0, 3.0)
+                actions[i, 0] = 0.5 * car.heading_error - 0.02 * off
+                actions[i, 1] = np.clip(0.5 - lack * (1 - 2 * i), 0.1, 0.9)
+        assert (aims == 0.0).all()
+        return cars[0].contacts
+    finally:
+        envs.close()
+
+
+def test_a_car_that_keeps_clear_touches_nobody_beside_it(game):
+    assert contacts_beside(keep_clear=False) > 0
+    assert contacts_beside(keep_clear=True) == 0
+
+
+def test_races_driven_at_once_make_room_as_single_ones_do(game):
+    aids = dict.fromkeys(("keep_distance", "keep_clear", "unstick"), True)
+    options = {"opponents": ["bt", "tita"], **aids}
     with both_kinds("Torcs-v0", track="g-track-1", action="pedal", **options) as (ours, theirs):
         ours.action_space.low[1] = theirs.action_space.low[1] = 0.9  # into those ahead
         assert_they_see_the_same(ours, theirs, steps=60)
 
 
 @pytest.mark.parametrize("world", [{"id": "TorcsLite-v0"}, {"id": "Torcs-v0", "backend": "scr"}])
-def test_a_world_without_races_has_nobody_to_keep_from(game, world):
+@pytest.mark.parametrize("aid", AIDS)
+def test_a_world_without_races_has_nobody_to_keep_from(game, world, aid):
     with pytest.raises(
-        InvalidOption, match="other cars, which is needed for 'keep_distance'; use Torcs-v0 with"
+        InvalidOption, match=f"other cars, which is needed for '{aid}'; use Torcs-v0 with"
     ):
-        gym.make(**world, keep_distance=True)
+        gym.make(**world, **{aid: True})
 
 
-def test_only_yes_or_no_is_an_answer():
-    with pytest.raises(InvalidOption, match="keep_distance is 1; expected True or False"):
-        gym.make("TorcsLite-v0", keep_distance=1)
+@pytest.mark.parametrize("aid", AIDS)
+def test_only_yes_or_no_is_an_answer(aid):
+    with pytest.raises(InvalidOption, match=f"{aid} is 1; expected True or False"):
+        gym.make("TorcsLite-v0", **{aid: 1})
