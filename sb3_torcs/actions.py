@@ -139,11 +139,12 @@ def action_layout(action: str, gears: int = GEARS) -> ActionLayout:
     :return: the layout
     :raises InvalidOption: if there is no such layout
     """
-    if action == "pedals":
+    name = action if isinstance(action, str) else None  # an array would compare one by one
+    if name == "pedals":
         return PEDALS
-    if action == "pedal":
+    if name == "pedal":
         return _PEDAL
-    if action == "manual":
+    if name == "manual":
         low, high = (-1.0, 0.0, 0.0, -1.0, 0.0), (1.0, 1.0, 1.0, float(gears), 1.0)
         return ActionLayout(_MANUAL, low, high, _read_manual)
     advice = f"expected one of {', '.join(map(repr, ACTIONS))}"
@@ -184,12 +185,13 @@ def used_gearbox(gearbox: str, action: str) -> str:
     :return: the gearbox
     :raises InvalidOption: if there is no such gearbox, or the agent chooses the gears itself
     """
-    if action == "manual" and gearbox != "automatic":
+    checked_gearbox(gearbox)
+    if action_layout(action).names == _MANUAL and gearbox != "automatic":
         raise InvalidOption(
             f"gearbox is {gearbox!r}, but action 'manual' chooses the gears itself; leave one of "
             "the two out"
         )
-    return checked_gearbox(gearbox)
+    return gearbox
 
 
 def controls_from_action(

@@ -189,7 +189,7 @@ def checked_start(start: StartName) -> StartName:
     :return: the same
     :raises InvalidOption: for anything else
     """
-    if start not in STARTS:
+    if not isinstance(start, str) or start not in STARTS:
         raise InvalidOption(f"start is {start!r}; expected {' or '.join(map(repr, STARTS))}")
     return start
 

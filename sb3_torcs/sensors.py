@@ -217,7 +217,7 @@ def checked_sensors(sensors: Sequence[SensorsName]) -> tuple[SensorsName, ...]:
     :return: the same in the order of the table
     :raises InvalidOption: if one is unknown or missing
     """
-    listed = isinstance(sensors, Sequence) and not isinstance(sensors, str)
+    listed = isinstance(sensors, Sequence) and not isinstance(sensors, (str, bytes))
     names = [name for name in GROUPS if listed and name in sensors]
     if "base" not in names or len(names) < len(sensors):
         others = ", ".join(repr(name) for name in GROUPS if name != "base")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import typing
 
+import numpy as np
 import pytest
 
 from sb3_torcs.envs.torcs import TorcsEnv
@@ -61,3 +62,18 @@ def test_another_name_is_refused_and_those_of_the_type_are_told(cls, argument, n
 )
 def test_a_table_has_the_names_of_its_type(alias, table):
     assert typing.get_args(alias) == tuple(table)
+
+
+NO_CHOICES = [np.array(["grid", "pedal"]), np.array([1.0, 2.0]), b"base", {"grid": 1}, 3]
+
+
+@pytest.mark.parametrize("cls", [TorcsEnv, TorcsLiteEnv])
+@pytest.mark.parametrize("wrong", NO_CHOICES, ids=["names", "numbers", "bytes", "dict", "number"])
+@pytest.mark.parametrize(
+    "argument",
+    ["action", "car", "gearbox", "opponents", "picture", "backend", "sensors", "start", "track"],
+)
+def test_what_is_no_name_is_refused_by_its_option(game, cls, wrong, argument):
+    """Also an array, which compares one by one."""
+    with pytest.raises(Sb3TorcsError, match=argument):
+        cls(**{argument: wrong})

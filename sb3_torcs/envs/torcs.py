@@ -145,7 +145,7 @@ class TorcsEnv(RacingEnv):
         host: str | None = None,
         port: int | None = None,
     ) -> None:
-        if backend not in BACKENDS:
+        if not isinstance(backend, str) or backend not in BACKENDS:
             raise InvalidOption(f"backend is {backend!r}; expected {' or '.join(BACKENDS)}")
         if backend != "native":
             self.metadata = RacingEnv.metadata
@@ -161,7 +161,8 @@ class TorcsEnv(RacingEnv):
             )
         if self.picture == "game" and (is_several(track) or is_several(car, "car")):
             raise InvalidOption("picture 'game' is for one track and one car, not for a list")
-        guests = guests_of(opponents, find_game()) if opponents else []
+        named = opponents if isinstance(opponents, (list, tuple)) else ()
+        guests = guests_of(named, find_game()) if named else []
         if self.picture == "game" and guests:
             raise InvalidOption(
                 f"picture 'game' is for races against robots, and '{guests[0]}' is an agent; use "
@@ -297,7 +298,7 @@ def _picture(picture: PictureName, render_mode: GameRenderMode | None) -> Pictur
     :return: one of :data:`PICTURES`
     :raises InvalidOption: if there is no such picture, or not in this mode
     """
-    if picture not in PICTURES:
+    if not isinstance(picture, str) or picture not in PICTURES:
         advice = f"expected {' or '.join(map(repr, PICTURES))}"
         raise InvalidOption(f"picture is {picture!r}{near_miss(str(picture), PICTURES, advice)}")
     if picture == "game" and render_mode == "human":

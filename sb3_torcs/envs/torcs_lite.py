@@ -123,12 +123,12 @@ class TorcsLiteEnv(RacingEnv):
     ) -> None:
         drawn: dict[str, str | None] = {"picture": picture, "render_mode": render_mode}
         for name, choice in drawn.items():
-            if choice == "game":
+            if isinstance(choice, str) and choice == "game":
                 raise InvalidOption(
                     f"{name} is 'game', which needs the installed game, so it is for Torcs-v0; "
                     "TorcsLite-v0 has render_mode 'rgb_array' or 'human' with picture 'above'"
                 )
-        if picture != "above":
+        if not isinstance(picture, str) or picture != "above":
             raise InvalidOption(f"picture is {picture!r}; expected 'above'")
         _refuse(of_the_game)
 

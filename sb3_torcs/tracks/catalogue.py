@@ -38,7 +38,7 @@ def load_track(
     """
     if isinstance(track, Track):
         return track
-    if track == RANDOM_TRACK:
+    if isinstance(track, str) and track == RANDOM_TRACK:
         if rng is None:
             raise InvalidOption(
                 f"track '{RANDOM_TRACK}' needs a generator; pass rng=numpy.random.default_rng(seed)"

@@ -48,7 +48,7 @@ class LiteBackend:
         range_finders: RangeFinderName | Sequence[float] = "scr",
         gearbox: str = "automatic",
     ) -> None:
-        if car not in CARS:
+        if not isinstance(car, str) or car not in CARS:
             raise InvalidOption(
                 f"car is {car!r}; TorcsLite-v0 has {', '.join(CARS)}. The cars of the real game "
                 "are those of Torcs-v0"
@@ -57,7 +57,7 @@ class LiteBackend:
         by_road = checked_gearbox(gearbox) == "road_speed"
         self._gearbox = physics.BY_ROAD_SPEED if by_road else physics.AUTOMATIC
         self.range_finder_angles = range_finder_angles(range_finders)
-        self._random = track == RANDOM_TRACK
+        self._random = isinstance(track, str) and track == RANDOM_TRACK
         self._flying = False
         self._grip = 1.0
         self._state = np.zeros(physics.STATE_SIZE)
