@@ -161,7 +161,9 @@ def test_a_drive_on_an_own_track_names_its_file(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.usefixtures("game")
-@pytest.mark.parametrize("driver", ["evaluate scripted --env Torcs-v0", "robots inferno"])
+@pytest.mark.parametrize(
+    "driver", ["evaluate scripted --env Torcs-v0", "robots inferno", "race inferno --races 1"]
+)
 def test_others_drive_where_a_saved_drive_was(tmp_path, monkeypatch, driver):
     """And not on the track of the game that has the file's name."""
     monkeypatch.chdir(tmp_path)

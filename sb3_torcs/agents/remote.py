@@ -12,6 +12,7 @@ from sb3_torcs.agents.models import driver_name, driver_record, load_driver
 from sb3_torcs.agents.rollout import drive
 from sb3_torcs.agents.wrapping import wrapped
 from sb3_torcs.telemetry import DriveLabel, DriveLog
+from sb3_torcs.tracks.catalogue import lasting_name
 
 __all__ = ["Agent"]
 
@@ -41,7 +42,7 @@ class Agent:
         self.env = wrapped(bare, driver_record(model).hyperparameters, trust=trust)
         self.driver = load_driver(model, self.env, algo, trust)
         self.backend.driver_name = name
-        track = str(settings.get("track", self.backend.track.name))
+        track = lasting_name(self.backend.track)
         self._label = DriveLabel(driver_name(model), track, self.backend.car, "Torcs-v0")
         self.log: DriveLog | None = None
         """What notes each timestep, once it is set."""

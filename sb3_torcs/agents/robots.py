@@ -15,6 +15,7 @@ from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.race_results import Lap, RobotResult
 from sb3_torcs.torcs.race_setup import RaceSetup, Session
 from sb3_torcs.torcs.track_names import find_track
+from sb3_torcs.tracks.catalogue import lasting_name, load_track
 
 __all__ = ["PARQUET", "drive_log", "race"]
 
@@ -117,7 +118,7 @@ def _rows(engine: Any, robots: Sequence[tuple[str, int]]) -> Iterator[tuple[Any,
 
 def _log(engine: Any, robots: Sequence[tuple[str, int]], track: str) -> DriveLog:
     """Drive to the end of the race, and note each control tick."""
-    name = track if find_track(track).source == "file" else find_track(track).path.stem
+    name = lasting_name(load_track(find_track(track, find_game()).path))
     labels = [
         DriveLabel(_named(robot), name, engine.car_name(number), WORLD)
         for number, robot in enumerate(robots)

@@ -227,7 +227,7 @@ def _held(
                     footage.setup = setup_in_the_game(order, args.track, args.laps)
                 watchers.append(footage)
             if log is not None and number == args.seed + args.races - 1:
-                watchers.append(Notes(log, args.track))
+                watchers.append(Notes(log))
             return run_race(order, args.track, watchers=watchers, **options)
 
         try:

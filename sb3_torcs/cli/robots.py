@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
     """
     from sb3_torcs.errors import InvalidOption
     from sb3_torcs.torcs.installation import find_game
-    from sb3_torcs.torcs.track_names import find_track, lasting_track
+    from sb3_torcs.torcs.track_names import find_track
 
     game = find_game()
     if args.name is None:
@@ -81,7 +81,7 @@ def run(args: argparse.Namespace) -> int:
     file = find_track(args.track, game)
     track = args.track if file.source == "file" else file.name
     with quiet_output(args.json):
-        results = _drive(game, robots, lasting_track(track), args, telemetry)
+        results = _drive(game, robots, track, args, telemetry)
     if args.json:
         print_json(results_as_json(results, robots[0], track))
         return 0

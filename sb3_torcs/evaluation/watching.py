@@ -29,7 +29,6 @@ from sb3_torcs.torcs.process import GameProcess
 from sb3_torcs.torcs.race_results import RobotResult
 from sb3_torcs.torcs.race_setup import SCR_SERVER, RaceSetup, session_for
 from sb3_torcs.torcs.results import read_results
-from sb3_torcs.torcs.track_names import lasting_track
 from sb3_torcs.torcs.window import ViewName, Window, window_arguments
 from sb3_torcs.tracks.trial import check_track
 
@@ -98,8 +97,7 @@ class Show:
         finally:
             sockets[0].close()
         try:
-            track = lasting_track(self.track)  # which the log keeps
-            settings = {"track": track, "host": "127.0.0.1", "port": port, **self.settings}
+            settings = {"track": self.track, "host": "127.0.0.1", "port": port, **self.settings}
             self.agent = Agent(self.model, settings, trust=self.trust, name=self.driver_name)
             self.agent.log = self.log
         except BaseException:
@@ -129,7 +127,7 @@ def drive_logs(shows: Sequence[Show]) -> DriveLog:
         race = show.race
         again = show.robot is not None
         log.extend(
-            drive_log(race.drivers, str(lasting_track(race.track)), race.laps, session=race.session)
+            drive_log(race.drivers, str(race.track), race.laps, session=race.session)
             if again
             else show.log
         )

@@ -16,6 +16,7 @@ from sb3_torcs.errors import InvalidOption
 from sb3_torcs.races.entrants import Entrant
 from sb3_torcs.telemetry import DriveLabel, DriveLog
 from sb3_torcs.torcs.starting_list import GRID_SLOTS
+from sb3_torcs.tracks.catalogue import lasting_name
 from sb3_torcs.tracks.track import Track
 
 if TYPE_CHECKING:
@@ -97,18 +98,17 @@ class Notes:
     Notes the drives of all cars.
 
     :param log: that is written
-    :param track: its name there
     """
 
-    def __init__(self, log: DriveLog, track: str) -> None:
-        self._log, self._track = log, track
+    def __init__(self, log: DriveLog) -> None:
+        self._log = log
 
     def begin(self, engine: Engine, names: Sequence[str], road: Track) -> None:
         """See :class:`Watcher`."""
-        del road
         self._engine = engine
+        track = lasting_name(road)
         self._labels = [
-            DriveLabel(name, self._track, engine.car_name(slot), "Torcs-v0")
+            DriveLabel(name, track, engine.car_name(slot), "Torcs-v0")
             for slot, name in enumerate(names)
         ]
 
