@@ -6,7 +6,7 @@ import json
 import os
 import zipfile
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sb3_torcs.agents.rollout import Timestep, drive
+from sb3_torcs.envs.aids import AIDS
 from sb3_torcs.errors import InvalidOption, ModelMismatch, near_miss
 from sb3_torcs.files import whole_file, writable_file
 from sb3_torcs.torcs.installation import find_game
@@ -203,7 +204,7 @@ class GhostDriver:
 
 USUAL: Mapping[str, Any] = {
     "action": "pedals", "gearbox": "automatic", "start": "grid", "opponents": (), "delay": 0,
-    "grip": 1.0, "mass": 1.0, "unstick": False, "keep_distance": False, "keep_clear": False,
+    "grip": 1.0, "mass": 1.0, **dict.fromkeys(AIDS, False),
 }  # fmt: skip
 """Options that change a drive, and their usual values."""
 
@@ -229,9 +230,7 @@ def check_fits(ghost: Ghost, env: gym.Env[Any, Any], name: str | Path) -> None:
         "car": backend.car,
         "action_repeat": env.get_wrapper_attr("action_repeat"),
         "action": env.get_wrapper_attr("action"),
-        "unstick": aids.unstick,
-        "keep_distance": aids.keep_distance,
-        "keep_clear": aids.keep_clear,
+        **asdict(aids),
     }
     needs = {**USUAL, **ghost.env_kwargs}
     own_track = load_track(find_track(needs["track"], find_game()).path)

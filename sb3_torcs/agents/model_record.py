@@ -18,6 +18,7 @@ import yaml
 
 from sb3_torcs.agents.model_file import as_mismatch
 from sb3_torcs.agents.model_policy import Spaces, restored_space
+from sb3_torcs.envs.aids import AIDS
 from sb3_torcs.errors import ModelMismatch
 from sb3_torcs.files import read_yaml
 
@@ -33,10 +34,7 @@ __all__ = [
     "record_within",
 ]
 
-DRIVEN_WITH = (
-    "action_repeat", "range_finders", "sensors", "action", "gearbox", "unstick", "keep_distance",
-    "keep_clear",
-)  # fmt: skip
+DRIVEN_WITH = ("action_repeat", "range_finders", "sensors", "action", "gearbox", *AIDS)
 """Options of its environment without which an agent does not drive as in its training."""
 
 RECORD = "sb3_torcs"

@@ -2,29 +2,30 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass, fields
 
 from sb3_torcs.car import CarState, Controls, checked_flag
 from sb3_torcs.envs.unstick import freeing_controls, needs_freeing
 from sb3_torcs.rivals import needed_brake, needed_turn
 
-__all__ = ["Aids"]
+__all__ = ["AIDS", "NEED_RIVALS", "Aids"]
 
 
+@dataclass
 class Aids:
     """
     The driver aids of a car.
 
-    :param unstick: whether a car that is stuck frees itself
-    :param keep_distance: whether a car brakes by itself for the one ahead
-    :param keep_clear: whether a car steers away by itself from those beside it
     :raises InvalidOption: if one is neither ``True`` nor ``False``
     """
 
-    def __init__(self, unstick: Any, keep_distance: Any, keep_clear: Any) -> None:
-        self.unstick = checked_flag("unstick", unstick)
-        self.keep_distance = checked_flag("keep_distance", keep_distance)
-        self.keep_clear = checked_flag("keep_clear", keep_clear)
+    unstick: bool  # a car that is stuck frees itself
+    keep_distance: bool  # it brakes by itself for the car ahead
+    keep_clear: bool  # it steers away by itself from those beside it
+
+    def __post_init__(self) -> None:
+        for name in AIDS:
+            setattr(self, name, checked_flag(name, getattr(self, name)))
 
     def change(self, controls: Controls, car: CarState) -> Controls:
         """
@@ -43,3 +44,10 @@ class Aids:
             steering = min(max(controls.steering + needed_turn(car), -1.0), 1.0)
             controls = controls._replace(steering=steering)
         return controls
+
+
+AIDS = tuple(aid.name for aid in fields(Aids))
+"""What they are called as options of an environment, in the order of compiled code."""
+
+NEED_RIVALS = ("keep_distance", "keep_clear")
+"""Those that have to see other cars."""

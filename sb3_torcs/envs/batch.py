@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import astuple
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,6 +20,7 @@ from sb3_torcs.backends.native import NativeBackend
 from sb3_torcs.backends.seats import SeatWorld
 from sb3_torcs.backends.several import present_world
 from sb3_torcs.car import CAR_RECORD, CarState, Controls, FloatArray, car_from_record
+from sb3_torcs.envs.aids import AIDS
 from sb3_torcs.envs.compiled import COMPILED, aid_cars, read_actions, value_timesteps
 from sb3_torcs.envs.racing import RacingEnv, racing_info
 from sb3_torcs.errors import CarLost, InvalidAction, InvalidOption
@@ -140,9 +142,7 @@ class Batch:
         self._laps = np.full(number, np.inf)
         self._runoff = np.zeros(number)
         self._recovery = np.zeros(number, np.int64)
-        self._unstick = np.zeros(number, np.bool_)
-        self._keep_distance = np.zeros(number, np.bool_)
-        self._keep_clear = np.zeros(number, np.bool_)
+        self._aids = np.zeros((number, len(AIDS)), np.bool_)
         self._ticks, self._patience, self._standing = np.ones((3, number), np.int64)
         self._driven: list[list[list[Held]]] = [[] for _ in self.envs]
         self._controls = np.zeros((number, len(Controls._fields)))
@@ -176,9 +176,7 @@ class Batch:
         self._cars[race] = np.hstack(env.car)
         self._laps[race] = np.inf if env.laps is None else env.laps
         self._runoff[race], self._recovery[race] = env.runoff, env.recovery_ticks
-        self._unstick[race] = env.aids.unstick
-        self._keep_distance[race] = env.aids.keep_distance
-        self._keep_clear[race] = env.aids.keep_clear
+        self._aids[race] = astuple(env.aids)
         self._ticks[race] = env.action_repeat
         self._patience[race], self._standing[race] = env.patience, env.standing
         self._driven[race] = []
@@ -218,9 +216,8 @@ class Batch:
             has been driven
         """
         controls = self._read(asked)
-        aids = self._unstick, self._keep_distance, self._keep_clear
-        if any(aid.any() for aid in aids):
-            aid_cars(self._cars.view(CAR_RECORD)[:, 0], *aids, controls)
+        if self._aids.any():
+            aid_cars(self._cars.view(CAR_RECORD)[:, 0], self._aids, controls)
         before, after = self._cars, np.empty_like(self._cars)
         waiting = [env.delay.waiting for env in self.envs]
         parts = self._parts(controls)

@@ -95,34 +95,27 @@ def read_actions(asked: Any, low: FloatArray, high: FloatArray, controls: FloatA
 
 
 @njit(cache=True)
-def aid_cars(
-    cars: Any,
-    unstick: npt.NDArray[np.bool_],
-    keep_distance: npt.NDArray[np.bool_],
-    keep_clear: npt.NDArray[np.bool_],
-    controls: FloatArray,
-) -> None:
+def aid_cars(cars: Any, aids: npt.NDArray[np.bool_], controls: FloatArray) -> None:
     """
     Change controls as :class:`~sb3_torcs.envs.aids.Aids` does.
 
     :param cars: (n,) at the begin of a timestep
-    :param unstick: (n,) which cars may free themselves
-    :param keep_distance: (n,) which cars brake by themselves for the one ahead
-    :param keep_clear: (n,) which cars steer away by themselves from those beside
+    :param aids: (n, 3) which cars have which, in the order of :data:`~sb3_torcs.envs.aids.AIDS`
     :param controls: (n, 5) that were asked for, changed
     """
     for row in range(len(cars)):
-        if unstick[row] and needs_freeing(cars[row]):
+        unstick, keep_distance, keep_clear = aids[row, 0], aids[row, 1], aids[row, 2]
+        if unstick and needs_freeing(cars[row]):
             steering, throttle, brake, gear = freeing_controls(cars[row])
             fields = (steering, throttle, brake, float(gear), 0.0)
             for i in range(5):
                 controls[row, i] = fields[i]
             continue
-        if keep_distance[row]:
+        if keep_distance:
             brake = needed_brake(cars[row])
             if brake > 0.0:
                 controls[row, 1], controls[row, 2] = 0.0, max(controls[row, 2], brake)
-        if keep_clear[row]:
+        if keep_clear:
             steering = controls[row, 0] + needed_turn(cars[row])
             controls[row, 0] = min(max(steering, -1.0), 1.0)
 

@@ -29,7 +29,7 @@ from sb3_torcs.car import (
     checked_start_speed,
     is_count,
 )
-from sb3_torcs.envs.aids import Aids
+from sb3_torcs.envs.aids import NEED_RIVALS, Aids
 from sb3_torcs.envs.conditions import Conditions, Delay, Part
 from sb3_torcs.envs.ends import ENDS, GRACE_TICKS, STUCK_TICKS, TRUNCATING, end_of, stands
 from sb3_torcs.envs.starts import Starts, read_start
@@ -88,7 +88,7 @@ def racing_info(
 def _check_tells(world: Backend, view: View, aids: Aids) -> None:
     """Refuse what needs a race, or a car's file, in a world that does not know of it."""
     lacking = sorted(NEEDS_RACE.intersection(view.sensors))
-    lacking += [name for name in ("keep_distance", "keep_clear") if getattr(aids, name)]
+    lacking += [name for name in NEED_RIVALS if getattr(aids, name)]
     if lacking and not optional(world, "tells_race"):
         raise InvalidOption(
             "this world does not tell of other cars, which is needed for "
