@@ -30,6 +30,7 @@ CLOSING = 1.0  # [s] for which it reckons that both go on as they do
 BEHIND = 1.0, 0.3  # [m] and [s] of the other's speed, within which its front counts as beside
 HALF_HIDDEN = 0.9  # [m] of overlap across the road, from which on a car is ahead, not beside
 TURN = 1.5  # [m/s] steering × speed that makes room; with the default car a yaw rate of 0.2 rad/s
+OVERDUE = 1.5  # times that, at most, where the cars would touch
 MOST, SLOWEST = 0.25, 5.0  # of the steering; [m/s]
 VERGE = 0.5  # [m] to the edge of the road, from which on a car makes less room
 
@@ -132,7 +133,7 @@ def needed_turn(car: CarState) -> float:
         if gap < -HALF_HIDDEN or left >= ASIDE:
             continue
         verge = 0.5 * (car.track_width - CAR_WIDTH) + side * car.distance_from_axis
-        short = min((ASIDE - left) / ASIDE, ASIDE)
+        short = min((ASIDE - left) / ASIDE, OVERDUE)
         turn -= side * short * min(max(verge / VERGE, 0.0), 1.0)
     turn *= TURN / max(car.speed_x, SLOWEST)
     return float(min(max(turn, -MOST), MOST))
