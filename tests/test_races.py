@@ -10,6 +10,7 @@ import pytest
 import torch as th
 from stable_baselines3 import PPO
 
+from sb3_torcs.agents.model_record import RECORD
 from sb3_torcs.agents.models import find_model
 from sb3_torcs.agents.pilots import Crew
 from sb3_torcs.agents.robots import race as robots_race
@@ -229,11 +230,15 @@ def test_a_policy_that_refuses_to_draw_from_no_numbers_is_out_too(game, tmp_path
 
 
 @pytest.mark.slow
-def test_a_robot_whose_car_the_physics_loses_is_out_and_the_others_race_on(game):
-    """In this race a contact puts the robot's car nowhere."""
-    race = run_race(find_entrants(["inferno", "ppo-racer"], game), "aalborg", laps=3)
+def test_a_robot_whose_car_the_physics_loses_is_out_and_the_others_race_on(game, tmp_path):
+    """In this race a contact puts the robot's car nowhere, if the agent does not keep clear."""
+    model = PPO.load(find_model("ppo-racer"), device="cpu")
+    getattr(model, RECORD)["env_kwargs"]["keep_clear"] = False
+    model.save(tmp_path / "racer")
+    entrants = find_entrants(["inferno", str(tmp_path / "racer.zip")], game)
+    race = run_race(entrants, "aalborg", laps=3)
     assert [(one.driver, one.out) for one in race.standings] == [
-        ("ppo-racer", False), ("inferno", True),
+        ("racer", False), ("inferno", True),
     ]  # fmt: skip
     assert "divided by zero" in race.failures["inferno"]
     assert np.isfinite(race.distances).all()
