@@ -211,10 +211,10 @@ def main() -> None:
         "gearbox": "road_speed", "action_repeat": 5,
         "unstick": True, "keep_distance": True, "keep_clear": True,
     }  # fmt: skip
-    if args.ancestor or args.racer:
-        weights = weights_of(args.ancestor or args.racer)
+    racer, driver = args.ancestor or args.racer, args.driver
+    if racer is not None:
+        weights = weights_of(racer)
     else:
-        driver = args.driver
         weights = weights_of(driver) if driver else learn_alone(args, env_kwargs, settings)
         begin_to_race(weights)
 

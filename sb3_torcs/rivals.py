@@ -25,13 +25,15 @@ HOLD = 0.2  # [s] for which a car goes on sidewise
 ROOM, SIDE = 0.4, 0.3  # [m] that a car keeps lengthwise and sidewise
 STRONGEST = 0.6  # of the brake, about 25 m/s²
 
-ASIDE = 1.5  # [m] sidewise to a car beside, below which a car makes room
-CLOSING = 1.0  # [s] for which it reckons that both go on as they do
-BEHIND = 1.0, 0.3  # [m] and [s] of the other's speed, within which its front counts as beside
-HALF_HIDDEN = 0.9  # [m] of overlap across the road, from which on a car is ahead, not beside
+ASIDE = 1.5  # [m] between the sides of two cars, below which a car makes room
+CLOSING = 1.0  # [s] for which both are taken to go on sidewise as they do
+APART = 1.0  # [m] lengthwise between two cars, up to which they are beside each other
+SOON = 0.3  # [s] in which they come beside each other
+IN_LINE = 0.9  # [m] by which two cars overlap across the road, where one is ahead, not beside
 TURN = 1.5  # [m/s] steering × speed that makes room; with the default car a yaw rate of 0.2 rad/s
-OVERDUE = 1.5  # times that, at most, where the cars would touch
-MOST, SLOWEST = 0.25, 5.0  # of the steering; [m/s]
+OVERDUE = 1.5  # most of this unit, for cars that would touch
+MOST_TURN = 0.25  # of the steering
+SLOWEST = 5.0  # [m/s] below which steering does not grow
 VERGE = 0.5  # [m] to the edge of the road, from which on a car makes less room
 
 
@@ -112,9 +114,9 @@ def needed_turn(car: CarState) -> float:
     """
     Return how much to steer away from cars beside, left positive, at most 0.25 to either side.
 
-    A car makes room for another that would be nearer than 1.5 m sidewise in a second, the harder
-    the nearer, unless it would leave the road. The game's robots do likewise ("filterSColl" of
-    `bt`). Compiled code calls it, too.
+    A car makes room for each car beside it whose side will be nearer than 1.5 m in a second. The
+    nearer that is, the more it turns; at the edge of the road it does not turn. The game's robots
+    make room, too ("filterSColl" of `bt`). Compiled code calls this function, too.
 
     :param car: at the begin of a timestep
     """
@@ -124,16 +126,16 @@ def needed_turn(car: CarState) -> float:
         along, across = rivals[i], rivals[RIVALS + i]
         faster, aside = rivals[2 * RIVALS + i], rivals[3 * RIVALS + i]
         length, width = rivals[4 * RIVALS + i], rivals[5 * RIVALS + i]
-        reach, soon = length + BEHIND[0], along + BEHIND[1] * faster
-        if abs(along) > 2.0 * length or min(abs(along), abs(soon)) > reach:
+        soon = min(abs(along), abs(along + SOON * faster))
+        if abs(along) > 2.0 * length or soon > length + APART:
             continue
         side = 1.0 if across > 0.0 else -1.0
         gap = abs(across) - width
         left = gap - CLOSING * max(-side * aside, 0.0)
-        if gap < -HALF_HIDDEN or left >= ASIDE:
+        if gap < -IN_LINE or left >= ASIDE:
             continue
         verge = 0.5 * (car.track_width - CAR_WIDTH) + side * car.distance_from_axis
         short = min((ASIDE - left) / ASIDE, OVERDUE)
         turn -= side * short * min(max(verge / VERGE, 0.0), 1.0)
     turn *= TURN / max(car.speed_x, SLOWEST)
-    return float(min(max(turn, -MOST), MOST))
+    return float(min(max(turn, -MOST_TURN), MOST_TURN))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -155,12 +157,21 @@ class TestWhatIsSeen:
         assert np.abs(near - self.seen(80.001, 1.0, -5.0, 1.0)).max() < 1e-3
 
 
-def contacts(keep_distance):
-    """Count the contacts of a car that drives faster than the one ahead of it."""
-    envs = TorcsVecEnv(1, agents=2, track="g-track-1", keep_distance=keep_distance)
+@contextmanager
+def two_agents(track, **aid):
+    """Two cars on the grid, and nobody else."""
+    envs = TorcsVecEnv(1, agents=2, track=track, **aid)
     try:
         envs.seed(0)
         envs.reset()
+        yield envs
+    finally:
+        envs.close()
+
+
+def contacts(keep_distance):
+    """Count the contacts of a car that drives faster than the one ahead of it."""
+    with two_agents("g-track-1", keep_distance=keep_distance) as envs:
         ahead = np.argmin([car.race_position for car in envs.get_attr("car")])
         actions = np.stack([0.3 * GAS, 0.3 * GAS])
         for step in range(200):
@@ -172,8 +183,6 @@ def contacts(keep_distance):
                 actions[:, 1] = 0.7
                 actions[ahead, 1] = 0.1
         return cars[1 - ahead].contacts
-    finally:
-        envs.close()
 
 
 def test_a_car_that_is_asked_to_rams_nobody(game):
@@ -183,10 +192,7 @@ def test_a_car_that_is_asked_to_rams_nobody(game):
 
 def contacts_beside(keep_clear):
     """Count the contacts of two cars that are side by side, and both want to the middle."""
-    envs = TorcsVecEnv(1, agents=2, track="b-speedway", keep_clear=keep_clear)
-    try:
-        envs.seed(0)
-        envs.reset()
+    with two_agents("b-speedway", keep_clear=keep_clear) as envs:
         actions = np.stack([0.5 * GAS, 0.5 * GAS])
         aims = np.array([4.0, -4.0])
         for step in range(200):
@@ -203,8 +209,6 @@ def contacts_beside(keep_clear):
                 actions[i, 1] = np.clip(0.5 - lack * (1 - 2 * i), 0.1, 0.9)
         assert (aims == 0.0).all()
         return cars[0].contacts
-    finally:
-        envs.close()
 
 
 def test_a_car_that_keeps_clear_touches_nobody_beside_it(game):

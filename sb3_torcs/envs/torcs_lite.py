@@ -87,7 +87,7 @@ class TorcsLiteEnv(RacingEnv):
     :param unstick: whether a car that is stuck across the road or beside it frees itself, as the
         game's robots do; actions count for nothing meanwhile
     :param keep_distance: ``False``; there are no other cars here
-    :param keep_clear: ``False``, for the same reason
+    :param keep_clear: ``False``; there are no other cars here
     :param delay: control ticks of 0.02 s from an observation until the controls that answer it
         arrive; or a pair, e.g. ``(0, 5)``, between which each episode draws
     :param grip: factor on the friction of all ground; or a pair, e.g. ``(0.8, 1.1)``, between which
