@@ -30,6 +30,7 @@ from sb3_torcs.evaluation import recording
 from sb3_torcs.telemetry import TELEMETRY_FIELDS
 from sb3_torcs.torcs import building
 from sb3_torcs.torcs import process as game_process
+from sb3_torcs.torcs.track_names import BUNDLED_FOLDER
 from sb3_torcs.training import run as training_run
 from sb3_torcs.training.run import TrainOptions
 
@@ -445,6 +446,13 @@ def test_random_tracks_are_of_the_world_that_has_them(capsys):
     world, said = driven(capsys, "scripted", "--track", "random")
     assert world == "TorcsLite-v0"
     assert "random tracks are there alone" in said
+
+
+def test_a_table_of_a_track_is_driven_in_the_world_that_reads_it(capsys):
+    file = BUNDLED_FOLDER / "road" / "aalborg.csv"
+    world, said = driven(capsys, "scripted", "--track", str(file))
+    assert world == "TorcsLite-v0"
+    assert ".csv tracks are there alone" in said
 
 
 @pytest.mark.usefixtures("no_game")

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -16,7 +17,7 @@ import gymnasium as gym
 from sb3_torcs.agents.model_record import DRIVEN_WITH
 from sb3_torcs.agents.rollout import Driver, Timestep, drive
 from sb3_torcs.car import CONTROL_TICK, check_count
-from sb3_torcs.torcs.track_names import RANDOM_TRACK
+from sb3_torcs.torcs.track_names import COMPACT, RANDOM_TRACK
 
 __all__ = [
     "KEPT",
@@ -122,6 +123,8 @@ def choose_world(driver: str, trained_on: str | None, track: Any = None) -> Worl
     unknown = f"'{driver}' does not say where it was trained"
     if track == RANDOM_TRACK:
         return World(WITHOUT_GAME, f"{unknown}, and random tracks are there alone")
+    if Path(str(track)).suffix.lower() == COMPACT:
+        return World(WITHOUT_GAME, f"{unknown}, and {COMPACT} tracks are there alone")
     try:
         check_layout(find_game())
     except BackendUnavailable:
