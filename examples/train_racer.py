@@ -1,6 +1,4 @@
-"""Train PPO to race: first alone, then behind robots, boldly and at last carefully.
-
-While it learns to race, some cars stay alone.
+"""Train PPO to race: first alone, then behind robots, while some cars stay alone.
 
 Each car of each race is an environment of TorcsVecEnv, so that stock PPO learns from all of them.
 It learns one track, or several, to race on those that it never saw. With --driver it goes on from a
@@ -24,7 +22,7 @@ from sb3_torcs.policies import BoundedPolicy
 from sb3_torcs.sensors import feature_slices
 from sb3_torcs.vec_env import JoinedVecEnv, MirrorVecEnv, TorcsVecEnv
 
-SENSORS = ("base", "passing_line", "rivals")
+SENSORS = ("base", "line", "rivals")
 # The fields of robots, of which each race draws one. Those with a number drive another car.
 FIELDS = (
     ("berniw", "bt", "inferno", "lliaw", "olethros", "tita", "inferno:4"),
@@ -32,7 +30,6 @@ FIELDS = (
     ("lliaw", "olethros", "tita", "inferno:4", "bt", "tita:4", "berniw"),
     ("tita", "bt", "berniw"),
 )
-SMALL_FIELDS = (("bt", "inferno"), ("berniw", "tita", "lliaw", "bt:3"))
 BESIDE_ANCESTORS = ((), ("bt", "berniw", "inferno:4"), ("lliaw", "olethros", "tita", "bt:3"))
 AGENTS = 3  # in each race, behind the others
 
@@ -65,32 +62,6 @@ ALL_ROADS = Settings(
 )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Racing:
-    """What differs between the stages in races."""
-
-    name: str
-    fields: tuple[tuple[str, ...], ...]
-    damage: float  # what a point of it costs
-    gamma: float
-    episodes: list[int]  # timesteps; of them one is drawn per race
-    log_std: tuple[float, float]  # of steering and pedal, at first
-    kl: float  # that an update may reach at first
-
-
-BOLD = Racing(
-    # Damage is done in the crowd of the first minute.
-    "races", FIELDS, damage=-0.3, gamma=0.99, episodes=[450, 450, 1400], log_std=(-2.0, -0.7),
-    kl=0.01,
-)  # fmt: skip
-# Who tries less, looks further ahead and meets fewer cars at once learns what a contact costs. Who
-# learns so from the begin, or for long, does not dare to pass, or spins off to be alone.
-CAREFUL = Racing(
-    "careful", (*FIELDS, *SMALL_FIELDS), damage=-0.5, gamma=0.995, episodes=[450, 900, 1400],
-    log_std=(-2.3, -1.0), kl=0.006,
-)  # fmt: skip
-
-
 def reward_alone(off_line: float) -> dict[str, float]:
     """Return the weights of the reward's terms for a car that is alone."""
     return {
@@ -99,10 +70,10 @@ def reward_alone(off_line: float) -> dict[str, float]:
     }  # fmt: skip
 
 
-def reward_in_races(off_line: float, damage: float) -> dict[str, float]:
+def reward_in_races(off_line: float) -> dict[str, float]:
     """Return the weights of the reward's terms for a car among others."""
     return {
-        "progress": 1.0, "off_line": off_line, "leaving": -0.3, "damage": damage, "passing": 1.0,
+        "progress": 1.0, "off_line": off_line, "leaving": -0.3, "damage": -0.3, "passing": 1.0,
         "places": 20.0, "contact": -1.0, "fault": -10.0, "crash": -1.0, "scale": 0.1,
     }  # fmt: skip
 
@@ -110,8 +81,7 @@ def reward_in_races(off_line: float, damage: float) -> dict[str, float]:
 parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
 parser.add_argument("--track", nargs="+", default=["aalborg"], help="one, or several")
 parser.add_argument("--alone", type=int, help="timesteps without other cars")
-parser.add_argument("--robots", type=int, default=4_000_000, help="timesteps in races")
-parser.add_argument("--careful", type=int, default=2_600_000, help="timesteps in races, carefully")
+parser.add_argument("--robots", type=int, default=6_000_000, help="timesteps in races")
 parser.add_argument("--driver", type=Path, help="model that drives alone, to go on from")
 parser.add_argument("--racer", type=Path, help="model that races, to go on from")
 parser.add_argument("--ancestor", type=Path, help="model.zip of a racer from which to go on")
@@ -174,16 +144,14 @@ def mirrored(cars: VecEnv, settings: Settings) -> VecEnv:
     return MirrorVecEnv(cars) if settings.mirror else cars
 
 
-def fields(args: argparse.Namespace, racing: Racing) -> tuple[tuple[str, ...], ...]:
+def fields(args: argparse.Namespace) -> tuple[tuple[str, ...], ...]:
     """Tell who may start in front of the agents: robots, or the ancestor, too."""
     if args.ancestor is None:
-        return racing.fields
+        return FIELDS
     return tuple((*[str(args.ancestor)] * 2, *robots) for robots in BESIDE_ANCESTORS)
 
 
-def cars_in_races(
-    args: argparse.Namespace, env_kwargs: dict, settings: Settings, racing: Racing
-) -> TorcsVecEnv:
+def cars_in_races(args: argparse.Namespace, env_kwargs: dict, settings: Settings) -> TorcsVecEnv:
     """
     Make races that begin on the grid, with the agents behind.
 
@@ -194,11 +162,11 @@ def cars_in_races(
         args.races,
         agents=AGENTS,
         threads=args.threads,
-        reward=reward_in_races(settings.off_line[1], racing.damage),
-        opponents=fields(args, racing),
+        reward=reward_in_races(settings.off_line[1]),
+        opponents=fields(args),
         runoff=8.0,
         recovery=20.0,
-        max_episode_steps=racing.episodes,
+        max_episode_steps=[450, 450, 1400],  # damage is done in the crowd of the first minute
         **env_kwargs,
     )
 
@@ -211,32 +179,6 @@ def learn_alone(args: argparse.Namespace, env_kwargs: dict, settings: Settings) 
     model.learn(timesteps, callback=callbacks(env_kwargs, args, "alone", 0.012, 0.003))
     cars.close()
     return model.policy.state_dict()
-
-
-def learn_to_race(
-    args: argparse.Namespace,
-    env_kwargs: dict,
-    settings: Settings,
-    racing: Racing,
-    timesteps: int,
-    weights: dict,
-) -> PPO:
-    """Learn in races, while some cars stay alone, for the pace: in races they are seldom free."""
-    beside = cars_alone(settings.beside_races * args.races, args, env_kwargs, settings)
-    races = cars_in_races(args, env_kwargs, settings, racing)
-    cars = mirrored(JoinedVecEnv([races, beside]), settings)
-    # Damage comes seldom and in heaps, so that short rollouts would lead astray. To follow a slower
-    # car costs little at once, and much in the end, so it looks further ahead.
-    model = make_model(cars, args.seed, n_steps=256, gamma=racing.gamma, settings=settings)
-    model.policy.load_state_dict(weights)
-    # It has become sure of what to do, and has to try things again: who never brakes does not find
-    # out that it ends a long contact.
-    with th.no_grad():
-        model.policy.log_std.copy_(th.tensor(racing.log_std))
-    learning = callbacks(env_kwargs, args, racing.name, racing.kl, racing.kl / 5)
-    model.learn(timesteps, callback=learning)
-    cars.close()
-    return model
 
 
 def weights_of(path: Path) -> dict:
@@ -261,9 +203,6 @@ def begin_to_race(weights: dict) -> None:
 
 def main() -> None:
     args = parser.parse_args()
-    stages = [each for each in ((BOLD, args.robots), (CAREFUL, args.careful)) if each[1] > 0]
-    if not stages:
-        parser.error("--robots and --careful are 0; a racer learns for some timesteps in races")
     several = len(args.track) > 1
     settings = ALL_ROADS if several else ONE_TRACK
     env_kwargs = {
@@ -279,9 +218,19 @@ def main() -> None:
         weights = weights_of(driver) if driver else learn_alone(args, env_kwargs, settings)
         begin_to_race(weights)
 
-    for racing, timesteps in stages:
-        model = learn_to_race(args, env_kwargs, settings, racing, timesteps, weights)
-        weights = model.policy.state_dict()
+    # Some cars stay alone, for the pace: in races they are seldom free to drive at their own.
+    beside = cars_alone(settings.beside_races * args.races, args, env_kwargs, settings)
+    cars = mirrored(JoinedVecEnv([cars_in_races(args, env_kwargs, settings), beside]), settings)
+    # Damage comes seldom and in heaps, so that short rollouts would lead astray. To follow a slower
+    # car costs little at once, and much in the end, so it looks further ahead.
+    model = make_model(cars, args.seed, n_steps=256, gamma=0.99, settings=settings)
+    model.policy.load_state_dict(weights)
+    # It has become sure of what to do, and has to try things again: who never brakes does not find
+    # out that it ends a long contact.
+    with th.no_grad():
+        model.policy.log_std.copy_(th.tensor([-2.0, -0.7]))
+    model.learn(args.robots, callback=callbacks(env_kwargs, args, "races", 0.01, 0.002))
+    cars.close()
     model.save(args.folder / "model")
     print(f"saved {args.folder}/model.zip; race it: sb3-torcs race {args.folder}/model.zip inferno")
 

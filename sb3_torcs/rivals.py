@@ -9,7 +9,7 @@ from numba import njit
 
 from sb3_torcs.car import CAR_WIDTH, FIRST_RIVAL, RIVALS, CarState, FloatArray
 
-__all__ = ["clarity", "lead_past", "needed_brake", "needed_turn", "see_rivals"]
+__all__ = ["clarity", "needed_brake", "needed_turn", "see_rivals"]
 
 NEARBY = 80.0  # [m] along the road, within which cars are seen
 HALF_ALONG, HALF_ACROSS = 10.0, 3.0  # [m] distances that are seen as 0.5
@@ -35,17 +35,6 @@ OVERDUE = 1.5  # most of this unit, for cars that would touch
 MOST_TURN = 0.25  # of the steering
 SLOWEST = 5.0  # [m/s] below which steering does not grow
 VERGE = 0.5  # [m] to the edge of the road, from which on a car makes less room
-
-NEAR, EARLIER = 5.0, 0.4  # [m], [s] of closing: lengthwise from here on the line moves aside, and
-ALL_ASIDE = 12.0  # [m] nearer it has all moved
-AWAY, GONE = (
-    2.0,
-    5.0,
-)  # [m/s] by which a car is faster: from here on it matters less, and not at all
-PASSED = 2.0  # [m] lengthwise behind, over which a passed car ceases to matter
-PASSING_ROOM = 0.5  # [m] between the sides of two cars that pass
-TO_EDGE = 1.2  # [m] from a passing line to the edge of the road
-ON_A_SIDE = 0.8  # [m] across to a car ahead, from which on it is passed on this side
 
 
 @njit(cache=True)
@@ -88,48 +77,6 @@ def see_rivals(rivals: FloatArray) -> FloatArray:
         close = min(max(1.0 - (abs(across) - width) / BESIDE, 0.0), 1.0)
         seen[5 * RIVALS + i] = overlap * close * (1.0 if across > 0.0 else -1.0)
     return seen
-
-
-@njit(cache=True)
-def lead_past(
-    race: FloatArray, offset: float, half_width: float, places: FloatArray, line: FloatArray
-) -> None:
-    """
-    Lead a line past the nearest car that is in its way and not faster.
-
-    The whole line moves aside, the more the nearer that car is, at most until there is 0.5 m
-    between the sides of the two. It passes on the side where the own car is already, or else where
-    more of the road is free; if there is no room, it stays.
-
-    :param race: of a ``CarState``
-    :param offset: of the own car from the road's axis [m]
-    :param half_width: of the road [m]
-    :param places: (n,) ahead of the own car, at which the line is told [m]
-    :param line: (n,) how far to the left of the own car it lies there [m], changed
-    """
-    most = half_width - TO_EDGE
-    rivals = race[FIRST_RIVAL:]
-    for i in range(RIVALS):
-        along, across, faster = rivals[i], rivals[RIVALS + i], rivals[2 * RIVALS + i]
-        length, width = rivals[4 * RIVALS + i], rivals[5 * RIVALS + i]
-        near = (NEAR + EARLIER * max(-faster, 0.0) - along) / ALL_ASIDE
-        here = min((along + length + PASSED) / PASSED, (GONE - faster) / (GONE - AWAY), 1.0)
-        apart = width + PASSING_ROOM
-        lies = np.interp(max(along, 0.0), places, line)
-        if near <= 0.0 or here <= 0.0 or abs(lies - across) >= apart:
-            continue
-        theirs = offset + across
-        side = -1.0 if across > 0.0 else 1.0
-        if abs(across) <= ON_A_SIDE:
-            side = 1.0 if theirs < 0.0 else -1.0
-        if along > length and side * theirs + apart > most:
-            side = -side
-            if side * theirs + apart > most:
-                continue
-        aside = min(near, 1.0) * here * (across + side * apart - lies)
-        for k in range(len(line)):
-            line[k] = min(max(line[k] + offset + aside, -most), most) - offset
-        return
 
 
 def needed_brake(car: CarState) -> float:

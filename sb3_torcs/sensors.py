@@ -2,11 +2,10 @@
 
 Its rows stand in groups, which an environment's ``sensors`` names: ``"base"`` are sensors of the
 SCR manual (arXiv:1304.1672, table 1), ``"preview"`` is the road ahead, ``"limits"`` are the speeds
-that it allows, ``"line"`` is the racing line, ``"passing_line"`` leads it past slower cars,
-``"opponents"``, ``"rivals"`` and ``"race"`` are the other cars, ``"car"`` is the car that is
-driven, and ``"car_line"`` the racing line as fast as this car may be on it. The observation space,
-the encoder, the mirror image, the documentation and the policy's view of the observation are all
-derived from the table.
+that it allows, ``"line"`` is the racing line, ``"opponents"``, ``"rivals"`` and ``"race"`` are the
+other cars, ``"car"`` is the car that is driven, and ``"car_line"`` the racing line as fast as this
+car may be on it. The observation space, the encoder, the mirror
+image, the documentation and the policy's view of the observation are all derived from the table.
 
 To add a group, write its rows, put them into :data:`GROUPS`, and its function into ``_WRITERS``.
 """
@@ -27,10 +26,9 @@ from numba.extending import overload
 
 from sb3_torcs.car import RIVALS, CarState, FloatArray
 from sb3_torcs.errors import InvalidOption
-from sb3_torcs.rivals import lead_past, see_rivals
+from sb3_torcs.rivals import see_rivals
 from sb3_torcs.tracks.profile import INTERVALS, QUANTITIES, RoadProfile, look_ahead, speed_margins
 from sb3_torcs.tracks.racing_line import (
-    LINE_DISTANCES,
     LINE_PLACES,
     USUAL_PACE,
     look_along,
@@ -60,9 +58,8 @@ __all__ = [
 ]
 
 SensorsName = Literal[
-    "base", "preview", "limits", "line", "passing_line", "opponents", "rivals", "race", "car",
-    "car_line",
-]  # fmt: skip
+    "base", "preview", "limits", "line", "opponents", "rivals", "race", "car", "car_line"
+]
 Mirror = Literal["same", "opposite", "reversed", "sides"]
 
 
@@ -125,13 +122,6 @@ LINE = (
 ``bends_ahead``, and by how much the car may be faster now to drive it, in the terms of
 ``speed_margins_ahead``, but on this surface, with its hills and banking."""
 
-PASSING_LINE = (
-    LINE[0]._replace(name="passing_line_offsets", low=-30.0, high=30.0),
-    *(row._replace(name=f"passing_{row.name}") for row in LINE[1:]),
-)
-"""The racing line of ``"line"``, moved aside where a slower car is in its way, so that an agent
-that follows it passes. Offsets have other bounds here for the reason of ``"car_line"``."""
-
 OPPONENTS = (Sensor("opponents", "opponents", 36, "m", 0.0, 200.0, 1.0 / 200.0, "reversed"),)
 """Distances to the nearest car in sectors of 10°, clockwise; the first begins straight behind."""
 
@@ -161,7 +151,7 @@ RACE = (
 )
 """How the race stands. Gaps are those to the car a place before and after."""
 
-NEEDS_RACE = frozenset({"passing_line", "rivals", "race"})
+NEEDS_RACE = frozenset({"rivals", "race"})
 """Groups that only a world with a race can tell."""
 
 CAR = (
@@ -193,7 +183,6 @@ GROUPS: Mapping[SensorsName, tuple[Sensor, ...]] = {
     "preview": PREVIEW,
     "limits": LIMITS,
     "line": LINE,
-    "passing_line": PASSING_LINE,
     "opponents": OPPONENTS,
     "rivals": RIVAL_ROWS,
     "race": RACE,
@@ -417,9 +406,6 @@ def _write_limits(world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -
     _scale_into(margins, _PARTS["limits"].start, numbers)
 
 
-_LINE_AT = np.array(LINE_DISTANCES[:LINE_PLACES], np.float64)
-
-
 def _write_line(
     group: SensorsName, world: Any, car: CarState, numbers: npt.NDArray[np.float32]
 ) -> None:
@@ -427,8 +413,6 @@ def _write_line(
     table, step = racing_line(_profile(world), pace)
     seen = np.empty((3, LINE_PLACES))
     look_along(table, step, car.distance_from_start, car.track_position, car.speed_x, seen)
-    if group == "passing_line":
-        lead_past(car.race, car.distance_from_axis, 0.5 * car.track_width, _LINE_AT, seen[0])
     seen[1] /= np.abs(seen[1]) + USUAL_BEND
     _scale_into(seen.ravel(), _PARTS[group].start, numbers)
 
@@ -454,7 +438,6 @@ _WRITERS: dict[str, Callable[[Any, CarState, npt.NDArray[np.float32]], None]] = 
     "preview": _write_preview,
     "limits": _write_limits,
     "line": partial(_write_line, "line"),
-    "passing_line": partial(_write_line, "passing_line"),
     "opponents": _write_opponents,
     "rivals": _write_rivals,
     "race": _write_race,

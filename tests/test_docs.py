@@ -190,7 +190,6 @@ GENERATED = {
         "preview": functools.partial(sensor_table, "preview"),
         "limits": functools.partial(sensor_table, "limits"),
         "line": functools.partial(sensor_table, "line"),
-        "passing-line": functools.partial(sensor_table, "passing_line"),
         "opponents": functools.partial(sensor_table, "opponents"),
         "rivals": functools.partial(sensor_table, "rivals"),
         "race": functools.partial(sensor_table, "race"),

@@ -65,7 +65,7 @@ def test_broken_tracks_are_refused_or_drive_what_is_written(monkeypatch, capsys,
 
 
 def test_a_racer_is_trained_alone_and_against_robots(monkeypatch, capsys, tmp_path, game):
-    budget = [f"--{stage}=1" for stage in ("alone", "robots", "careful")]
+    budget = [f"--{stage}=1" for stage in ("alone", "robots")]
     run(monkeypatch, "train_racer.py", *budget, "--races", "2", "--folder", str(tmp_path))
     assert f"{tmp_path}/model.zip" in capsys.readouterr().out
     (racer,) = find_entrants([str(tmp_path / "model.zip")], game)
@@ -74,7 +74,7 @@ def test_a_racer_is_trained_alone_and_against_robots(monkeypatch, capsys, tmp_pa
 
 def test_a_racer_goes_on_from_a_driver_that_never_saw_a_car(monkeypatch, capsys, tmp_path, game):
     driver = EXAMPLES.parent / "sb3_torcs" / "agents" / "ppo-roads" / "best_model.zip"
-    budget = ["--driver", str(driver), "--robots=1", "--careful=0", "--races=2"]
+    budget = ["--driver", str(driver), "--robots=1", "--races=2"]
     run(monkeypatch, "train_racer.py", *budget, "--folder", str(tmp_path))
     assert f"{tmp_path}/model.zip" in capsys.readouterr().out
 
