@@ -22,7 +22,7 @@ from sb3_torcs.races import protocol
 from sb3_torcs.races.entrants import find_entrants
 from sb3_torcs.races.protocol import Race, Standing, run_race, run_races
 from sb3_torcs.races.ratings import ratings
-from sb3_torcs.races.standings import driver_figures, wilson
+from sb3_torcs.races.standings import driver_figures, mean_interval, wilson
 
 SHORT = "g-track-1"
 
@@ -49,6 +49,25 @@ def test_a_win_rate_is_wilson_s():
     assert wilson(5, 5)[2] == 1.0
 
 
+class TestTheIntervalOfAMeanPlace:
+    def test_it_is_that_of_the_normal_distribution_nearly(self):
+        """For many races: the mean ± 1.96 standard errors."""
+        places = [1, 2, 3, 4] * 50
+        low, high = mean_interval(places)
+        error = np.std(places) / len(places) ** 0.5
+        assert low == pytest.approx(2.5 - 1.96 * error, abs=0.03)
+        assert high == pytest.approx(2.5 + 1.96 * error, abs=0.03)
+
+    def test_it_is_the_same_each_time(self):
+        assert mean_interval([1, 4, 2, 7]) == mean_interval([1, 4, 2, 7])
+
+    def test_who_always_comes_third_has_none_to_speak_of(self):
+        assert mean_interval([3, 3, 3]) == [3.0, 3.0]
+
+    def test_one_race_tells_nothing(self):
+        assert mean_interval([2]) is None
+
+
 def test_who_wins_more_has_the_higher_rating():
     rated = ratings([["a", "b", "c"], ["a", "c", "b"], ["b", "a", "c"]])
     assert rated["a"][0] > rated["b"][0] > rated["c"][0]
@@ -62,7 +81,8 @@ def test_figures_are_sums_over_the_races_of_a_driver():
     a = figures["a"]
     assert (a["races"], a["wins"], a["finished"], a["mean_place"]) == (3, 2, 2, 4 / 3)
     assert a["damage_per_km"] == 600.0 / 6.0
-    assert figures["c"]["races"] == 1
+    assert a["mean_place_interval"] == mean_interval([1, 2, 1])
+    assert (figures["c"]["races"], figures["c"]["mean_place_interval"]) == (1, None)
 
 
 def test_who_is_out_has_not_won():

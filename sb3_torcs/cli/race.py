@@ -51,7 +51,8 @@ each race: --grid last puts the first driver behind all others, whose order is d
 all; reverse begins each race in the reverse order of the standings before. With --field N each race
 holds the first driver and N - 1 of the others, who are drawn.
 
-A win rate comes with its 95 % interval. Ratings are those of openskill (Plackett-Luce).
+Win rates and mean places come with their 95 % intervals. Ratings are those of openskill
+(Plackett-Luce).
 
 Ctrl-C ends the command after the races that are over, and tells how they went.
 
@@ -262,6 +263,11 @@ def _as_json(args: argparse.Namespace, races: list[Race]) -> dict[str, Any]:
     }
 
 
+def _mean_place(figures: dict[str, Any]) -> str:
+    mean, interval = f"{figures['mean_place']:.2f}", figures["mean_place_interval"]
+    return mean if interval is None else "{} ({:.2f} to {:.2f})".format(mean, *interval)
+
+
 def _show(races: list[Race]) -> None:
     """Print the figures of the drivers, and the standings of the last race."""
     from sb3_torcs.races.standings import driver_figures
@@ -269,7 +275,7 @@ def _show(races: list[Race]) -> None:
     print(table(HEADERS, [
         (
             f["driver"], str(f["races"]), str(f["wins"]),
-            "{1:.0%} ({0:.0%} to {2:.0%})".format(*f["win_rate"]), f"{f['mean_place']:.2f}",
+            "{1:.0%} ({0:.0%} to {2:.0%})".format(*f["win_rate"]), _mean_place(f),
             str(f["finished"]),
             UNKNOWN if f["damage_per_km"] is None else f"{f['damage_per_km']:.0f}",
             "{:.1f} ± {:.1f}".format(*f["rating"]),

@@ -6,10 +6,14 @@ from collections.abc import Sequence
 from statistics import fmean
 from typing import Any
 
+import numpy as np
+
 from sb3_torcs.races.protocol import Race, Standing
 from sb3_torcs.races.ratings import ratings
 
-__all__ = ["driver_figures", "wilson"]
+__all__ = ["driver_figures", "mean_interval", "wilson"]
+
+RESAMPLES = 2000
 
 
 def wilson(wins: int, races: int) -> list[float]:
@@ -24,6 +28,26 @@ def wilson(wins: int, races: int) -> list[float]:
 
     interval = binomtest(wins, races).proportion_ci(0.95, method="wilson")
     return [float(interval.low), wins / races, float(interval.high)]
+
+
+def mean_interval(places: Sequence[int]) -> list[float] | None:
+    """
+    Estimate the 95 % interval of a mean place, by the percentile bootstrap.
+
+    The bootstrap is seeded, so that the same races give the same interval.
+
+    :param places: of a driver, one per race
+    :return: low, high; ``None`` for a single race, which tells nothing of others
+    """
+    from scipy.stats import bootstrap
+
+    if len(places) < 2:
+        return None
+    interval = bootstrap(
+        (places,), np.mean, n_resamples=RESAMPLES, method="percentile",
+        random_state=np.random.default_rng(0),
+    ).confidence_interval  # fmt: skip
+    return [float(interval.low), float(interval.high)]
 
 
 def driver_figures(races: Sequence[Race]) -> list[dict[str, Any]]:
@@ -45,12 +69,14 @@ def driver_figures(races: Sequence[Race]) -> list[dict[str, Any]]:
 
 def _figures(driver: str, standings: Sequence[Standing]) -> dict[str, Any]:
     wins = sum(standing.place == 1 and not standing.out for standing in standings)
+    places = [standing.place for standing in standings]
     return {
         "driver": driver,
         "races": len(standings),
         "wins": wins,
         "win_rate": wilson(wins, len(standings)),
-        "mean_place": fmean(standing.place for standing in standings),
+        "mean_place": fmean(places),
+        "mean_place_interval": mean_interval(places),
         "finished": sum(not standing.out for standing in standings),
         "damage_per_km": _damage_per_km(standings),
     }
