@@ -61,11 +61,9 @@ class TestTheIntervalOfAMeanPlace:
     def test_it_is_the_same_each_time(self):
         assert mean_interval([1, 4, 2, 7]) == mean_interval([1, 4, 2, 7])
 
-    def test_who_always_comes_third_has_none_to_speak_of(self):
-        assert mean_interval([3, 3, 3]) == [3.0, 3.0]
-
-    def test_one_race_tells_nothing(self):
-        assert mean_interval([2]) is None
+    @pytest.mark.parametrize("places", [[2], [3, 3, 3]])
+    def test_places_that_are_all_the_same_tell_nothing(self, places):
+        assert mean_interval(places) is None
 
 
 def test_who_wins_more_has_the_higher_rating():

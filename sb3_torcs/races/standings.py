@@ -37,11 +37,11 @@ def mean_interval(places: Sequence[int]) -> list[float] | None:
     The bootstrap is seeded, so that the same races give the same interval.
 
     :param places: of a driver, one per race
-    :return: low, high; ``None`` for a single race, which tells nothing of others
+    :return: low, high; ``None`` if all places are the same, which tells nothing of their spread
     """
     from scipy.stats import bootstrap
 
-    if len(places) < 2:
+    if len(set(places)) < 2:
         return None
     interval = bootstrap(
         (places,), np.mean, n_resamples=RESAMPLES, method="percentile",
