@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -17,7 +16,7 @@ import gymnasium as gym
 from sb3_torcs.agents.model_record import DRIVEN_WITH
 from sb3_torcs.agents.rollout import Driver, Timestep, drive
 from sb3_torcs.car import CONTROL_TICK, check_count
-from sb3_torcs.torcs.track_names import COMPACT, RANDOM_TRACK
+from sb3_torcs.torcs.track_names import RANDOM_TRACK, kind_without_game
 
 __all__ = [
     "KEPT",
@@ -121,10 +120,9 @@ def choose_world(driver: str, trained_on: str | None, track: Any = None) -> Worl
     if trained_on is not None:
         return World(trained_on, f"'{driver}' was trained there")
     unknown = f"'{driver}' does not say where it was trained"
-    if track == RANDOM_TRACK:
-        return World(WITHOUT_GAME, f"{unknown}, and random tracks are there alone")
-    if Path(str(track)).suffix.lower() == COMPACT:
-        return World(WITHOUT_GAME, f"{unknown}, and {COMPACT} tracks are there alone")
+    kind = kind_without_game(track)
+    if kind is not None:
+        return World(WITHOUT_GAME, f"{unknown}, and {kind} tracks are there alone")
     try:
         check_layout(find_game())
     except BackendUnavailable:

@@ -15,6 +15,7 @@ __all__ = [
     "RANDOM_TRACK",
     "TrackFile",
     "find_track",
+    "kind_without_game",
     "known_tracks",
     "lasting_kwargs",
     "lasting_track",
@@ -53,7 +54,7 @@ def find_track(track: str | os.PathLike[str] | TrackFile, game: Game | None = No
     if not isinstance(track, (str, os.PathLike)) or track == RANDOM_TRACK:
         raise InvalidOption(f"track is {track!r}; {_expected(game)}")
     name = os.fspath(track)
-    suffix = Path(name).suffix.lower()
+    suffix = _suffix(name)
     if suffix == XML or (suffix == COMPACT and game is None):
         return _own_file(Path(lasting_track(name)))
     if suffix == COMPACT:
@@ -72,6 +73,18 @@ def find_track(track: str | os.PathLike[str] | TrackFile, game: Game | None = No
     raise TrackNotFound(f"no track '{name}'{near_miss(name, names, LISTED)}{where}")
 
 
+def kind_without_game(track: Any) -> str | None:
+    """
+    Tell of which kind a track is that TorcsLite-v0 alone has.
+
+    :param track: as of an environment
+    :return: ``"random"`` or ``".csv"``; ``None`` for a track that Torcs-v0 may have, too
+    """
+    if track == RANDOM_TRACK:
+        return RANDOM_TRACK
+    return COMPACT if _suffix(track) == COMPACT else None
+
+
 def lasting_track(track: Any) -> Any:
     """
     Say a track so that it means the same in another working folder.
@@ -81,9 +94,7 @@ def lasting_track(track: Any) -> Any:
     """
     if isinstance(track, (list, tuple)) and not isinstance(track, TrackFile):
         return [lasting_track(item) for item in track]
-    is_path = isinstance(track, (str, os.PathLike)) and (
-        Path(track).suffix.lower() in (XML, COMPACT)
-    )
+    is_path = _suffix(track) in (XML, COMPACT)
     return str(Path(os.path.expanduser(track)).absolute()) if is_path else track
 
 
@@ -114,6 +125,11 @@ def known_tracks(game: Game | None = None) -> dict[str, TrackFile]:
         for name, path in track_files(folder).items():
             files.setdefault(name, TrackFile(path.absolute(), "torcs", name))
     return files
+
+
+def _suffix(track: Any) -> str:
+    """Return the ending of a name or path, in small letters; empty for what is neither."""
+    return Path(track).suffix.lower() if isinstance(track, (str, os.PathLike)) else ""
 
 
 def _expected(game: Game | None) -> str:
