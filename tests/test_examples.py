@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sb3_torcs.agents.models import AGENTS
+from sb3_torcs.agents.models import AGENTS, driver_record
 from sb3_torcs.callbacks.lines import DrivenLap, driven_laps
 from sb3_torcs.errors import OutputNotWritable
 from sb3_torcs.evaluation.protocol import World
@@ -77,6 +77,25 @@ def test_a_racer_goes_on_from_a_driver_that_never_saw_a_car(monkeypatch, capsys,
     budget = ["--driver", str(driver), "--robots=1", "--races=2"]
     run(monkeypatch, "train_racer.py", *budget, "--folder", str(tmp_path))
     assert f"{tmp_path}/model.zip" in capsys.readouterr().out
+
+
+def test_specialists_teach_one_student(monkeypatch, capsys, tmp_path, game):
+    words = ["ppo-roads", "--track", "forza", "--timesteps=1", "--folder", str(tmp_path)]
+    run(monkeypatch, "specialize.py", *words)
+    specialist = str(tmp_path / "forza.zip")
+    assert f"sb3-torcs evaluate {specialist}" in capsys.readouterr().out
+    teaching = ["--teach", specialist, "forza", "--teach", "ppo-roads", "aalborg", "eroad"]
+    budget = ["--rounds=1", "--lessons=1", "--cars=1", "--folder", str(tmp_path / "student")]
+    run(monkeypatch, "distill.py", *teaching, *budget)
+    student = tmp_path / "student" / "model.zip"
+    assert f"saved {student}" in capsys.readouterr().out
+    assert driver_record(student).env_kwargs["track"] == ["forza", "aalborg", "eroad"]
+
+
+def test_teachers_who_drive_differently_are_refused(monkeypatch, tmp_path):
+    teaching = ["--teach", "ppo-roads", "forza", "--teach", "ppo-racer", "aalborg"]
+    with pytest.raises(SystemExit, match="ppo-racer drives with "):
+        run(monkeypatch, "distill.py", *teaching, "--folder", str(tmp_path))
 
 
 def test_own_reward_learns_from_it(monkeypatch, capsys):

@@ -1,0 +1,151 @@
+"""Teach one policy what several agents know, each on tracks of its own.
+
+The student drives, and learns what the teacher of its track would have done where it is (DAgger:
+Ross, Gordon and Bagnell, arXiv:1011.0686). A track that is named several times gets more cars. For
+tracks that no agent drives well, `specialize.py` makes teachers.
+"""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch as th
+from rich.progress import track as with_progress
+from stable_baselines3 import PPO
+from stable_baselines3.common.policies import ActorCriticPolicy
+from torch import nn
+
+from sb3_torcs.agents.model_writing import recipe, write_record
+from sb3_torcs.agents.models import driver_record, find_model
+from sb3_torcs.policies import BoundedPolicy
+from sb3_torcs.policies.imitation import Imitation, mean_actions
+from sb3_torcs.vec_env import JoinedVecEnv, TorcsVecEnv
+
+TIMESTEPS = 64  # of each car, between lessons
+BATCH = 4096  # observations in a lesson, which is a step of Adam
+RATE = 1e-3  # of learning, which falls in the second half
+LAST = 10  # times as many lessons in the last round
+SHOWN = 0.15  # of the rounds, in which teachers still drive, less and less
+DRIVING = ("action", "action_repeat", "gearbox", "range_finders", "sensors")
+
+parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+parser.add_argument(
+    "--teach",
+    nargs="+",
+    action="append",
+    required=True,
+    metavar=("TEACHER", "TRACK"),
+    help="a model of PPO and the tracks on which it teaches; give it once per teacher",
+)
+parser.add_argument("--rounds", type=int, default=150, help="of driving and lessons")
+parser.add_argument("--lessons", type=int, default=40, help="in each round")
+parser.add_argument("--cars", type=int, default=4, help="on each track")
+parser.add_argument("--width", type=int, default=256, help="of the student's two layers")
+parser.add_argument("--seed", type=int, default=0)
+parser.add_argument("--threads", type=int, help="default: one per core")
+parser.add_argument("--folder", type=Path, default=Path("logs/distilled"))
+
+
+class School:
+    """
+    Cars on the tracks of their teachers.
+
+    :param teaching: teachers, each followed by its tracks
+    :param cars: on each track
+    :param threads: as of ``TorcsVecEnv``
+    """
+
+    def __init__(self, teaching: Sequence[Sequence[str]], cars: int, threads: int | None) -> None:
+        self.env_kwargs = _same_for_all([teacher for teacher, *_ in teaching])
+        self.tracks = list(dict.fromkeys(name for _, *tracks in teaching for name in tracks))
+        parts, self._teachers = [], []
+        for teacher, *tracks in teaching:
+            part = TorcsVecEnv(
+                cars * len(tracks),
+                threads=threads,
+                track=tracks,
+                start="random",
+                max_episode_steps=300,
+                **self.env_kwargs,
+            )
+            part.env_method("set_random_speed", 80.0)
+            part.env_method("set_hard_starts", 0.7)
+            policy = PPO.load(find_model(teacher), device="cpu").policy
+            self._teachers.append((policy, part.num_envs))
+            parts.append(part)
+        self.cars = JoinedVecEnv(parts)
+
+    def wanted(self, seen: th.Tensor) -> th.Tensor:
+        """Ask the teachers what they would do."""
+        sizes = [size for _, size in self._teachers]
+        return th.cat(
+            [
+                mean_actions(policy, part)
+                for (policy, _), part in zip(self._teachers, seen.split(sizes), strict=True)
+            ]
+        )
+
+
+def _same_for_all(teachers: Sequence[str]) -> dict:
+    """Return the options of driving, which all teachers have to share."""
+    records = [driver_record(teacher).env_kwargs for teacher in teachers]
+    found = [{name: each[name] for name in DRIVING if name in each} for each in records]
+    for teacher, options in zip(teachers, found, strict=True):
+        if options != found[0]:
+            raise SystemExit(f"{teacher} drives with {options}, and {teachers[0]} with {found[0]}")
+    return found[0]
+
+
+def teach(model: PPO, school: School, rounds: int, lessons: int, seed: int) -> None:
+    """Drive and learn, in rounds; everything that was seen is kept."""
+    student: ActorCriticPolicy = model.policy
+    imitation = Imitation(student, RATE)
+    rng = np.random.default_rng(seed)
+    cars = school.cars
+    cars.seed(seed)
+    last_seen = cars.reset()
+    number, features = last_seen.shape
+    seen = th.empty(rounds * TIMESTEPS * number, features)
+    wanted = th.empty(len(seen), 2)
+    known = 0
+    for done in with_progress(range(rounds), description="teaching"):
+        shown = rng.random(number) < 1.0 - done / (SHOWN * rounds)
+        for _ in range(TIMESTEPS):
+            now = slice(known, known + number)
+            seen[now] = th.from_numpy(last_seen)
+            wanted[now] = school.wanted(seen[now])
+            own = mean_actions(student, seen[now])
+            last_seen, *_ = cars.step(np.where(shown[:, None], wanted[now], own))
+            known += number
+        imitation.set_learning_rate(RATE * min(1.0, 2.0 * (1.0 - done / rounds)))
+        for _ in range(lessons if done < rounds - 1 else LAST * lessons):
+            batch = th.from_numpy(rng.integers(0, known, BATCH))
+            imitation.learn(seen[batch], wanted[batch])
+
+
+def main() -> None:
+    args = parser.parse_args()
+    school = School(args.teach, args.cars, args.threads)
+    model = PPO(
+        BoundedPolicy,
+        school.cars,
+        policy_kwargs={
+            "net_arch": [args.width, args.width],
+            "activation_fn": nn.ReLU,
+            "log_std_init": [-2.0, -0.7],  # steering, pedal, for a training that goes on from it
+        },
+        seed=args.seed,
+        device="cpu",
+    )
+    env_kwargs = {**school.env_kwargs, "track": school.tracks}
+    write_record(model, recipe("ppo", "Torcs-v0", {"env_kwargs": env_kwargs}))
+    teach(model, school, args.rounds, args.lessons, args.seed)
+    school.cars.close()
+    args.folder.mkdir(parents=True, exist_ok=True)
+    model.save(args.folder / "model")
+    print(f"saved {args.folder}/model.zip")
+
+
+if __name__ == "__main__":
+    main()

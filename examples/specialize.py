@@ -1,0 +1,77 @@
+"""Let an agent go on learning on one track at a time: it becomes a specialist for each.
+
+A specialist is much faster on its track than who drives many, and knows no other. `distill.py`
+teaches one agent what all of them know. The tracks come one after the other, on one core each: to
+use more, run it several times.
+"""
+
+import argparse
+from pathlib import Path
+
+import torch as th
+from stable_baselines3 import PPO
+
+from sb3_torcs.agents.model_writing import RecordCallback, recipe
+from sb3_torcs.agents.models import driver_record, find_model
+from sb3_torcs.callbacks import AdaptiveLearningRateCallback, LeanUpdatesCallback
+from sb3_torcs.vec_env import TorcsVecEnv
+
+CARS, TIMESTEPS = 64, 128  # at once, and of each between updates
+REWARD = {
+    "progress": 1.0, "off_line": -1.0, "leaving": -0.5, "damage": -0.02, "crash": -1.0,
+    "scale": 0.1,
+}  # fmt: skip
+NOISE = -1.7, -0.7  # logarithms of the standard deviations at first, steering and pedal
+NOT_DRIVING = ("track", "reward", "max_episode_steps")
+
+parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+parser.add_argument("driver", help="a model of PPO to go on from, such as ppo-roads")
+parser.add_argument("--track", nargs="+", required=True, help="one, or several")
+parser.add_argument("--timesteps", type=int, default=1_048_576, help="on each track")
+parser.add_argument("--seed", type=int, default=0)
+parser.add_argument("--folder", type=Path, default=Path("logs/specialists"))
+
+
+def specialize(driver: str, track: str, timesteps: int, seed: int, folder: Path) -> Path:
+    """Go on learning on one track, and return the model's file."""
+    th.set_num_threads(1)
+    trained = driver_record(driver).env_kwargs
+    env_kwargs = {name: value for name, value in trained.items() if name not in NOT_DRIVING}
+    env_kwargs["track"] = track
+    cars = TorcsVecEnv(
+        CARS, threads=1, start="random", reward=REWARD, max_episode_steps=600, **env_kwargs
+    )
+    cars.env_method("set_random_speed", 80.0)
+    cars.env_method("set_hard_starts", 0.5)
+    file = find_model(driver)
+    known = PPO.load(file, device="cpu")
+    # A new learner: that of a shipped file cannot go on, and its learning rate has fallen.
+    model = PPO(
+        known.policy_class, cars, learning_rate=1e-3, n_steps=TIMESTEPS,
+        batch_size=TIMESTEPS * CARS // 4, gamma=0.985, ent_coef=0.001,
+        policy_kwargs=known.policy_kwargs, seed=seed, device="cpu",
+    )  # fmt: skip
+    model.policy.load_state_dict(known.policy.state_dict())
+    with th.no_grad():
+        model.policy.log_std.copy_(th.tensor(NOISE))
+    callbacks = [
+        RecordCallback(recipe("ppo", "Torcs-v0", {"env_kwargs": env_kwargs})),
+        LeanUpdatesCallback(),
+        AdaptiveLearningRateCallback(kl=0.012, last_kl=0.003),
+    ]
+    model.learn(timesteps, callback=callbacks)
+    cars.close()
+    model.save(folder / track)
+    return folder / f"{track}.zip"
+
+
+def main() -> None:
+    args = parser.parse_args()
+    args.folder.mkdir(parents=True, exist_ok=True)
+    for track in args.track:
+        file = specialize(args.driver, track, args.timesteps, args.seed, args.folder)
+        print(f"saved {file}; drive it: sb3-torcs evaluate {file}")
+
+
+if __name__ == "__main__":
+    main()
