@@ -26,6 +26,7 @@ TIMESTEPS = 64  # of each car, between lessons
 BATCH = 4096  # observations in a lesson, which is a step of Adam
 RATE = 1e-3  # of learning, which falls in the second half
 LAST = 10  # times as many lessons in the last round
+KEPT = 20  # rounds after which a copy is kept
 SHOWN = 0.15  # of the rounds, in which teachers still drive, less and less
 DRIVING = ("action", "action_repeat", "gearbox", "range_finders", "sensors")
 
@@ -38,6 +39,7 @@ parser.add_argument(
     metavar=("TEACHER", "TRACK"),
     help="a model of PPO and the tracks on which it teaches; give it once per teacher",
 )
+parser.add_argument("--student", help="a model of the same width to go on from")
 parser.add_argument("--rounds", type=int, default=150, help="of driving and lessons")
 parser.add_argument("--lessons", type=int, default=40, help="in each round")
 parser.add_argument("--cars", type=int, default=4, help="on each track")
@@ -97,20 +99,21 @@ def _same_for_all(teachers: Sequence[str]) -> dict:
     return found[0]
 
 
-def teach(model: PPO, school: School, rounds: int, lessons: int, seed: int) -> None:
+def teach(model: PPO, school: School, args: argparse.Namespace) -> None:
     """Drive and learn, in rounds; everything that was seen is kept."""
+    rounds = args.rounds
     student: ActorCriticPolicy = model.policy
     imitation = Imitation(student, RATE)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(args.seed)
     cars = school.cars
-    cars.seed(seed)
+    cars.seed(args.seed)
     last_seen = cars.reset()
     number, features = last_seen.shape
     seen = th.empty(rounds * TIMESTEPS * number, features)
     wanted = th.empty(len(seen), 2)
     known = 0
     for done in with_progress(range(rounds), description="teaching"):
-        shown = rng.random(number) < 1.0 - done / (SHOWN * rounds)
+        shown = rng.random(number) < (0.0 if args.student else 1.0 - done / (SHOWN * rounds))
         for _ in range(TIMESTEPS):
             now = slice(known, known + number)
             seen[now] = th.from_numpy(last_seen)
@@ -119,9 +122,11 @@ def teach(model: PPO, school: School, rounds: int, lessons: int, seed: int) -> N
             last_seen, *_ = cars.step(np.where(shown[:, None], wanted[now], own))
             known += number
         imitation.set_learning_rate(RATE * min(1.0, 2.0 * (1.0 - done / rounds)))
-        for _ in range(lessons if done < rounds - 1 else LAST * lessons):
+        for _ in range(args.lessons * (1 if done < rounds - 1 else LAST)):
             batch = th.from_numpy(rng.integers(0, known, BATCH))
             imitation.learn(seen[batch], wanted[batch])
+        if done % KEPT == KEPT - 1:
+            model.save(args.folder / f"{done + 1}_rounds")
 
 
 def main() -> None:
@@ -138,11 +143,14 @@ def main() -> None:
         seed=args.seed,
         device="cpu",
     )
+    if args.student:
+        known = PPO.load(find_model(args.student), device="cpu")
+        model.policy.load_state_dict(known.policy.state_dict())
     env_kwargs = {**school.env_kwargs, "track": school.tracks}
     write_record(model, recipe("ppo", "Torcs-v0", {"env_kwargs": env_kwargs}))
-    teach(model, school, args.rounds, args.lessons, args.seed)
-    school.cars.close()
     args.folder.mkdir(parents=True, exist_ok=True)
+    teach(model, school, args)
+    school.cars.close()
     model.save(args.folder / "model")
     print(f"saved {args.folder}/model.zip")
 

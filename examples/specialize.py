@@ -17,10 +17,7 @@ from sb3_torcs.callbacks import AdaptiveLearningRateCallback, LeanUpdatesCallbac
 from sb3_torcs.vec_env import TorcsVecEnv
 
 CARS, TIMESTEPS = 64, 128  # at once, and of each between updates
-REWARD = {
-    "progress": 1.0, "off_line": -1.0, "leaving": -0.5, "damage": -0.02, "crash": -1.0,
-    "scale": 0.1,
-}  # fmt: skip
+REWARD = {"progress": 1.0, "off_line": -1.0, "leaving": -0.5, "crash": -1.0, "scale": 0.1}
 NOISE = -1.7, -0.7  # logarithms of the standard deviations at first, steering and pedal
 NOT_DRIVING = ("track", "reward", "max_episode_steps")
 
@@ -28,28 +25,28 @@ parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
 parser.add_argument("driver", help="a model of PPO to go on from, such as ppo-roads")
 parser.add_argument("--track", nargs="+", required=True, help="one, or several")
 parser.add_argument("--timesteps", type=int, default=1_048_576, help="on each track")
+parser.add_argument("--damage", type=float, default=-0.02, help="weight of a point of damage")
 parser.add_argument("--seed", type=int, default=0)
 parser.add_argument("--folder", type=Path, default=Path("logs/specialists"))
 
 
-def specialize(driver: str, track: str, timesteps: int, seed: int, folder: Path) -> Path:
+def specialize(args: argparse.Namespace, track: str) -> Path:
     """Go on learning on one track, and return the model's file."""
-    th.set_num_threads(1)
-    trained = driver_record(driver).env_kwargs
+    trained = driver_record(args.driver).env_kwargs
     env_kwargs = {name: value for name, value in trained.items() if name not in NOT_DRIVING}
     env_kwargs["track"] = track
+    reward = {**REWARD, "damage": args.damage}
     cars = TorcsVecEnv(
-        CARS, threads=1, start="random", reward=REWARD, max_episode_steps=600, **env_kwargs
+        CARS, threads=1, start="random", reward=reward, max_episode_steps=600, **env_kwargs
     )
     cars.env_method("set_random_speed", 80.0)
     cars.env_method("set_hard_starts", 0.5)
-    file = find_model(driver)
-    known = PPO.load(file, device="cpu")
+    known = PPO.load(find_model(args.driver), device="cpu")
     # A new learner: that of a shipped file cannot go on, and its learning rate has fallen.
     model = PPO(
         known.policy_class, cars, learning_rate=1e-3, n_steps=TIMESTEPS,
         batch_size=TIMESTEPS * CARS // 4, gamma=0.985, ent_coef=0.001,
-        policy_kwargs=known.policy_kwargs, seed=seed, device="cpu",
+        policy_kwargs=known.policy_kwargs, seed=args.seed, device="cpu",
     )  # fmt: skip
     model.policy.load_state_dict(known.policy.state_dict())
     with th.no_grad():
@@ -59,17 +56,19 @@ def specialize(driver: str, track: str, timesteps: int, seed: int, folder: Path)
         LeanUpdatesCallback(),
         AdaptiveLearningRateCallback(kl=0.012, last_kl=0.003),
     ]
-    model.learn(timesteps, callback=callbacks)
+    model.learn(args.timesteps, callback=callbacks)
     cars.close()
-    model.save(folder / track)
-    return folder / f"{track}.zip"
+    file = args.folder / f"{track}.zip"
+    model.save(file)
+    return file
 
 
 def main() -> None:
     args = parser.parse_args()
     args.folder.mkdir(parents=True, exist_ok=True)
+    th.set_num_threads(1)
     for track in args.track:
-        file = specialize(args.driver, track, args.timesteps, args.seed, args.folder)
+        file = specialize(args, track)
         print(f"saved {file}; drive it: sb3-torcs evaluate {file}")
 
 
