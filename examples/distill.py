@@ -39,11 +39,11 @@ parser.add_argument(
     metavar=("TEACHER", "TRACK"),
     help="a model of PPO and the tracks on which it teaches; give it once per teacher",
 )
-parser.add_argument("--student", help="a model of the same width to go on from")
+parser.add_argument("--student", help="a model of PPO to go on from")
 parser.add_argument("--rounds", type=int, default=150, help="of driving and lessons")
 parser.add_argument("--lessons", type=int, default=40, help="in each round")
 parser.add_argument("--cars", type=int, default=4, help="on each track")
-parser.add_argument("--width", type=int, default=256, help="of the student's two layers")
+parser.add_argument("--width", type=int, default=256, help="of a new student's two layers")
 parser.add_argument("--seed", type=int, default=0)
 parser.add_argument("--threads", type=int, help="default: one per core")
 parser.add_argument("--folder", type=Path, default=Path("logs/distilled"))
@@ -132,19 +132,20 @@ def teach(model: PPO, school: School, args: argparse.Namespace) -> None:
 def main() -> None:
     args = parser.parse_args()
     school = School(args.teach, args.cars, args.threads)
+    policy_kwargs = {
+        "net_arch": [args.width, args.width],
+        "activation_fn": nn.ReLU,
+        "log_std_init": [-2.0, -0.7],  # steering, pedal, for a training that goes on from it
+    }
+    known = PPO.load(find_model(args.student), device="cpu") if args.student else None
     model = PPO(
         BoundedPolicy,
         school.cars,
-        policy_kwargs={
-            "net_arch": [args.width, args.width],
-            "activation_fn": nn.ReLU,
-            "log_std_init": [-2.0, -0.7],  # steering, pedal, for a training that goes on from it
-        },
+        policy_kwargs=known.policy_kwargs if known else policy_kwargs,
         seed=args.seed,
         device="cpu",
     )
-    if args.student:
-        known = PPO.load(find_model(args.student), device="cpu")
+    if known:
         model.policy.load_state_dict(known.policy.state_dict())
     env_kwargs = {**school.env_kwargs, "track": school.tracks}
     write_record(model, recipe("ppo", "Torcs-v0", {"env_kwargs": env_kwargs}))
@@ -152,7 +153,8 @@ def main() -> None:
     teach(model, school, args)
     school.cars.close()
     model.save(args.folder / "model")
-    print(f"saved {args.folder}/model.zip")
+    drive = f"sb3-torcs evaluate {args.folder}/model.zip --track {school.tracks[0]}"
+    print(f"saved {args.folder}/model.zip; drive it: {drive}")
 
 
 if __name__ == "__main__":
