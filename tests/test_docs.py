@@ -360,7 +360,7 @@ def test_a_command_in_the_docs_parses_and_names_what_exists(page, line, parsed, 
             )
         case ["make", target, *_]:
             assert target in TARGETS
-        case ["python", script, *_]:
+        case ["python" | "sh", script, *_]:
             assert (ROOT / script).is_relative_to(ROOT / "examples")
             assert (ROOT / script).is_file()
         case ["pip", "install", what] | ["SB3_TORCS_WITHOUT_ENGINE=1", "pip", "install", what]:

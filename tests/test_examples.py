@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sb3_torcs.agents.models import AGENTS, driver_record
+from sb3_torcs.agents.models import AGENTS, driver_record, shipped_agents
 from sb3_torcs.callbacks.lines import DrivenLap, driven_laps
 from sb3_torcs.errors import OutputNotWritable
 from sb3_torcs.evaluation.protocol import World
@@ -90,6 +90,25 @@ def test_specialists_teach_one_student(monkeypatch, capsys, tmp_path, game):
     student = tmp_path / "student" / "model.zip"
     assert f"saved {student}" in capsys.readouterr().out
     assert driver_record(student).env_kwargs["track"] == ["forza", "aalborg", "eroad"]
+
+
+def test_everywhere_teaches_by_models_that_are_there_or_were_made_before(tmp_path):
+    """With a Python that only writes down what it is asked."""
+    python, asked = tmp_path / "python", tmp_path / "asked"
+    python.write_text(f'#!/bin/sh\necho "$@" >> {asked}\n')
+    python.chmod(0o755)
+    path = {"PATH": f"{tmp_path}:/usr/bin:/bin"}
+    subprocess.run(["sh", EXAMPLES / "everywhere.sh"], env=path, check=True)
+    made = set()
+    for call in asked.read_text().splitlines():
+        options = [option.split() for option in call.split(" --")]
+        given = {name: values for name, *values in options}
+        needed = {values[0] for name, *values in options if name in ("teach", "student")}
+        assert needed <= made | set(shipped_agents())
+        (folder,) = given["folder"]
+        made |= {f"{folder}/{track}.zip" for track in given.get("track", ["model"])}
+    assert sum("specialists" in model for model in made) == 22
+    assert "logs/everywhere/model.zip" in made
 
 
 def test_teachers_who_drive_differently_are_refused(monkeypatch, tmp_path):
