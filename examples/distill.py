@@ -1,8 +1,8 @@
 """Teach one policy what several agents know, each on tracks of its own.
 
-The student drives, and learns what the teacher of its track would have done where it is (DAgger:
-Ross, Gordon and Bagnell, arXiv:1011.0686). A track that is named several times gets more cars. For
-tracks that no agent drives well, `specialize.py` makes teachers.
+The student drives, and learns what the teacher of its track would do where it is (DAgger: Ross,
+Gordon and Bagnell, arXiv:1011.0686). A track that is named several times gets more cars.
+`specialize.py` makes teachers for tracks that no agent drives well.
 """
 
 import argparse
@@ -11,11 +11,12 @@ from pathlib import Path
 
 import numpy as np
 import torch as th
-from rich.progress import track as with_progress
+from rich.progress import track as progress
 from stable_baselines3 import PPO
 from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import nn
 
+from sb3_torcs.agents.model_record import DRIVEN_WITH
 from sb3_torcs.agents.model_writing import recipe, write_record
 from sb3_torcs.agents.models import driver_record, find_model
 from sb3_torcs.policies import BoundedPolicy
@@ -28,7 +29,6 @@ RATE = 1e-3  # of learning, which falls in the second half
 LAST = 10  # times as many lessons in the last round
 KEPT = 20  # rounds after which a copy is kept
 SHOWN = 0.15  # of the rounds, in which teachers still drive, less and less
-DRIVING = ("action", "action_repeat", "gearbox", "range_finders", "sensors")
 
 parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
 parser.add_argument(
@@ -73,26 +73,19 @@ class School:
             )
             part.env_method("set_random_speed", 80.0)
             part.env_method("set_hard_starts", 0.7)
-            policy = PPO.load(find_model(teacher), device="cpu").policy
-            self._teachers.append((policy, part.num_envs))
+            self._teachers.append(PPO.load(find_model(teacher), device="cpu").policy)
             parts.append(part)
+        self._sizes = [part.num_envs for part in parts]
         self.cars = JoinedVecEnv(parts)
 
     def wanted(self, seen: th.Tensor) -> th.Tensor:
         """Ask the teachers what they would do."""
-        sizes = [size for _, size in self._teachers]
-        return th.cat(
-            [
-                mean_actions(policy, part)
-                for (policy, _), part in zip(self._teachers, seen.split(sizes), strict=True)
-            ]
-        )
+        return th.cat([*map(mean_actions, self._teachers, seen.split(self._sizes))])
 
 
 def _same_for_all(teachers: Sequence[str]) -> dict:
     """Return the options of driving, which all teachers have to share."""
-    records = [driver_record(teacher).env_kwargs for teacher in teachers]
-    found = [{name: each[name] for name in DRIVING if name in each} for each in records]
+    found = [driver_record(teacher).kept(DRIVEN_WITH) for teacher in teachers]
     for teacher, options in zip(teachers, found, strict=True):
         if options != found[0]:
             raise SystemExit(f"{teacher} drives with {options}, and {teachers[0]} with {found[0]}")
@@ -112,7 +105,7 @@ def teach(model: PPO, school: School, args: argparse.Namespace) -> None:
     seen = th.empty(rounds * TIMESTEPS * number, features)
     wanted = th.empty(len(seen), 2)
     known = 0
-    for done in with_progress(range(rounds), description="teaching"):
+    for done in progress(range(rounds), description="teaching"):
         shown = rng.random(number) < (0.0 if args.student else 1.0 - done / (SHOWN * rounds))
         for _ in range(TIMESTEPS):
             now = slice(known, known + number)

@@ -1,6 +1,6 @@
 #!/bin/sh
 # Make an agent like `ppo-everywhere`: 22 specialists, then a student of them and of those they come
-# from. It takes two cores an hour.
+# from. It takes two cores about an hour.
 set -e
 export OMP_NUM_THREADS=1
 
@@ -16,8 +16,8 @@ special ppo-ole-road-1 --track ole-road-1
 special ppo-dirt --track dirt-6
 wait
 
-# Each word is the track of a specialist, and after colons the others on which it teaches. Who is
-# named more than once gets more cars.
+# Each word is the track of a specialist, and after colons come the others on which it teaches. A
+# track that is named more than once gets more cars.
 from_specialists() {
   for word in "$@"; do
     echo --teach "logs/specialists/${word%%:*}.zip" $(echo "$word" | tr : ' ')
@@ -25,14 +25,13 @@ from_specialists() {
 }
 
 ovals=b-speedway:c-speedway:d-speedway:e-speedway:f-speedway:g-speedway
-dirt="dirt-1 dirt-3 dirt-4 dirt-5 mixed-1 mixed-2"
 
 python examples/distill.py --rounds 200 --folder logs/first $(
   from_specialists aalborg alpine-1:alpine-1 alpine-2 $ovals brondehach corkscrew dirt-6:dirt-6 \
     e-track-1 e-track-2 e-track-3 e-track-4:e-track-4 e-track-6 eroad forza g-track-1 g-track-2 \
     g-track-3 ole-road-1:ole-road-1 ruudskogen street-1 wheel-1 wheel-2
-) --teach ppo-roads spring spring a-speedway e-track-5 michigan --teach ppo-dirt $dirt \
-  --teach ppo-dirt-2 dirt-2 dirt-2 dirt-2 dirt-2
+) --teach ppo-roads spring spring a-speedway e-track-5 michigan --teach ppo-dirt dirt-1 dirt-3 \
+  dirt-4 dirt-5 mixed-1 mixed-2 --teach ppo-dirt-2 dirt-2 dirt-2 dirt-2 dirt-2
 
 # More cars where that student leaves the road.
 python examples/distill.py --student logs/first/model.zip --rounds 250 --folder logs/second $(

@@ -1,8 +1,8 @@
 """Let an agent go on learning on one track at a time: it becomes a specialist for each.
 
-A specialist is much faster on its track than who drives many, and knows no other. `distill.py`
-teaches one agent what all of them know. The tracks come one after the other, on one core each: to
-use more, run it several times.
+A specialist is faster on its track than an agent for many, and forgets other tracks. `distill.py`
+teaches one agent what several specialists know. This script learns one track after the other, on
+one core; run it several times at once to use more.
 """
 
 import argparse
@@ -42,7 +42,7 @@ def specialize(args: argparse.Namespace, track: str) -> Path:
     cars.env_method("set_random_speed", 80.0)
     cars.env_method("set_hard_starts", 0.5)
     known = PPO.load(find_model(args.driver), device="cpu")
-    # A new learner: that of a shipped file cannot go on, and its learning rate has fallen.
+    # A new learner, since shipped files hold no optimizer, and their learning rate has fallen.
     model = PPO(
         known.policy_class, cars, learning_rate=1e-3, n_steps=TIMESTEPS,
         batch_size=TIMESTEPS * CARS // 4, gamma=0.985, ent_coef=0.001,

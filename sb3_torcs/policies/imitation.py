@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import torch as th
 from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.utils import update_learning_rate
 
 from sb3_torcs.errors import InvalidOption
 
@@ -50,8 +51,8 @@ class Imitation:
     def __init__(self, policy: ActorCriticPolicy, learning_rate: float = 1e-3) -> None:
         self._policy = policy
         parts = (policy.mlp_extractor.policy_net, policy.action_net)
-        self._parameters = [own for part in parts for own in part.parameters()]
-        self._adam = th.optim.Adam(self._parameters, lr=learning_rate)
+        parameters = [own for part in parts for own in part.parameters()]
+        self._adam = th.optim.Adam(parameters, lr=learning_rate)
 
     def set_learning_rate(self, rate: float) -> None:
         """
@@ -59,8 +60,7 @@ class Imitation:
 
         :param rate: of Adam
         """
-        for group in self._adam.param_groups:
-            group["lr"] = rate
+        update_learning_rate(self._adam, rate)
 
     def learn(self, seen: th.Tensor, wanted: th.Tensor) -> float:
         """
@@ -73,9 +73,7 @@ class Imitation:
         errors = th.full((wanted.shape[1],), PEDALS)
         errors[0] = STEERING
         loss = (((self._policy.get_distribution(seen).mode() - wanted) / errors) ** 2).mean()
-        gradients = th.autograd.grad(loss, self._parameters)
-        for own, gradient in zip(self._parameters, gradients, strict=True):
-            own.grad = gradient
+        loss.backward()
         self._adam.step()
         self._adam.zero_grad()
         return loss.item()
