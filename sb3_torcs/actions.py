@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from sb3_torcs.car import Controls, FloatArray
+from sb3_torcs.car import Controls, FloatArray, checked_choice
 from sb3_torcs.errors import InvalidAction, InvalidOption, near_miss
 
 __all__ = [
@@ -170,10 +170,7 @@ def checked_gearbox(gearbox: str) -> str:
     :return: the same
     :raises InvalidOption: for anything else
     """
-    if not isinstance(gearbox, str) or gearbox not in GEARBOXES:
-        advice = f"expected {' or '.join(map(repr, GEARBOXES))}"
-        raise InvalidOption(f"gearbox is {gearbox!r}{near_miss(str(gearbox), GEARBOXES, advice)}")
-    return gearbox
+    return checked_choice("gearbox", gearbox, GEARBOXES)
 
 
 def used_gearbox(gearbox: str, action: str) -> str:

@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from numbers import Integral, Real
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, TypeVar, get_args
 
 import numpy as np
 import numpy.typing as npt
 
-from sb3_torcs.errors import InvalidOption
+from sb3_torcs.errors import InvalidOption, near_miss
 
 __all__ = [
     "CAR_LENGTH",
@@ -39,6 +39,7 @@ __all__ = [
     "StartName",
     "car_from_record",
     "check_count",
+    "checked_choice",
     "checked_delay",
     "checked_factor",
     "checked_flag",
@@ -53,6 +54,7 @@ __all__ = [
 ]
 
 FloatArray = npt.NDArray[np.float64]
+Name = TypeVar("Name", bound=str)
 
 DEFAULT_CAR = "car1-trb1"
 """The car of the SCR championship, which all worlds have."""
@@ -189,9 +191,7 @@ def checked_start(start: StartName) -> StartName:
     :return: the same
     :raises InvalidOption: for anything else
     """
-    if not isinstance(start, str) or start not in STARTS:
-        raise InvalidOption(f"start is {start!r}; expected {' or '.join(map(repr, STARTS))}")
-    return start
+    return checked_choice("start", start, STARTS)
 
 
 def checked_start_speed(speed: float) -> float:
@@ -204,6 +204,23 @@ def checked_start_speed(speed: float) -> float:
     """
     allowed = f"0 to {MAX_START_SPEED:g} m/s"
     return _checked_from_zero("speed of random starts", speed, MAX_START_SPEED, allowed)
+
+
+def checked_choice(name: str, choice: Name, choices: Collection[str]) -> Name:
+    """
+    Check an option that is one of several names.
+
+    :param name: of the option
+    :param choice: one of the names
+    :param choices: the names
+    :return: the same
+    :raises InvalidOption: for anything else
+    """
+    if not isinstance(choice, str) or choice not in choices:
+        *most, last = map(repr, choices)
+        advice = f"expected {', '.join(most)} or {last}"
+        raise InvalidOption(f"{name} is {choice!r}{near_miss(str(choice), choices, advice)}")
+    return choice
 
 
 def checked_flag(name: str, choice: bool) -> bool:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from stable_baselines3 import PPO
 
 from sb3_torcs.agents.models import AGENTS, driver_record, shipped_agents
 from sb3_torcs.callbacks.lines import DrivenLap, driven_laps
@@ -90,6 +91,14 @@ def test_specialists_teach_one_student(monkeypatch, capsys, tmp_path, game):
     student = tmp_path / "student" / "model.zip"
     assert f"saved {student}" in capsys.readouterr().out
     assert driver_record(student).env_kwargs["track"] == ["forza", "aalborg", "eroad"]
+
+
+def test_a_specialist_of_a_student_learns_its_value_function_anew(monkeypatch, tmp_path, game):
+    """The shipped file of a student has NaN where its value function would be."""
+    words = ["ppo-everywhere", "--track", "forza", "--timesteps=1", "--folder", str(tmp_path)]
+    run(monkeypatch, "specialize.py", *words)
+    weights = PPO.load(tmp_path / "forza.zip", device="cpu").policy.state_dict()
+    assert all(value.isfinite().all() for value in weights.values())
 
 
 def test_everywhere_teaches_by_models_that_are_there_or_were_made_before(tmp_path):

@@ -136,7 +136,7 @@ class TestGrid:
         ("options", "message"),
         [
             ({"field_size": 5}, "4 drivers, 5 in a race"),
-            ({"grid": "front"}, "grid is 'front'; expected one of 'last'"),
+            ({"grid": "front"}, "grid is 'front'; expected 'last', 'reverse' or 'random'"),
         ],
     )
     def test_what_cannot_be_held(self, grids, options, message):

@@ -251,6 +251,7 @@ def test_without_hard_starts_mishaps_change_no_start(oval):
         ({"recovery": -1.0}, "recovery is -1.0; expected a number of seconds from 0 to 60"),
         ({"recovery": "long"}, "recovery is 'long'"),
         ({"start": "pits"}, "start is 'pits'; expected 'grid' or 'random'"),
+        ({"start": "gird"}, "start is 'gird'; did you mean 'grid'"),
         ({"render_mode": "ansi"}, "render_mode is 'ansi'"),
     ],
 )

@@ -233,7 +233,7 @@ def check_fits(ghost: Ghost, env: gym.Env[Any, Any], name: str | Path) -> None:
         **asdict(aids),
     }
     needs = {**USUAL, **ghost.env_kwargs}
-    own_track = load_track(find_track(needs["track"], find_game()).path)
+    own_track = load_track(find_track(needs["track"], find_game()))
     needs["track"], has["track"] = own_track.name, backend.track.name
     if needs["track"] == has["track"]:  # which two roads may have
         needs["track"], has["track"] = str(own_track.file), str(backend.track.file)

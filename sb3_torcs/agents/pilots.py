@@ -97,7 +97,8 @@ class Pilots:
         :return: control ticks until the next agent has to be asked
         """
         for driver, team in self._teams.items():
-            if tick % self._envs[team[0]].action_repeat == 0:
+            begins = tick % self._envs[team[0]].action_repeat == 0
+            if begins and not self.failed.keys() >= set(team):
                 self._ask(driver, team, np.full(len(team), tick == 0))
         return min(env.action_repeat - tick % env.action_repeat for env in self._envs)
 

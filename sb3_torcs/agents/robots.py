@@ -118,7 +118,7 @@ def _rows(engine: Any, robots: Sequence[tuple[str, int]]) -> Iterator[tuple[Any,
 
 def _log(engine: Any, robots: Sequence[tuple[str, int]], track: str) -> DriveLog:
     """Drive to the end of the race, and note each control tick."""
-    name = lasting_name(load_track(find_track(track, find_game()).path))
+    name = lasting_name(load_track(find_track(track, find_game())))
     labels = [
         DriveLabel(_named(robot), name, engine.car_name(number), WORLD)
         for number, robot in enumerate(robots)

@@ -20,6 +20,7 @@ from sb3_torcs.car import (
     Controls,
     FloatArray,
     Start,
+    checked_choice,
     checked_laps,
 )
 from sb3_torcs.errors import BackendUnavailable, EnvClosed, InvalidOption, TrackFileError
@@ -83,8 +84,7 @@ def make_engine(
     :raises UnknownRobot: if there is no such robot
     """
     native = _extension()
-    if session not in SESSIONS:
-        raise InvalidOption(f"session is {session!r}; expected {' or '.join(SESSIONS)}")
+    checked_choice("session", session, SESSIONS)
     agents = sum(name == AGENT[0] for name, _ in entries)
     cars = _for_each(car, agents)
     for name in cars:
@@ -97,8 +97,9 @@ def make_engine(
             )
         if name != AGENT[0]:
             game.find_robot(name, index)
-    path = find_track(track, game).path
-    load_track(path)  # reports a broken file before the game's own loader reads it
+    file = find_track(track, game)
+    path = file.path
+    load_track(file)  # reports a broken file before the game's own loader reads it
     race = engine_arguments(game, path, entries, cars=cars, session=session, laps=laps)
     try_race(path, race)
     angles = range_finder_angles("scr") if angles is None else angles
@@ -152,7 +153,7 @@ def load_race(
         car=list(cars) or DEFAULT_CAR, gearbox=list(gearboxes) or "automatic",
         angles=np.stack(angles) if angles else None,
     )  # fmt: skip
-    road = load_track(file.path)
+    road = load_track(file)
     align(engine, road)
     return engine, road
 
@@ -226,7 +227,7 @@ class NativeBackend:
             angles=self.range_finder_angles,
             gearbox=gearbox,
         )
-        self.track: Track = load_track(file.path)
+        self.track: Track = load_track(file)
         self.seat = entries.index(AGENT)  # in the starting list
         self.gears = self.engine.gears(self.seat)
         self._noise = sensor_noise

@@ -97,7 +97,7 @@ class ScrBackend:
         self.range_finder_angles = range_finder_angles(range_finders)
         self._gearbox = read_gearbox(game.find_car(car), checked_gearbox(gearbox))
         self.gears = len(self._gearbox.ratios)
-        self.track: Track = load_track(find_track(track, game).path)
+        self.track: Track = load_track(find_track(track, game))
         entries = starting_list(game, opponents, grid_place)
         if self._own:
             compiled_library(

@@ -8,8 +8,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_torcs.car import is_count, is_number
-from sb3_torcs.errors import InvalidOption, near_miss, renamed
+from sb3_torcs.car import checked_choice, is_count, is_number
+from sb3_torcs.errors import InvalidOption, renamed
 from sb3_torcs.noise import (
     BLOG,
     ActuatorNoise,
@@ -61,10 +61,7 @@ class NoiseCallback(BaseCallback):
         verbose: int = 0,
     ) -> None:
         super().__init__(verbose)
-        if not isinstance(kind, str) or kind not in KINDS:
-            hint = near_miss(str(kind), KINDS, "pass 'set_point' or 'ou'")
-            raise InvalidOption(f"kind is {kind!r}{hint}")
-        self.kind = kind
+        self.kind = checked_choice("kind", kind, KINDS)
         self.parameters = tuple(OUParameters.of(value) for value in (steering, throttle, brake))
         self.dt = checked_dt(dt)
         self.seed = seed

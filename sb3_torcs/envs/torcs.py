@@ -16,10 +16,10 @@ from sb3_torcs.backends.native import NativeBackend
 from sb3_torcs.backends.scr import ScrBackend
 from sb3_torcs.backends.seats import LoneSeat
 from sb3_torcs.backends.several import is_several, one_or_several
-from sb3_torcs.car import DEFAULT_CAR, StartName, checked_flag, is_count
+from sb3_torcs.car import DEFAULT_CAR, StartName, checked_choice, checked_flag, is_count
 from sb3_torcs.envs.racing import RacingEnv, RenderMode
 from sb3_torcs.envs.torcs_race import make_shared_race
-from sb3_torcs.errors import InvalidOption, near_miss
+from sb3_torcs.errors import InvalidOption
 from sb3_torcs.rewards import RewardChoice
 from sb3_torcs.sensors import RangeFinderName, SensorsName
 from sb3_torcs.torcs.installation import find_game
@@ -145,8 +145,7 @@ class TorcsEnv(RacingEnv):
         host: str | None = None,
         port: int | None = None,
     ) -> None:
-        if not isinstance(backend, str) or backend not in BACKENDS:
-            raise InvalidOption(f"backend is {backend!r}; expected {' or '.join(BACKENDS)}")
+        checked_choice("backend", backend, BACKENDS)
         if backend != "native":
             self.metadata = RacingEnv.metadata
         self.picture = _picture(picture, render_mode)
@@ -298,9 +297,7 @@ def _picture(picture: PictureName, render_mode: GameRenderMode | None) -> Pictur
     :return: one of :data:`PICTURES`
     :raises InvalidOption: if there is no such picture, or not in this mode
     """
-    if not isinstance(picture, str) or picture not in PICTURES:
-        advice = f"expected {' or '.join(map(repr, PICTURES))}"
-        raise InvalidOption(f"picture is {picture!r}{near_miss(str(picture), PICTURES, advice)}")
+    checked_choice("picture", picture, PICTURES)
     if picture == "game" and render_mode == "human":
         raise InvalidOption(
             "picture 'game' is for render_mode 'rgb_array'; `sb3-torcs watch` shows the game's "

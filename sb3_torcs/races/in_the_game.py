@@ -21,7 +21,6 @@ from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.race_results import RobotResult
 from sb3_torcs.torcs.race_setup import SCR_DRIVERS, SCR_SERVER, RaceSetup, session_for
 from sb3_torcs.torcs.results import read_results
-from sb3_torcs.torcs.track_names import find_track
 from sb3_torcs.tracks.catalogue import load_track
 
 if TYPE_CHECKING:
@@ -81,7 +80,7 @@ def run_game_race(
     race = setup_in_the_game(order, track, laps)
     agents = [entrant for entrant in order if entrant.agent is not None]
     if agents:
-        goal = laps * load_track(find_track(track).path).length
+        goal = laps * load_track(track).length
         results = _with_clients(
             agents, race, trust, lambda distance: progress(min(distance / goal, 1.0))
         )

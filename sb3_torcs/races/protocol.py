@@ -11,7 +11,7 @@ import numpy as np
 from sb3_torcs.agents.pilots import Pilots
 from sb3_torcs.backends.native import load_race
 from sb3_torcs.backends.seats import SeatWorld, SharedRace
-from sb3_torcs.car import CONTROL_TICK, Controls, FloatArray, checked_laps
+from sb3_torcs.car import CONTROL_TICK, Controls, FloatArray, checked_choice, checked_laps
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.races.entrants import Entrant
 from sb3_torcs.telemetry import DriveLabel, DriveLog
@@ -143,8 +143,7 @@ def run_races(
     :param seed: of the first race; the others have the next ones
     :raises InvalidOption: if no such races can be held
     """
-    if grid not in GRIDS:
-        raise InvalidOption(f"grid is {grid!r}; expected one of {', '.join(map(repr, GRIDS))}")
+    checked_choice("grid", grid, GRIDS)
     size = len(entrants) if field_size is None else field_size
     if not 1 <= size <= min(len(entrants), GRID_SLOTS):
         raise InvalidOption(

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from sb3_torcs.car import DEFAULT_CAR, MANY_LAPS, checked_laps
+from sb3_torcs.car import DEFAULT_CAR, MANY_LAPS, checked_choice, checked_laps
 from sb3_torcs.errors import GameIncomplete, InvalidOption
 from sb3_torcs.torcs.installation import Game
 from sb3_torcs.torcs.params import Node
@@ -69,8 +69,7 @@ class RaceSetup:
     car: str | Sequence[str] = DEFAULT_CAR
 
     def __post_init__(self) -> None:
-        if self.session not in SESSIONS:
-            raise InvalidOption(f"session is {self.session!r}; expected {' or '.join(SESSIONS)}")
+        checked_choice("session", self.session, SESSIONS)
         checked_laps(self.laps)
         drivers = list(self.drivers)
         if self.session == "practice" and len(drivers) != 1:

@@ -26,13 +26,14 @@ CATEGORIES = ("road", "oval", "dirt")
 
 
 def load_track(
-    track: str | os.PathLike[str] | Track, rng: np.random.Generator | None = None
+    track: str | os.PathLike[str] | TrackFile | Track, rng: np.random.Generator | None = None
 ) -> Track:
     """
     Find a track by name or path. Files that were read are cached.
 
     :param track: ``"aalborg"``, ``"road/aalborg"``, a path to a ``.xml`` (TORCS) or ``.csv``
-        file, ``"random"``, or a track, which comes back as it is
+        file, its file as :func:`~sb3_torcs.torcs.track_names.find_track` finds it, ``"random"``, or
+        a track, which comes back as it is
     :param rng: what a random track is drawn from; only ``"random"`` needs it
     :return: the track
     """
