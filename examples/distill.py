@@ -2,7 +2,8 @@
 
 The student drives, and learns what the teacher of its track would do where it is (DAgger: Ross,
 Gordon and Bagnell, arXiv:1011.0686). A track that is named several times gets more cars.
-`specialize.py` makes teachers for tracks that no agent drives well.
+`specialize.py` makes teachers for tracks that no agent drives well. Models with commas between them
+teach the mean of what they would do, so that none of them alone can lead the student astray.
 """
 
 import argparse
@@ -21,7 +22,7 @@ from sb3_torcs.agents.model_writing import recipe, write_record
 from sb3_torcs.agents.models import driver_record, find_model
 from sb3_torcs.policies import BoundedPolicy
 from sb3_torcs.policies.imitation import Imitation, mean_actions
-from sb3_torcs.vec_env import JoinedVecEnv, TorcsVecEnv
+from sb3_torcs.vec_env import JoinedVecEnv, MirrorVecEnv, TorcsVecEnv
 
 TIMESTEPS = 64  # of each car, between lessons
 BATCH = 4096  # observations in a lesson, which is a step of Adam
@@ -37,12 +38,15 @@ parser.add_argument(
     action="append",
     required=True,
     metavar=("TEACHER", "TRACK"),
-    help="a model of PPO and the tracks on which it teaches; give it once per teacher",
+    help="a model of PPO, or several with commas between them, and the tracks on which they teach; "
+    "give it once per teacher",
 )
 parser.add_argument("--student", help="a model of PPO to go on from")
 parser.add_argument("--rounds", type=int, default=150, help="of driving and lessons")
 parser.add_argument("--lessons", type=int, default=40, help="in each round")
 parser.add_argument("--cars", type=int, default=4, help="on each track")
+parser.add_argument("--grip", type=float, default=1.0, help="least grip, of that of the game")
+parser.add_argument("--mirror", action="store_true", help="let every other car drive in the mirror")
 parser.add_argument("--width", type=int, default=256, help="of a new student's two layers")
 parser.add_argument("--seed", type=int, default=0)
 parser.add_argument("--threads", type=int, help="default: one per core")
@@ -53,34 +57,43 @@ class School:
     """
     Cars on the tracks of their teachers.
 
-    :param teaching: teachers, each followed by its tracks
-    :param cars: on each track
-    :param threads: as of ``TorcsVecEnv``
+    :param args: from the command line
     """
 
-    def __init__(self, teaching: Sequence[Sequence[str]], cars: int, threads: int | None) -> None:
-        self.env_kwargs = _same_for_all([teacher for teacher, *_ in teaching])
-        self.tracks = list(dict.fromkeys(name for _, *tracks in teaching for name in tracks))
+    def __init__(self, args: argparse.Namespace) -> None:
+        teaching = [(names.split(","), tracks) for names, *tracks in args.teach]
+        self.env_kwargs = _same_for_all([name for names, _ in teaching for name in names])
+        self.tracks = list(dict.fromkeys(track for _, tracks in teaching for track in tracks))
         parts, self._teachers = [], []
-        for teacher, *tracks in teaching:
+        for names, tracks in teaching:
             part = TorcsVecEnv(
-                cars * len(tracks),
-                threads=threads,
+                args.cars * len(tracks),
+                threads=args.threads,
                 track=tracks,
                 start="random",
                 max_episode_steps=300,
+                grip=[args.grip, 1.0],
                 **self.env_kwargs,
             )
             part.env_method("set_random_speed", 80.0)
             part.env_method("set_hard_starts", 0.7)
-            self._teachers.append(PPO.load(find_model(teacher), device="cpu").policy)
+            self._teachers.append(
+                [PPO.load(find_model(name), device="cpu").policy for name in names]
+            )
             parts.append(part)
         self._sizes = [part.num_envs for part in parts]
-        self.cars = JoinedVecEnv(parts)
+        cars = JoinedVecEnv(parts)
+        self.cars = MirrorVecEnv(cars) if args.mirror else cars
 
     def wanted(self, seen: th.Tensor) -> th.Tensor:
         """Ask the teachers what they would do."""
-        return th.cat([*map(mean_actions, self._teachers, seen.split(self._sizes))])
+        parts = zip(self._teachers, seen.split(self._sizes), strict=True)
+        return th.cat(
+            [
+                th.stack([mean_actions(policy, part) for policy in policies]).mean(0)
+                for policies, part in parts
+            ]
+        )
 
 
 def _same_for_all(teachers: Sequence[str]) -> dict:
@@ -124,7 +137,7 @@ def teach(model: PPO, school: School, args: argparse.Namespace) -> None:
 
 def main() -> None:
     args = parser.parse_args()
-    school = School(args.teach, args.cars, args.threads)
+    school = School(args)
     policy_kwargs = {
         "net_arch": [args.width, args.width],
         "activation_fn": nn.ReLU,
