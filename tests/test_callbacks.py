@@ -359,7 +359,7 @@ def test_evaluation_keeps_its_reward_unless_asked(also_eval, expected):
         (RandomStartCallback, {"start": "rnadom"}, "expected 'grid' or 'random'"),
         (RandomStartCallback, {"speed": "fast"}, "expected 0 to 150 m/s"),
         (RandomStartCallback, {"hard": 50}, "share of hard starts is 50; expected 0 to 1"),
-        (NoiseCallback, {"kind": 5}, "pass 'set_point' or 'ou'"),
+        (NoiseCallback, {"kind": 5}, "expected 'set_point' or 'ou'"),
         (NoiseCallback, {"dt": "1e-1"}, "pass a duration above 0"),
         (StochasticBrakeCallback, {"probability": "10 %"}, "a share of the timesteps"),
     ],

@@ -188,7 +188,9 @@ class TestRefusals:
             race(robots, "aalborg", laps, session="race" if len(robots) > 1 else "practice")
 
     def test_a_session_that_is_none(self, game):
-        with pytest.raises(InvalidOption, match="session is 'rally'; expected practice or race"):
+        with pytest.raises(
+            InvalidOption, match="session is 'rally'; expected 'practice' or 'race'"
+        ):
             race([("inferno", 3)], "aalborg", 1, session="rally")
 
     @pytest.mark.parametrize(

@@ -144,7 +144,11 @@ class TestRefusals:
                 {"laps": 0},
                 r"laps is 0; expected .* from 1 to 1073741824",
             ),
-            ([("racer", 3)], {"session": "duel"}, r"session is 'duel'; expected practice or race"),
+            (
+                [("racer", 3)],
+                {"session": "duel"},
+                r"session is 'duel'; expected 'practice' or 'race'",
+            ),
         ],
     )
     def test_what_no_session_can_be(self, fake, robots, changes, message):
