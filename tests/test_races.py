@@ -230,6 +230,7 @@ def test_an_agent_that_answers_no_number_is_out_and_the_others_race_on(monkeypat
     first, second = race.standings
     assert (first.driver, first.out, second.driver, second.out) == ("bt", False, "scripted", True)
     assert "steering is nan" in race.failures["scripted"]
+    assert len(asked) == 51
 
 
 def test_a_policy_that_refuses_to_draw_from_no_numbers_is_out_too(game, tmp_path):

@@ -97,8 +97,8 @@ class Pilots:
         :return: control ticks until the next agent has to be asked
         """
         for driver, team in self._teams.items():
-            begins = tick % self._envs[team[0]].action_repeat == 0
-            if begins and not self.failed.keys() >= set(team):
+            due = tick % self._envs[team[0]].action_repeat == 0
+            if due and any(number not in self.failed for number in team):
                 self._ask(driver, team, np.full(len(team), tick == 0))
         return min(env.action_repeat - tick % env.action_repeat for env in self._envs)
 
