@@ -2,8 +2,8 @@
 
 The student drives, and learns what the teacher of its track would do where it is (DAgger: Ross,
 Gordon and Bagnell, arXiv:1011.0686). A track that is named several times gets more cars.
-`specialize.py` makes teachers for tracks that no agent drives well. Models with commas between them
-teach the mean of what they would do, so that none of them alone can lead the student astray.
+`specialize.py` makes teachers for tracks that no agent drives well. Several models, with commas
+between them, teach the mean of their actions.
 """
 
 import argparse
@@ -17,6 +17,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import nn
 
+from sb3_torcs.agents.model_file import learned_weights
 from sb3_torcs.agents.model_record import DRIVEN_WITH
 from sb3_torcs.agents.model_writing import recipe, write_record
 from sb3_torcs.agents.models import driver_record, find_model
@@ -143,7 +144,8 @@ def main() -> None:
         "activation_fn": nn.ReLU,
         "log_std_init": [-2.0, -0.7],  # steering, pedal, for a training that goes on from it
     }
-    known = PPO.load(find_model(args.student), device="cpu") if args.student else None
+    file = find_model(args.student) if args.student else None
+    known = PPO.load(file, device="cpu") if file else None
     model = PPO(
         BoundedPolicy,
         school.cars,
@@ -151,8 +153,8 @@ def main() -> None:
         seed=args.seed,
         device="cpu",
     )
-    if known:
-        model.policy.load_state_dict(known.policy.state_dict())
+    if file:
+        model.policy.load_state_dict({**model.policy.state_dict(), **learned_weights(file)})
     env_kwargs = {**school.env_kwargs, "track": school.tracks}
     write_record(model, recipe("ppo", "Torcs-v0", {"env_kwargs": env_kwargs}))
     args.folder.mkdir(parents=True, exist_ok=True)

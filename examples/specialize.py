@@ -11,6 +11,7 @@ from pathlib import Path
 import torch as th
 from stable_baselines3 import PPO
 
+from sb3_torcs.agents.model_file import learned_weights
 from sb3_torcs.agents.model_writing import RecordCallback, recipe
 from sb3_torcs.agents.models import driver_record, find_model
 from sb3_torcs.callbacks import AdaptiveLearningRateCallback, LeanUpdatesCallback
@@ -41,17 +42,16 @@ def specialize(args: argparse.Namespace, track: str) -> Path:
     )
     cars.env_method("set_random_speed", 80.0)
     cars.env_method("set_hard_starts", 0.5)
-    known = PPO.load(find_model(args.driver), device="cpu")
+    file = find_model(args.driver)
+    known = PPO.load(file, device="cpu")
     # A new learner, since shipped files hold no optimizer, and their learning rate has fallen.
     model = PPO(
         known.policy_class, cars, learning_rate=1e-3, n_steps=TIMESTEPS,
         batch_size=TIMESTEPS * CARS // 4, gamma=0.985, ent_coef=0.001,
         policy_kwargs=known.policy_kwargs, seed=args.seed, device="cpu",
     )  # fmt: skip
-    # A student's value function has never learned, and its shipped file holds NaN in its place.
-    weights = known.policy.state_dict()
-    learned = {name: value for name, value in weights.items() if th.isfinite(value).all()}
-    model.policy.load_state_dict(learned, strict=False)
+    # The shipped file of a student has no value function: the new one stays.
+    model.policy.load_state_dict({**model.policy.state_dict(), **learned_weights(file)})
     with th.no_grad():
         model.policy.log_std.copy_(th.tensor(NOISE))
     callbacks = [
@@ -61,9 +61,9 @@ def specialize(args: argparse.Namespace, track: str) -> Path:
     ]
     model.learn(args.timesteps, callback=callbacks)
     cars.close()
-    file = args.folder / f"{track}.zip"
-    model.save(file)
-    return file
+    specialist = args.folder / f"{track}.zip"
+    model.save(specialist)
+    return specialist
 
 
 def main() -> None:

@@ -345,4 +345,9 @@ def test_a_driver_of_ppo_keeps_its_value_function_if_asked(env, tmp_path, kept):
         np.testing.assert_array_equal(driver.predict(OBSERVATIONS, deterministic=True)[0], expected)
     values = stock.policy.predict_values(th.as_tensor(OBSERVATIONS))
     assert bool(values.isfinite().all()) is kept
+    learned = model_file.learned_weights(tmp_path / "driver.zip")
+    assert all(weights.equal(model.policy.state_dict()[name]) for name, weights in learned.items())
+    left_out = model.policy.state_dict().keys() - learned.keys()
+    expected_out = () if kept else model_file.VALUES
+    assert left_out == {n for n in model.policy.state_dict() if n.startswith(expected_out)}
     assert stock._last_obs is None

@@ -27,6 +27,7 @@ __all__ = [
     "VALUES",
     "as_mismatch",
     "check_finite",
+    "learned_weights",
     "referenced_class",
     "saved_data",
     "saved_weights",
@@ -119,6 +120,21 @@ def saved_weights(model: Path) -> dict[str, th.Tensor]:
             raise ValueError("expected tensors by name")
     check_finite(model, weights)
     return dict(weights)
+
+
+def learned_weights(model: Path) -> dict[str, th.Tensor]:
+    """
+    Read the weights of a policy without those that a shipped file leaves out, which are NaN there.
+
+    :param model: the file
+    :return: tensors by name; those of a learner may take the place of the others
+    :raises ModelMismatch: as of :func:`saved_weights`
+    """
+    return {
+        name: tensor
+        for name, tensor in saved_weights(model).items()
+        if not (name.startswith(IDLE) and bool(tensor.isnan().all()))
+    }
 
 
 def check_finite(model: Path, weights: dict[str, th.Tensor]) -> None:
