@@ -7,6 +7,7 @@ racer that was trained so, and races against itself, this ancestor and robots.
 """
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +17,9 @@ from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
+from sb3_torcs.agents.model_file import learned_weights
 from sb3_torcs.agents.model_writing import RecordCallback, recipe
+from sb3_torcs.agents.models import find_model
 from sb3_torcs.callbacks import AdaptiveLearningRateCallback, LeanUpdatesCallback
 from sb3_torcs.policies import BoundedPolicy
 from sb3_torcs.sensors import feature_slices
@@ -32,6 +35,8 @@ FIELDS = (
 )
 BESIDE_ANCESTORS = ((), ("bt", "berniw", "inferno:4"), ("lliaw", "olethros", "tita", "bt:3"))
 AGENTS = 3  # in each race, behind the others
+UNITS = [128, 128]  # of a new policy
+VALUES_FIRST = 400_000  # timesteps for a value function that has never learned
 
 
 @dataclass(frozen=True)
@@ -82,16 +87,21 @@ parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
 parser.add_argument("--track", nargs="+", default=["aalborg"], help="one, or several")
 parser.add_argument("--alone", type=int, help="timesteps without other cars")
 parser.add_argument("--robots", type=int, default=6_000_000, help="timesteps in races")
-parser.add_argument("--driver", type=Path, help="model that drives alone, to go on from")
-parser.add_argument("--racer", type=Path, help="model that races, to go on from")
-parser.add_argument("--ancestor", type=Path, help="model.zip of a racer from which to go on")
+parser.add_argument("--driver", help="model that drives alone, to go on from, such as ppo-roads")
+parser.add_argument("--racer", help="model that races, to go on from, such as ppo-racer-roads")
+parser.add_argument("--ancestor", help="the same, and to race against")
+parser.add_argument(
+    "--values", type=int, default=VALUES_FIRST, help="timesteps before a student goes on learning"
+)
 parser.add_argument("--races", type=int, default=16, help="held at once")
 parser.add_argument("--seed", type=int, default=0)
 parser.add_argument("--threads", type=int, help="default: one per core")
 parser.add_argument("--folder", type=Path, default=Path("logs/racer"))
 
 
-def make_model(env: VecEnv, seed: int, n_steps: int, gamma: float, settings: Settings) -> PPO:
+def make_model(
+    env: VecEnv, seed: int, n_steps: int, gamma: float, settings: Settings, units: Sequence[int]
+) -> PPO:
     """Make the learner of a stage."""
     return PPO(
         BoundedPolicy,
@@ -102,7 +112,7 @@ def make_model(env: VecEnv, seed: int, n_steps: int, gamma: float, settings: Set
         gamma=gamma,
         ent_coef=settings.ent_coef,
         policy_kwargs={
-            "net_arch": [128, 128],
+            "net_arch": list(units),
             "activation_fn": nn.ReLU,
             "log_std_init": [-1.0, -0.3],  # steering, pedal
         },
@@ -148,7 +158,7 @@ def fields(args: argparse.Namespace) -> tuple[tuple[str, ...], ...]:
     """Tell who may start in front of the agents: robots, or the ancestor, too."""
     if args.ancestor is None:
         return FIELDS
-    return tuple((*[str(args.ancestor)] * 2, *robots) for robots in BESIDE_ANCESTORS)
+    return tuple((*[args.ancestor] * 2, *robots) for robots in BESIDE_ANCESTORS)
 
 
 def cars_in_races(args: argparse.Namespace, env_kwargs: dict, settings: Settings) -> TorcsVecEnv:
@@ -174,16 +184,47 @@ def cars_in_races(args: argparse.Namespace, env_kwargs: dict, settings: Settings
 def learn_alone(args: argparse.Namespace, env_kwargs: dict, settings: Settings) -> dict:
     """Learn to drive where there is nobody, and return the policy's weights."""
     cars = mirrored(cars_alone(settings.cars_alone, args, env_kwargs, settings), settings)
-    model = make_model(cars, args.seed, n_steps=128, gamma=0.985, settings=settings)
+    model = make_model(cars, args.seed, 128, 0.985, settings, UNITS)
     timesteps = args.alone or settings.timesteps_alone
     model.learn(timesteps, callback=callbacks(env_kwargs, args, "alone", 0.012, 0.003))
     cars.close()
     return model.policy.state_dict()
 
 
-def weights_of(path: Path) -> dict:
-    """Return the policy's weights in a model file."""
-    return PPO.load(path, device="cpu").policy.state_dict()
+class ValuesOnlyCallback(BaseCallback):
+    """Put the policy back after each update, so that only its value function learns."""
+
+    def _on_training_start(self) -> None:
+        named = self.model.policy.named_parameters()
+        self._policy = [(own, own.detach().clone()) for name, own in named if "value" not in name]
+
+    def _on_rollout_start(self) -> None:
+        with th.no_grad():
+            for own, before in self._policy:
+                own.copy_(before)
+
+    def _on_training_end(self) -> None:
+        self._on_rollout_start()
+
+    def _on_step(self) -> bool:
+        return True
+
+
+def with_values(
+    weights: dict, cars: VecEnv, args: argparse.Namespace, settings: Settings, units: Sequence[int]
+) -> dict:
+    """
+    Let the value function learn first where a policy has none, as that of `distill.py`.
+
+    With a value function that knows nothing, PPO would soon spoil what the policy knows.
+    """
+    if "value_net.weight" in weights:
+        return weights
+    model = make_model(cars, args.seed, 256, 0.99, settings, units)
+    model.policy.load_state_dict({**model.policy.state_dict(), **weights})
+    learning = [LeanUpdatesCallback(), AdaptiveLearningRateCallback(kl=0.03)]
+    model.learn(args.values, callback=[ValuesOnlyCallback(), *learning])
+    return model.policy.state_dict()
 
 
 def begin_to_race(weights: dict) -> None:
@@ -198,6 +239,10 @@ def begin_to_race(weights: dict) -> None:
     missing = max(where.stop for where in features.values()) - seen
     for net in ("policy_net", "value_net"):
         name = f"mlp_extractor.{net}.0.weight"
+        if name not in weights:
+            continue
+        if weights[name].shape[1] not in (seen, seen + missing):
+            raise SystemExit("the driver sees other things; it needs the sensors base and line")
         weights[name] = nn.functional.pad(weights[name][:, :seen], (0, missing))
 
 
@@ -212,18 +257,21 @@ def main() -> None:
         "unstick": True, "keep_distance": True, "keep_clear": True,
     }  # fmt: skip
     racer, driver = args.ancestor or args.racer, args.driver
-    if racer is not None:
-        weights = weights_of(racer)
-    else:
-        weights = weights_of(driver) if driver else learn_alone(args, env_kwargs, settings)
+    known = racer or driver
+    weights = (
+        learned_weights(find_model(known)) if known else learn_alone(args, env_kwargs, settings)
+    )
+    if racer is None:
         begin_to_race(weights)
+    units = [len(weights[f"mlp_extractor.policy_net.{layer}.bias"]) for layer in (0, 2)]
 
     # Some cars stay alone, for the pace: in races they are seldom free to drive at their own.
     beside = cars_alone(settings.beside_races * args.races, args, env_kwargs, settings)
     cars = mirrored(JoinedVecEnv([cars_in_races(args, env_kwargs, settings), beside]), settings)
     # Damage comes seldom and in heaps, so that short rollouts would lead astray. To follow a slower
     # car costs little at once, and much in the end, so it looks further ahead.
-    model = make_model(cars, args.seed, n_steps=256, gamma=0.99, settings=settings)
+    weights = with_values(weights, cars, args, settings, units)
+    model = make_model(cars, args.seed, 256, 0.99, settings, units)
     model.policy.load_state_dict(weights)
     # It has become sure of what to do, and has to try things again: who never brakes does not find
     # out that it ends a long contact.

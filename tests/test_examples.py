@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from stable_baselines3 import PPO
 
+from sb3_torcs.agents.model_file import saved_weights
 from sb3_torcs.agents.models import AGENTS, driver_record, shipped_agents
 from sb3_torcs.callbacks.lines import DrivenLap, driven_laps
 from sb3_torcs.errors import OutputNotWritable
@@ -73,11 +74,21 @@ def test_a_racer_is_trained_alone_and_against_robots(monkeypatch, capsys, tmp_pa
     assert racer.name == "model"
 
 
-def test_a_racer_goes_on_from_a_driver_that_never_saw_a_car(monkeypatch, capsys, tmp_path, game):
-    driver = EXAMPLES.parent / "sb3_torcs" / "agents" / "ppo-roads" / "best_model.zip"
-    budget = ["--driver", str(driver), "--robots=1", "--races=2"]
+@pytest.mark.parametrize("driver", ["ppo-roads", "ppo-everywhere"])
+def test_a_racer_goes_on_from_a_driver_that_never_saw_a_car(
+    driver, monkeypatch, capsys, tmp_path, game
+):
+    """Also from a student, whose file has no value function, and more units."""
+    budget = ["--driver", driver, "--values=1", "--robots=1", "--races=2"]
     run(monkeypatch, "train_racer.py", *budget, "--folder", str(tmp_path))
     assert f"{tmp_path}/model.zip" in capsys.readouterr().out
+    weights = saved_weights(tmp_path / "model.zip")
+    assert all(tensor.isfinite().all() for tensor in weights.values())
+
+
+def test_a_racer_needs_a_driver_that_sees_the_line(monkeypatch, tmp_path, game):
+    with pytest.raises(SystemExit, match="the sensors base and line"):
+        run(monkeypatch, "train_racer.py", "--driver=ppo-aalborg", "--folder", str(tmp_path))
 
 
 def test_specialists_teach_one_student(monkeypatch, capsys, tmp_path, game):
