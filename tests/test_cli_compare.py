@@ -15,6 +15,7 @@ from sb3_torcs.agents.ghosts import Ghost
 from sb3_torcs.agents.rollout import drive as rollout
 from sb3_torcs.agents.scripted import ScriptedDriver
 from sb3_torcs.cli import main
+from sb3_torcs.errors import ModelMismatch
 from sb3_torcs.evaluation import comparing
 from sb3_torcs.evaluation.comparing import compare
 from sb3_torcs.telemetry import DriveLog, read_drives
@@ -111,12 +112,24 @@ def test_an_agent_drives_the_track_of_a_saved_drive(saved):
 
 def test_the_track_is_that_of_the_training(monkeypatch):
     asked = []
-    monkeypatch.setattr(comparing, "_driven", lambda *words: asked.append(words[1]) or [])
+    monkeypatch.setattr(comparing, "_ready", lambda *words: lambda: asked.append(words[1]) or [])
     monkeypatch.setattr(comparing, "compare_drives", lambda drives, track: None)
     compare("ddpg-league")
     compare("scripted")
     compare("ddpg-league", track="forza")
     assert asked == ["corkscrew", "aalborg", "forza"]
+
+
+def test_what_is_wrong_with_a_later_driver_is_told_before_the_first_one_drives(monkeypatch, game):
+    def refuse(driver, env, trust):
+        if driver == "ppo-post":
+            raise ModelMismatch(f"{driver} does not fit")
+
+    monkeypatch.setattr(comparing, "load_driver", refuse)
+    for driving in ("drive_log", "drive"):
+        monkeypatch.setattr(comparing, driving, lambda *words, **named: pytest.fail("it drives"))
+    with pytest.raises(ModelMismatch, match="ppo-post does not fit"):
+        compare("inferno", "ddpg-aalborg", "ppo-post", track="aalborg", laps=1)
 
 
 def test_an_evaluation_makes_the_same_page(tmp_path, capsys):

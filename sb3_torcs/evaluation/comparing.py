@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import cached_property
 from html import escape
@@ -31,8 +32,6 @@ from sb3_torcs.tracks.track import Track
 
 if TYPE_CHECKING:
     import pandas as pd
-
-    from sb3_torcs.telemetry import DriveLog
 
 __all__ = ["LapReport", "compare", "report_of", "saved_drives"]
 
@@ -103,9 +102,14 @@ def compare(
     saved = {driver: saved_drives(driver) for driver in drivers if is_saved(driver)}
     where = _track(track, drivers, saved)
     drives = []
-    for driver in drivers:
-        known = saved.get(driver)
-        drives += _driven(str(driver), where, laps, trust) if known is None else known
+    with ExitStack() as worlds:
+        # All are made ready before anybody drives, so that what is wrong is told at once.
+        ready = [
+            None if driver in saved else _ready(str(driver), where, laps, trust, worlds)
+            for driver in drivers
+        ]
+        for driver, drive_alone in zip(drivers, ready, strict=True):
+            drives += saved[driver] if drive_alone is None else drive_alone()
     return LapReport(compare_drives(_told_apart(drives), load_track(where)))
 
 
@@ -195,33 +199,40 @@ def _robot(driver: str) -> tuple[str, int] | None:
     return None if game is None or not game.has_robot(driver) else game.parse_robot(driver)
 
 
-def _driven(driver: str, track: str, laps: int, trust: bool) -> list[Drive]:
-    """Let a robot or an agent drive."""
+def _ready(
+    driver: str, track: str, laps: int, trust: bool, worlds: ExitStack
+) -> Callable[[], list[Drive]]:
+    """
+    Make a robot or an agent ready to drive, an agent where it was trained.
+
+    :param driver: its name
+    :param track: that it drives on
+    :param laps: to drive
+    :param trust: run the code that is pickled in a model
+    :param worlds: which closes the agent's
+    :return: what lets it drive
+    """
     robot = _robot(driver)
-    if robot is None:
-        return drives_of(_agent_log(driver, track, laps, trust).frame())
-    return drives_of(drive_log([robot], track, laps).frame())
-
-
-def _agent_log(driver: str, track: str, laps: int, trust: bool) -> DriveLog:
-    """Let an agent drive, where it was trained, and note each control tick."""
+    if robot is not None:
+        return lambda: drives_of(drive_log([robot], track, laps).frame())
     record = agent_record(driver, _game())
-    world = choose_world(driver, record.env_id, track)
     env = race_environment(
-        world.env_id,
+        choose_world(driver, record.env_id, track).env_id,
         record.env_kwargs,
         track,
         laps=laps,
         hyperparameters=record.hyperparameters,
         trust=trust,
     )
-    try:
-        log = log_drives(env, driver_name(driver))
-        for _ in drive(env, load_driver(driver, env, trust=trust), seed=0):
+    worlds.callback(env.close)
+    log, pilot = log_drives(env, driver_name(driver)), load_driver(driver, env, trust=trust)
+
+    def drive_alone() -> list[Drive]:
+        for _ in drive(env, pilot, seed=0):
             pass
-    finally:
-        env.close()
-    return log
+        return drives_of(log.frame())
+
+    return drive_alone
 
 
 def _told_apart(drives: Sequence[Drive]) -> list[Drive]:
