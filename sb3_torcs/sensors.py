@@ -3,9 +3,10 @@
 Its rows stand in groups, which an environment's ``sensors`` names: ``"base"`` are sensors of the
 SCR manual (arXiv:1304.1672, table 1), ``"preview"`` is the road ahead, ``"limits"`` are the speeds
 that it allows, ``"line"`` is the racing line, ``"opponents"``, ``"rivals"`` and ``"race"`` are the
-other cars, ``"car"`` is the car that is driven, and ``"car_line"`` the racing line as fast as this
-car may be on it. The observation space, the encoder, the mirror
-image, the documentation and the policy's view of the observation are all derived from the table.
+other cars, ``"car"`` is the car that is driven, ``"car_line"`` the racing line as fast as this car
+may be on it, and ``"motion"`` is how the car turns and jumps. The observation space, the encoder,
+the mirror image, the documentation and the policy's view of the observation are all derived from
+the table.
 
 To add a group, write its rows, put them into :data:`GROUPS`, and its function into ``_WRITERS``.
 """
@@ -58,7 +59,7 @@ __all__ = [
 ]
 
 SensorsName = Literal[
-    "base", "preview", "limits", "line", "opponents", "rivals", "race", "car", "car_line"
+    "base", "preview", "limits", "line", "opponents", "rivals", "race", "car", "car_line", "motion"
 ]
 Mirror = Literal["same", "opposite", "reversed", "sides"]
 
@@ -175,6 +176,15 @@ of its tyres and its downforce, and with short crests. Margins of ``"line"`` are
 default car. Offsets have other bounds here, so that an observation space tells which line it has.
 """
 
+MOTION = (
+    Sensor("yaw_rate", "", 1, "rad/s", -5.0, 5.0, 1.0, "opposite"),
+    Sensor("lift", "", 1, "m", -0.5, 1.0, 10.0),
+)
+"""What else the car does: how fast it turns, without which a spin is seen only when it is too late
+to steer against it, and how high it is over its usual height, by which a car that is light over a
+crest, or jumps, can be told."""
+USUAL_HEIGHT = 0.345  # [m] of the default car's mass centre over the surface, at rest
+
 NEEDS_CAR = frozenset({"car", "car_line"})
 """Groups that only a world that knows its car's file can tell."""
 
@@ -188,6 +198,7 @@ GROUPS: Mapping[SensorsName, tuple[Sensor, ...]] = {
     "race": RACE,
     "car": CAR,
     "car_line": CAR_LINE,
+    "motion": MOTION,
 }
 """The whole table. An observation has the groups that are named, in this order."""
 
@@ -434,6 +445,11 @@ def _write_car(world: Any, _car: CarState, numbers: npt.NDArray[np.float32]) -> 
     _scale_into(np.array(world.facts), _PARTS["car"].start, numbers)
 
 
+def _write_motion(_world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> None:
+    values = np.array([car.yaw_rate, car.height - USUAL_HEIGHT])
+    _scale_into(values, _PARTS["motion"].start, numbers)
+
+
 _WRITERS: dict[str, Callable[[Any, CarState, npt.NDArray[np.float32]], None]] = {
     "preview": _write_preview,
     "limits": _write_limits,
@@ -443,6 +459,7 @@ _WRITERS: dict[str, Callable[[Any, CarState, npt.NDArray[np.float32]], None]] = 
     "race": _write_race,
     "car": _write_car,
     "car_line": partial(_write_line, "car_line"),
+    "motion": _write_motion,
 }
 """Of each group but ``"base"``: fills its numbers, from the world and the state of the car."""
 

@@ -63,7 +63,8 @@ class TorcsEnv(RacingEnv):
     :param sensors: groups of sensors in an observation: ``"base"``, the 29 numbers, and any of
         ``"preview"``, the road ahead, ``"limits"``, the speeds that it allows, ``"line"``, the
         racing line, ``"opponents"``, ``"rivals"`` and ``"race"``, the other cars, ``"car"``,
-        which car it is, and ``"car_line"``, the racing line as fast as this car may be on it
+        which car it is, ``"car_line"``, the racing line as fast as this car may be on it, and
+        ``"motion"``, how the car turns and jumps
     :param action: ``"pedals"``: steering, throttle, brake; ``"pedal"``: steering and one signed
         pedal; or ``"manual"``: steering, throttle, brake, gear, clutch
     :param gearbox: ``"automatic"``, by motor speed; or ``"road_speed"``, which does not hunt while
