@@ -46,6 +46,7 @@ __all__ = [
     "OBSERVATION_SIZE",
     "RANGE_FINDERS",
     "SENSORS",
+    "USUAL_HEIGHT",
     "Sensor",
     "SensorsName",
     "View",

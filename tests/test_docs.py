@@ -195,6 +195,7 @@ GENERATED = {
         "race": functools.partial(sensor_table, "race"),
         "car": functools.partial(sensor_table, "car"),
         "car-line": functools.partial(sensor_table, "car_line"),
+        "motion": functools.partial(sensor_table, "motion"),
         "range-finders": range_finders_table,
         "terms": terms_table,
         "presets": presets_table,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from conftest import car_state, plainly_encoded
@@ -15,6 +16,8 @@ from sb3_torcs.sensors import (
     OBSERVATION_LOW,
     OBSERVATION_SIZE,
     SENSORS,
+    USUAL_HEIGHT,
+    View,
     encode,
     feature_slices,
     range_finder_angles,
@@ -120,3 +123,23 @@ def test_the_usual_range_finders_look_every_ten_degrees_from_left_to_right():
 def test_other_range_finders_are_refused(choice):
     with pytest.raises(InvalidOption, match="expected"):
         range_finder_angles(choice)
+
+
+def test_motion_tells_how_fast_the_car_turns_and_how_high_it_is():
+    view = View(("base", "motion"))
+    light = car_state(yaw_rate=-0.5, height=USUAL_HEIGHT + 0.1)
+    np.testing.assert_allclose(view.encode(light, None)[OBSERVATION_SIZE:], [-0.5, 1.0])
+    thrown = car_state(yaw_rate=90.0, height=-3.0)
+    assert view.encode(thrown, None)[OBSERVATION_SIZE:].tolist() == [5.0, -5.0]
+
+
+def test_a_car_in_the_air_is_seen_to_be_there(game):
+    """On g-track-3 a fast car jumps; standing, it is as high as usual."""
+    env = gym.make("sb3_torcs:Torcs-v0", track="g-track-3", sensors=("base", "motion"))
+    lift = feature_slices(("base", "motion"))["lift"]
+    standing, _ = env.reset(seed=0)
+    assert abs(standing[lift]) < 0.1
+    env.reset(options={"distance": 2000.0, "speed": 55.0})
+    flown = [env.step(np.array([0.0, 0.0, 0.0], np.float32))[0][lift].item() for _ in range(25)]
+    env.close()
+    assert max(flown) > 0.5, flown

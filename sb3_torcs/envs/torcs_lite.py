@@ -73,7 +73,7 @@ class TorcsLiteEnv(RacingEnv):
     :param range_finders: ``"scr"``, ``"narrow"``, or 19 angles in degrees, left to right
     :param sensors: groups of sensors in an observation: ``"base"``, the 29 numbers, and any of
         ``"preview"``, the road ahead, ``"limits"``, the speeds that it allows, ``"line"``, the
-        racing line, or ``"opponents"``
+        racing line, ``"opponents"``, and ``"motion"``, how the car turns and jumps
     :param action: ``"pedals"``: steering, throttle, brake; ``"pedal"``: steering and one signed
         pedal; or ``"manual"``: steering, throttle, brake, gear, clutch
     :param gearbox: ``"automatic"``, by motor speed; or ``"road_speed"``, which does not hunt while
