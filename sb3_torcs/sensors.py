@@ -181,9 +181,8 @@ MOTION = (
     Sensor("yaw_rate", "", 1, "rad/s", -5.0, 5.0, 1.0, "opposite"),
     Sensor("lift", "", 1, "m", -0.5, 1.0, 10.0),
 )
-"""What else the car does: how fast it turns, without which a spin is seen only when it is too late
-to steer against it, and how high it is over its usual height, by which a car that is light over a
-crest, or jumps, can be told."""
+"""What else the car does: how fast it turns, which tells a spin as it begins, and how much higher
+than usual it is, which tells that it is light over a crest, or flies."""
 USUAL_HEIGHT = 0.345  # [m] of the default car's mass centre over the surface, at rest
 
 NEEDS_CAR = frozenset({"car", "car_line"})
