@@ -17,7 +17,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
-from sb3_torcs.agents.model_file import learned_weights
+from sb3_torcs.agents.model_file import VALUES, learned_weights
 from sb3_torcs.agents.model_writing import RecordCallback, recipe
 from sb3_torcs.agents.models import find_model
 from sb3_torcs.callbacks import AdaptiveLearningRateCallback, LeanUpdatesCallback
@@ -36,7 +36,6 @@ FIELDS = (
 BESIDE_ANCESTORS = ((), ("bt", "berniw", "inferno:4"), ("lliaw", "olethros", "tita", "bt:3"))
 AGENTS = 3  # in each race, behind the others
 UNITS = [128, 128]  # of a new policy
-VALUES_FIRST = 400_000  # timesteps for a value function that has never learned
 
 
 @dataclass(frozen=True)
@@ -89,9 +88,12 @@ parser.add_argument("--alone", type=int, help="timesteps without other cars")
 parser.add_argument("--robots", type=int, default=6_000_000, help="timesteps in races")
 parser.add_argument("--driver", help="model that drives alone, to go on from, such as ppo-roads")
 parser.add_argument("--racer", help="model that races, to go on from, such as ppo-racer-roads")
-parser.add_argument("--ancestor", help="the same, and to race against")
+parser.add_argument("--ancestor", help="racer to go on from, and to race against")
 parser.add_argument(
-    "--values", type=int, default=VALUES_FIRST, help="timesteps before a student goes on learning"
+    "--values",
+    type=int,
+    default=400_000,
+    help="timesteps in which only the value function learns, if the driver's file has none",
 )
 parser.add_argument("--races", type=int, default=16, help="held at once")
 parser.add_argument("--seed", type=int, default=0)
@@ -196,7 +198,9 @@ class ValuesOnlyCallback(BaseCallback):
 
     def _on_training_start(self) -> None:
         named = self.model.policy.named_parameters()
-        self._policy = [(own, own.detach().clone()) for name, own in named if "value" not in name]
+        self._policy = [
+            (own, own.detach().clone()) for name, own in named if not name.startswith(VALUES)
+        ]
 
     def _on_rollout_start(self) -> None:
         with th.no_grad():
@@ -214,9 +218,9 @@ def with_values(
     weights: dict, cars: VecEnv, args: argparse.Namespace, settings: Settings, units: Sequence[int]
 ) -> dict:
     """
-    Let the value function learn first where a policy has none, as that of `distill.py`.
+    Let the value function learn first if the weights have none, as those of a student.
 
-    With a value function that knows nothing, PPO would soon spoil what the policy knows.
+    Updates by a value function that knows nothing would spoil the policy.
     """
     if "value_net.weight" in weights:
         return weights
@@ -242,7 +246,9 @@ def begin_to_race(weights: dict) -> None:
         if name not in weights:
             continue
         if weights[name].shape[1] not in (seen, seen + missing):
-            raise SystemExit("the driver sees other things; it needs the sensors base and line")
+            raise SystemExit(
+                "the driver sees other things; take one with the sensors base and line: ppo-roads"
+            )
         weights[name] = nn.functional.pad(weights[name][:, :seen], (0, missing))
 
 
