@@ -1,4 +1,5 @@
-"""The state of a car and its controls, the two records that all worlds use, and how episodes begin.
+"""The state of a car and its controls, the two records that all worlds use, how episodes begin, and
+where range finders look.
 
 SI units and radians throughout. Left is positive for steering, lateral position and yaw.
 """
@@ -28,6 +29,7 @@ __all__ = [
     "MAX_DAMAGE",
     "MAX_DELAY",
     "NO_RACE",
+    "RANGE_FINDERS",
     "RIVALS",
     "RPM",
     "STEER_LOCK",
@@ -35,6 +37,7 @@ __all__ = [
     "Controls",
     "FloatArray",
     "Range",
+    "RangeFinderName",
     "Start",
     "StartName",
     "car_from_record",
@@ -51,6 +54,8 @@ __all__ = [
     "checked_start_speed",
     "is_count",
     "is_number",
+    "look_both_ways",
+    "range_finder_angles",
 ]
 
 FloatArray = npt.NDArray[np.float64]
@@ -313,6 +318,48 @@ FIRST_RIVAL = 5
 NO_RACE = np.array([200.0, 200.0, 0.0, 0.0, 0.0, *[200.0] * RIVALS, *[0.0] * 5 * RIVALS])
 """``CarState.race`` of a car that knows of no other, or in a world that does not tell."""
 NO_RACE.flags.writeable = False
+
+
+RangeFinderName = Literal["scr", "narrow"]
+RANGE_FINDERS: dict[RangeFinderName, tuple[float, ...]] = {
+    "scr": tuple(float(angle) for angle in range(-90, 91, 10)),
+    "narrow": (
+        -45, -19, -12, -7, -4, -2.5, -1.7, -1, -0.5, 0, 0.5, 1, 1.7, 2.5, 4, 7, 12, 19, 45,
+    ),
+}  # fmt: skip
+"""[deg] left to right: the SCR server's default, and what the original DDPG code asks for."""
+
+
+def range_finder_angles(choice: RangeFinderName | Sequence[float]) -> FloatArray:
+    """
+    Resolve the ``range_finders`` option.
+
+    :param choice: ``"scr"``, ``"narrow"``, or 19 angles in degrees, left negative
+    :return: (19,) [rad]
+    :raises InvalidOption: for anything else
+    """
+    allowed = 'expected "scr", "narrow", or 19 angles in [-90, 90] degrees, left to right'
+    if isinstance(choice, str):
+        if choice not in RANGE_FINDERS:
+            raise InvalidOption(f"range_finders is {choice!r}; {allowed}")
+        choice = RANGE_FINDERS[choice]
+    try:
+        angles = np.array(choice, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InvalidOption(f"range_finders is {choice!r}; {allowed}") from None
+    if angles.shape != (19,) or not np.all(np.abs(angles) <= 90.0):
+        raise InvalidOption(f"range_finders has shape {angles.shape}: {choice!r}; {allowed}")
+    return np.radians(angles)
+
+
+def look_both_ways(angles: FloatArray) -> bool:
+    """
+    Check whether the angles are symmetric, so that an observation has a mirror image.
+
+    :param angles: (19,) [rad]
+    :return: whether they do
+    """
+    return bool(np.allclose(angles, -angles[::-1]))
 
 
 class CarState(NamedTuple):

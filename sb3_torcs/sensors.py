@@ -44,7 +44,6 @@ __all__ = [
     "OBSERVATION_HIGH",
     "OBSERVATION_LOW",
     "OBSERVATION_SIZE",
-    "RANGE_FINDERS",
     "SENSORS",
     "USUAL_HEIGHT",
     "Sensor",
@@ -55,8 +54,6 @@ __all__ = [
     "encode",
     "encode_record",
     "feature_slices",
-    "look_both_ways",
-    "range_finder_angles",
 ]
 
 SensorsName = Literal[
@@ -512,45 +509,3 @@ class View:
         """
         for write, where in self._more:
             write(world, car, observation[where])
-
-
-RangeFinderName = Literal["scr", "narrow"]
-RANGE_FINDERS: dict[RangeFinderName, tuple[float, ...]] = {
-    "scr": tuple(float(angle) for angle in range(-90, 91, 10)),
-    "narrow": (
-        -45, -19, -12, -7, -4, -2.5, -1.7, -1, -0.5, 0, 0.5, 1, 1.7, 2.5, 4, 7, 12, 19, 45,
-    ),
-}  # fmt: skip
-"""[deg] left to right: the SCR server's default, and what the original DDPG code asks for."""
-
-
-def range_finder_angles(choice: RangeFinderName | Sequence[float]) -> FloatArray:
-    """
-    Resolve the ``range_finders`` option.
-
-    :param choice: ``"scr"``, ``"narrow"``, or 19 angles in degrees, left negative
-    :return: (19,) [rad]
-    :raises InvalidOption: for anything else
-    """
-    allowed = 'expected "scr", "narrow", or 19 angles in [-90, 90] degrees, left to right'
-    if isinstance(choice, str):
-        if choice not in RANGE_FINDERS:
-            raise InvalidOption(f"range_finders is {choice!r}; {allowed}")
-        choice = RANGE_FINDERS[choice]
-    try:
-        angles = np.array(choice, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InvalidOption(f"range_finders is {choice!r}; {allowed}") from None
-    if angles.shape != (19,) or not np.all(np.abs(angles) <= 90.0):
-        raise InvalidOption(f"range_finders has shape {angles.shape}: {choice!r}; {allowed}")
-    return np.radians(angles)
-
-
-def look_both_ways(angles: FloatArray) -> bool:
-    """
-    Check whether the angles are symmetric, so that an observation has a mirror image.
-
-    :param angles: (19,) [rad]
-    :return: whether they do
-    """
-    return bool(np.allclose(angles, -angles[::-1]))

@@ -7,11 +7,11 @@ import typing
 import numpy as np
 import pytest
 
+from sb3_torcs.car import RANGE_FINDERS, RangeFinderName
 from sb3_torcs.envs.torcs import TorcsEnv
 from sb3_torcs.envs.torcs_lite import TorcsLiteEnv
 from sb3_torcs.errors import Sb3TorcsError
 from sb3_torcs.rewards import PRESETS, RewardName
-from sb3_torcs.sensors import RANGE_FINDERS, RangeFinderName
 from sb3_torcs.torcs.window import VIEWS, ViewName
 
 

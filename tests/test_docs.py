@@ -29,10 +29,11 @@ from sb3_torcs import cli, rewards
 from sb3_torcs.agents.model_algorithm import SBX
 from sb3_torcs.agents.models import shipped_agents
 from sb3_torcs.callbacks.metrics import DrivingMetricsCallback
+from sb3_torcs.car import RANGE_FINDERS
 from sb3_torcs.envs.torcs import TorcsEnv
 from sb3_torcs.envs.torcs_lite import TorcsLiteEnv
 from sb3_torcs.noise import BLOG
-from sb3_torcs.sensors import GROUPS, RANGE_FINDERS, feature_slices
+from sb3_torcs.sensors import GROUPS, feature_slices
 from sb3_torcs.studies.config import read_study
 from sb3_torcs.torcs.packages import VIDEO_PACKAGES
 from sb3_torcs.torcs.track_names import BUNDLED_FOLDER

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from conftest import car_state, plainly_encoded
 
-from sb3_torcs.car import CarState
+from sb3_torcs.car import CarState, range_finder_angles
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.sensors import (
     OBSERVATION_HIGH,
@@ -20,7 +20,6 @@ from sb3_torcs.sensors import (
     View,
     encode,
     feature_slices,
-    range_finder_angles,
 )
 
 

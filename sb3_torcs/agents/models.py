@@ -33,13 +33,14 @@ from sb3_torcs.agents.model_record import (
 )
 from sb3_torcs.agents.scripted import SCRIPTED, ScriptedDriver
 from sb3_torcs.agents.wrapping import frames_of, normalizes, stacked_space, unrebuilt
+from sb3_torcs.car import range_finder_angles
 from sb3_torcs.errors import (
     InvalidOption,
     ModelMismatch,
     ModelNotTrusted,
     near_miss,
 )
-from sb3_torcs.sensors import choice_within, range_finder_angles
+from sb3_torcs.sensors import choice_within
 
 if TYPE_CHECKING:
     from sb3_torcs.torcs.installation import Game

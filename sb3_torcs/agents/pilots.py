@@ -12,10 +12,9 @@ from sb3_torcs.agents.model_record import DRIVEN_WITH
 from sb3_torcs.agents.models import agent_record, load_driver
 from sb3_torcs.agents.wrapping import wrapped
 from sb3_torcs.backends.seats import SeatWorld, SharedRace
-from sb3_torcs.car import DEFAULT_CAR, FloatArray
+from sb3_torcs.car import DEFAULT_CAR, FloatArray, range_finder_angles
 from sb3_torcs.envs.torcs_race import RaceCarEnv
 from sb3_torcs.errors import InvalidAction, InvalidOption, ModelMismatch
-from sb3_torcs.sensors import range_finder_angles
 from sb3_torcs.torcs.installation import find_game
 
 __all__ = ["CarOfAnAgent", "Crew", "Pilots"]

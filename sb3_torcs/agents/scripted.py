@@ -7,8 +7,9 @@ import math
 import numpy as np
 import numpy.typing as npt
 
+from sb3_torcs.car import RANGE_FINDERS
 from sb3_torcs.errors import InvalidOption
-from sb3_torcs.sensors import RANGE_FINDERS, SENSORS, choices_of_size, feature_slices
+from sb3_torcs.sensors import SENSORS, choices_of_size, feature_slices
 
 __all__ = ["SCRIPTED", "ScriptedDriver"]
 

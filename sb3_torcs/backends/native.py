@@ -19,12 +19,13 @@ from sb3_torcs.car import (
     CarState,
     Controls,
     FloatArray,
+    RangeFinderName,
     Start,
     checked_choice,
     checked_laps,
+    range_finder_angles,
 )
 from sb3_torcs.errors import BackendUnavailable, EnvClosed, InvalidOption, TrackFileError
-from sb3_torcs.sensors import RangeFinderName, range_finder_angles
 from sb3_torcs.torcs.building import build_command
 from sb3_torcs.torcs.car_file import CarFacts
 from sb3_torcs.torcs.installation import Game, find_game
@@ -176,7 +177,7 @@ class NativeBackend:
 
     :param track: ``"aalborg"``, ``"road/aalborg"``, or the path of a TORCS XML file
     :param car: any of the game's
-    :param range_finders: see :func:`sb3_torcs.sensors.range_finder_angles`
+    :param range_finders: see :func:`sb3_torcs.car.range_finder_angles`
     :param opponents: robots, e.g. ``("inferno", "berniw:3")``
     :param laps: of the race with opponents, who take fuel for so many; ``None`` drives on
     :param grid_place: of the agent among them, 1 in front; ``None`` is behind them all

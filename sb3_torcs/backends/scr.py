@@ -13,7 +13,17 @@ from typing import Any
 import numpy as np
 
 from sb3_torcs.actions import checked_gearbox, controls_from_action
-from sb3_torcs.car import CONTROL_TICK, DEFAULT_CAR, MANY_LAPS, CarState, Controls, Start, is_count
+from sb3_torcs.car import (
+    CONTROL_TICK,
+    DEFAULT_CAR,
+    MANY_LAPS,
+    CarState,
+    Controls,
+    RangeFinderName,
+    Start,
+    is_count,
+    range_finder_angles,
+)
 from sb3_torcs.errors import EngineForked, GameFailed, GameTimeout, InvalidOption, ServerLost
 from sb3_torcs.scr.car_reader import CarReader
 from sb3_torcs.scr.client import ScrClient
@@ -21,7 +31,7 @@ from sb3_torcs.scr.gearbox import read_gearbox
 from sb3_torcs.scr.protocol import ScrAction, format_action, parse_motor, parse_state
 from sb3_torcs.scr.rehearsal import Rehearsal
 from sb3_torcs.scr.server import SCR_PORT, open_ports, start_server
-from sb3_torcs.sensors import RangeFinderName, encode, range_finder_angles
+from sb3_torcs.sensors import encode
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.process import GameProcess, compiled_library
 from sb3_torcs.torcs.race_setup import SCR_SERVER, RaceSetup
@@ -57,7 +67,7 @@ class ScrBackend:
     :param track: ``"aalborg"``, ``"road/aalborg"``, or the path of a TORCS XML file; that of the
         server, if one is named
     :param car: any of the game's; that of the server, if one is named
-    :param range_finders: see :func:`sb3_torcs.sensors.range_finder_angles`
+    :param range_finders: see :func:`sb3_torcs.car.range_finder_angles`
     :param opponents: robots, e.g. ``("inferno", "berniw:3")``
     :param laps: of the race with opponents, who take fuel for so many; ``None`` drives on
     :param grid_place: of the agent among them, 1 in front; ``None`` is behind them all

@@ -16,12 +16,19 @@ from sb3_torcs.backends.native import NativeBackend
 from sb3_torcs.backends.scr import ScrBackend
 from sb3_torcs.backends.seats import LoneSeat
 from sb3_torcs.backends.several import is_several, one_or_several
-from sb3_torcs.car import DEFAULT_CAR, StartName, checked_choice, checked_flag, is_count
+from sb3_torcs.car import (
+    DEFAULT_CAR,
+    RangeFinderName,
+    StartName,
+    checked_choice,
+    checked_flag,
+    is_count,
+)
 from sb3_torcs.envs.racing import RacingEnv, RenderMode
 from sb3_torcs.envs.torcs_race import make_shared_race
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.rewards import RewardChoice
-from sb3_torcs.sensors import RangeFinderName, SensorsName
+from sb3_torcs.sensors import SensorsName
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.scenery import find_scenery
 from sb3_torcs.torcs.starting_list import guests_of

@@ -10,11 +10,11 @@ from typing import Any, Literal
 from sb3_torcs.actions import ActionName, GearboxName, used_gearbox
 from sb3_torcs.backends.lite.backend import LiteBackend
 from sb3_torcs.backends.several import one_or_several
-from sb3_torcs.car import DEFAULT_CAR, StartName
+from sb3_torcs.car import DEFAULT_CAR, RangeFinderName, StartName
 from sb3_torcs.envs.racing import RacingEnv, RenderMode
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.rewards import RewardChoice
-from sb3_torcs.sensors import RangeFinderName, SensorsName
+from sb3_torcs.sensors import SensorsName
 from sb3_torcs.tracks.track import Track
 
 __all__ = ["OF_THE_GAME", "TorcsLiteEnv"]

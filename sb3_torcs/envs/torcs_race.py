@@ -12,10 +12,16 @@ from sb3_torcs.actions import ActionName, GearboxName, used_gearbox
 from sb3_torcs.backends.native import load_race
 from sb3_torcs.backends.seats import Grid, Seat, SeatWorld, SharedRace
 from sb3_torcs.backends.several import is_several, world_pool
-from sb3_torcs.car import DEFAULT_CAR, CarState, checked_flag, checked_laps
+from sb3_torcs.car import (
+    DEFAULT_CAR,
+    CarState,
+    RangeFinderName,
+    checked_flag,
+    checked_laps,
+    range_finder_angles,
+)
 from sb3_torcs.envs.racing import RacingEnv
 from sb3_torcs.errors import InvalidOption
-from sb3_torcs.sensors import RangeFinderName, range_finder_angles
 from sb3_torcs.torcs.drivers import crew_of
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.starting_list import guests_of, starting_list

@@ -14,8 +14,9 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
+from sb3_torcs.car import look_both_ways
 from sb3_torcs.errors import InvalidOption
-from sb3_torcs.sensors import GROUPS, Sensor, choice_within, look_both_ways
+from sb3_torcs.sensors import GROUPS, Sensor, choice_within
 
 __all__ = [
     "MirrorImage",

@@ -15,9 +15,9 @@ from sb3_torcs.agents.model_algorithm import check_same, told_algorithm
 from sb3_torcs.agents.model_file import as_mismatch, saved_data
 from sb3_torcs.agents.models import check_spaces, saved_spaces, saved_timesteps, training_record
 from sb3_torcs.agents.wrapping import frames_of, normalizes
+from sb3_torcs.car import range_finder_angles
 from sb3_torcs.errors import ModelMismatch, ModelNotTrusted
 from sb3_torcs.files import listed, path_and_arguments
-from sb3_torcs.sensors import range_finder_angles
 from sb3_torcs.training.keeping import REPLAY_BUFFER
 from sb3_torcs.training.zoo_data import as_data
 

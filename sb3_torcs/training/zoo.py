@@ -22,10 +22,9 @@ import yaml
 
 from sb3_torcs.agents.model_algorithm import SBX, algorithm_class
 from sb3_torcs.agents.wrapping import normalizes, unrebuilt, wrapped
-from sb3_torcs.car import is_count
+from sb3_torcs.car import is_count, look_both_ways, range_finder_angles
 from sb3_torcs.errors import InvalidOption, ModelMismatch, ZooConfigError, near_miss
 from sb3_torcs.files import listed, path_and_arguments, read_yaml
-from sb3_torcs.sensors import look_both_ways, range_finder_angles
 from sb3_torcs.training.zoo_data import (
     as_data,
     check_class,

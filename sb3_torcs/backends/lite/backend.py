@@ -13,9 +13,17 @@ from sb3_torcs.backends.lite import physics
 from sb3_torcs.backends.lite.car import TOP_GEAR
 from sb3_torcs.backends.lite.rays import RANGE, Edges, road_edges
 from sb3_torcs.backends.lite.road import road_width
-from sb3_torcs.car import DEFAULT_CAR, NO_RACE, CarState, Controls, FloatArray, Start
+from sb3_torcs.car import (
+    DEFAULT_CAR,
+    NO_RACE,
+    CarState,
+    Controls,
+    FloatArray,
+    RangeFinderName,
+    Start,
+    range_finder_angles,
+)
 from sb3_torcs.errors import CarLost, InvalidOption
-from sb3_torcs.sensors import RangeFinderName, range_finder_angles
 from sb3_torcs.torcs.track_names import RANDOM_TRACK
 from sb3_torcs.tracks import track as column
 from sb3_torcs.tracks.catalogue import load_track
@@ -33,7 +41,7 @@ class LiteBackend:
 
     :param track: a name, a path, a :class:`Track`, or ``"random"`` for a new one each episode
     :param car: ``"car1-trb1"``
-    :param range_finders: see :func:`sb3_torcs.sensors.range_finder_angles`
+    :param range_finders: see :func:`sb3_torcs.car.range_finder_angles`
     :param gearbox: see :data:`sb3_torcs.actions.GEARBOXES`
     """
 
