@@ -30,6 +30,7 @@ __all__ = [
     "MAX_DELAY",
     "NO_RACE",
     "RANGE_FINDERS",
+    "REST_HEIGHT",
     "RIVALS",
     "RPM",
     "STEER_LOCK",
@@ -65,6 +66,8 @@ DEFAULT_CAR = "car1-trb1"
 """The car of the SCR championship, which all worlds have."""
 CAR_LENGTH, CAR_WIDTH = 4.52, 1.94
 """[m] of that car."""
+REST_HEIGHT = 0.345
+"""[m] of its mass centre over the surface while it stands."""
 STEER_LOCK = math.radians(21.0)
 """[rad] of its front wheels, to either side."""
 LIMITER_RPM = 9152.0

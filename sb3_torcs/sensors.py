@@ -25,7 +25,7 @@ import numpy.typing as npt
 from numba import literal_unroll, njit, types
 from numba.extending import overload
 
-from sb3_torcs.car import RIVALS, CarState, FloatArray
+from sb3_torcs.car import REST_HEIGHT, RIVALS, CarState, FloatArray
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.rivals import see_rivals
 from sb3_torcs.tracks.profile import INTERVALS, QUANTITIES, RoadProfile, look_ahead, speed_margins
@@ -45,7 +45,6 @@ __all__ = [
     "OBSERVATION_LOW",
     "OBSERVATION_SIZE",
     "SENSORS",
-    "USUAL_HEIGHT",
     "Sensor",
     "SensorsName",
     "View",
@@ -179,8 +178,7 @@ MOTION = (
     Sensor("lift", "", 1, "m", -0.5, 1.0, 10.0),
 )
 """What else the car does: how fast it turns, which tells a spin as it begins, and how much higher
-than usual it is, which tells that it is light over a crest, or flies."""
-USUAL_HEIGHT = 0.345  # [m] of the default car's mass centre over the surface, at rest
+it is than at rest, which tells that it is light over a crest, or flies."""
 
 NEEDS_CAR = frozenset({"car", "car_line"})
 """Groups that only a world that knows its car's file can tell."""
@@ -443,7 +441,7 @@ def _write_car(world: Any, _car: CarState, numbers: npt.NDArray[np.float32]) -> 
 
 
 def _write_motion(_world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> None:
-    values = np.array([car.yaw_rate, car.height - USUAL_HEIGHT])
+    values = np.array([car.yaw_rate, car.height - REST_HEIGHT])
     _scale_into(values, _PARTS["motion"].start, numbers)
 
 

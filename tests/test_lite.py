@@ -14,7 +14,7 @@ from sb3_torcs.backends.lite import car as figures
 from sb3_torcs.backends.lite import physics
 from sb3_torcs.backends.lite.backend import LiteBackend
 from sb3_torcs.backends.lite.rays import RANGE, cast, road_edges
-from sb3_torcs.car import Controls, Start
+from sb3_torcs.car import REST_HEIGHT, Controls, Start
 from sb3_torcs.errors import CarLost, InvalidOption
 from sb3_torcs.tracks.track import Grid, Track
 
@@ -97,9 +97,9 @@ def test_combined_slip_takes_braking_from_cornering(world):
 
 def test_downforce_presses_the_body_into_its_springs(world):
     cars = drive(world, GAS, 150, Start(20.0, 0.0, 0.0, 30.0))
-    assert cars[-1].height < cars[0].height < figures.CG_HEIGHT
+    assert cars[-1].height < cars[0].height < REST_HEIGHT
     assert cars[-1].speed_z < 0.0
-    sunk = figures.CG_HEIGHT - cars[-1].height
+    sunk = REST_HEIGHT - cars[-1].height
     assert sunk == pytest.approx(0.001, abs=0.001)  # [m] stiff springs: a millimetre
 
 

@@ -9,14 +9,13 @@ import numpy as np
 import pytest
 from conftest import car_state, plainly_encoded
 
-from sb3_torcs.car import CarState, range_finder_angles
+from sb3_torcs.car import REST_HEIGHT, CarState, range_finder_angles
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.sensors import (
     OBSERVATION_HIGH,
     OBSERVATION_LOW,
     OBSERVATION_SIZE,
     SENSORS,
-    USUAL_HEIGHT,
     View,
     encode,
     feature_slices,
@@ -126,7 +125,7 @@ def test_other_range_finders_are_refused(choice):
 
 def test_motion_tells_how_fast_the_car_turns_and_how_high_it_is():
     view = View(("base", "motion"))
-    light = car_state(yaw_rate=-0.5, height=USUAL_HEIGHT + 0.1)
+    light = car_state(yaw_rate=-0.5, height=REST_HEIGHT + 0.1)
     np.testing.assert_allclose(view.encode(light, None)[OBSERVATION_SIZE:], [-0.5, 1.0])
     thrown = car_state(yaw_rate=90.0, height=-3.0)
     assert view.encode(thrown, None)[OBSERVATION_SIZE:].tolist() == [5.0, -5.0]

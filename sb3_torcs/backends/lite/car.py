@@ -12,14 +12,15 @@ import numpy as np
 from numba import njit
 
 from sb3_torcs.actions import SHIFT_UP, automatic_gear, launch_clutch
-from sb3_torcs.car import CAR_LENGTH, CAR_WIDTH, LIMITER_RPM, RPM
+from sb3_torcs.car import CAR_LENGTH, CAR_WIDTH, LIMITER_RPM, REST_HEIGHT, RPM
 
 GRAVITY = 9.80665  # [m/s²]
 
 # Body
 FUEL = 94.0  # [l] a full tank, 1 kg per litre in TORCS
 MASS = 1150.0 + FUEL  # [kg]
-CG_HEIGHT = 0.25  # [m]
+CG_HEIGHT = 0.25  # [m] in the car file's frame, which weight shifts by
+SEEN_HEIGHT = REST_HEIGHT  # [m] over the road, as the game tells it, before the springs give
 FRONT_WEIGHT = 0.52  # share of the weight on the front axle
 INERTIA_ARM = 0.62**2 * CAR_LENGTH**2 + CAR_WIDTH**2  # [m²] "mass repartition coefficient" 0.62
 YAW_INERTIA = MASS * INERTIA_ARM / 12.0  # [kg m²]

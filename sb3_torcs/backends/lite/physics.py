@@ -402,7 +402,7 @@ def read(
     scalars[5] = state[VX] * cos_yaw + state[VY] * sin_yaw
     scalars[6] = state[VY] * cos_yaw - state[VX] * sin_yaw
     scalars[7] = -state[SINK_RATE]  # the road is flat, but downforce presses the springs
-    scalars[8] = car.CG_HEIGHT - state[SINK]
+    scalars[8] = car.SEEN_HEIGHT - state[SINK]
     scalars[9] = wrap(state[TANGENT] - yaw)
     scalars[10] = state[OFFSET]
     scalars[11] = width
