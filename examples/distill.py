@@ -17,7 +17,8 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import nn
 
-from sb3_torcs.agents.model_file import learned_weights
+from sb3_torcs.agents.model_algorithm import told_algorithm
+from sb3_torcs.agents.model_file import learned_weights, saved_data
 from sb3_torcs.agents.model_record import DRIVEN_WITH
 from sb3_torcs.agents.model_writing import recipe, write_record
 from sb3_torcs.agents.models import driver_record, find_model
@@ -63,6 +64,9 @@ class School:
 
     def __init__(self, args: argparse.Namespace) -> None:
         teaching = [(names.split(","), tracks) for names, *tracks in args.teach]
+        for names, tracks in teaching:
+            if not tracks:
+                raise SystemExit(f"{','.join(names)} teaches nowhere; name its tracks behind it")
         self.env_kwargs = _same_for_all([name for names, _ in teaching for name in names])
         self.tracks = list(dict.fromkeys(track for _, tracks in teaching for track in tracks))
         parts, self._teachers = [], []
@@ -78,9 +82,7 @@ class School:
             )
             part.env_method("set_random_speed", 80.0)
             part.env_method("set_hard_starts", 0.7)
-            self._teachers.append(
-                [PPO.load(find_model(name), device="cpu").policy for name in names]
-            )
+            self._teachers.append([_policy(name) for name in names])
             parts.append(part)
         self._sizes = [part.num_envs for part in parts]
         cars = JoinedVecEnv(parts)
@@ -104,6 +106,14 @@ def _same_for_all(teachers: Sequence[str]) -> dict:
         if options != found[0]:
             raise SystemExit(f"{teacher} drives with {options}, and {teachers[0]} with {found[0]}")
     return found[0]
+
+
+def _policy(name: str) -> ActorCriticPolicy:
+    """Load the policy of a teacher."""
+    file = find_model(name)
+    if told_algorithm(saved_data(file)) != "ppo":
+        raise SystemExit(f"{name} is no model of PPO; give one, e.g. ppo-roads")
+    return PPO.load(file, device="cpu").policy
 
 
 def teach(model: PPO, school: School, args: argparse.Namespace) -> None:

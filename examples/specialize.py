@@ -11,7 +11,8 @@ from pathlib import Path
 import torch as th
 from stable_baselines3 import PPO
 
-from sb3_torcs.agents.model_file import learned_weights
+from sb3_torcs.agents.model_algorithm import told_algorithm
+from sb3_torcs.agents.model_file import learned_weights, saved_data
 from sb3_torcs.agents.model_writing import RecordCallback, recipe
 from sb3_torcs.agents.models import driver_record, find_model
 from sb3_torcs.callbacks import AdaptiveLearningRateCallback, LeanUpdatesCallback
@@ -43,6 +44,8 @@ def specialize(args: argparse.Namespace, track: str) -> Path:
     cars.env_method("set_random_speed", 80.0)
     cars.env_method("set_hard_starts", 0.5)
     file = find_model(args.driver)
+    if told_algorithm(saved_data(file)) != "ppo":
+        raise SystemExit(f"{args.driver} is no model of PPO; give one, e.g. ppo-roads")
     known = PPO.load(file, device="cpu")
     # A new learner, since shipped files hold no optimizer, and their learning rate has fallen.
     model = PPO(

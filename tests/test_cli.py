@@ -462,6 +462,28 @@ def test_an_agent_of_the_game_is_not_driven_elsewhere(capsys):
     assert "there is no TORCS in" in err
 
 
+@pytest.mark.usefixtures("no_game")
+@pytest.mark.parametrize("words", [
+    ("evaluate", "scripted", "--env", "TorcsLite-v0", "--track", "b-speedway"),
+    ("train", "--algo", "ppo", "--env", "TorcsLite-v0", "--track", "b-speedway"),
+    ("compare", "inferno", "scripted"),
+])  # fmt: skip
+def test_what_only_the_game_has_is_said_to_be_missing_with_it(capsys, words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    status, _, err = run(capsys, *words)
+    assert status == 2
+    assert "since TORCS was not found; type: `sb3-torcs install-torcs`" in err
+
+
+def test_a_deleted_working_folder_is_told(tmp_path):
+    folder = tmp_path / "gone"
+    folder.mkdir()
+    script = f"cd {folder}; rmdir {folder}; {sys.executable} -m sb3_torcs.cli evaluate scripted"
+    done = subprocess.run(["sh", "-c", script], capture_output=True, text=True)
+    said = "sb3-torcs: the working folder was deleted; go to another one\n"
+    assert (done.returncode, done.stdout, done.stderr) == (2, "", said)
+
+
 @pytest.mark.parametrize("folder", ["none", "~nobody-of-this-name"])
 def test_a_missing_model_is_told(capsys, folder):
     status, _, err = run(capsys, "evaluate", f"{folder}/best_model.zip")

@@ -120,6 +120,11 @@ def test_the_track_is_that_of_the_training(monkeypatch):
     assert asked == ["corkscrew", "aalborg", "forza"]
 
 
+def test_an_agent_that_learned_several_cars_drives_the_usual_one(game):
+    report = compare("ppo-cars", track="aalborg", laps=1)
+    assert {drive.car for drive in report.comparison.drives} == {"car1-trb1"}
+
+
 def test_what_is_wrong_with_a_later_driver_is_told_before_the_first_one_drives(monkeypatch, game):
     def refuse(driver, env, trust):
         if driver == "ppo-post":

@@ -173,6 +173,8 @@ class TestRefusals:
             (["racer", "--track", "lop"], "no track 'lop'; did you mean 'loop'?"),
             (["racer", "--with", "rcaer:3"], "no robot 'rcaer'; did you mean 'racer'?"),
             (["racer", "--game", "--telemetry", "x.csv"], "only; leave out --game"),
+            (["racer:3", "--index", "3"], "'racer:3' has an index already; leave out --index 3"),
+            ([], "--track is for a robot that drives; name one: robots inferno"),
         ],
     )
     def test_a_mistake_is_told_in_one_line(self, fake, capsys, words, message):

@@ -12,6 +12,7 @@ from sb3_torcs.errors import near_miss
     [
         ("aalbrog", "it has aalborg", "; did you mean 'aalborg'? it has aalborg"),
         ("aalbrog", "", "; did you mean 'aalborg'?"),
+        ("AALBORG", "", "; did you mean 'aalborg'?"),
         ("x", "it has aalborg", "; it has aalborg"),
         ("x", "", ""),
     ],

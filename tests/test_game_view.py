@@ -29,6 +29,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecVide
 from sb3_torcs.envs.torcs import TorcsEnv
 from sb3_torcs.envs.torcs_lite import OF_THE_GAME, TorcsLiteEnv
 from sb3_torcs.errors import DisplayUnavailable, EnvClosed, GameFailed, InvalidOption
+from sb3_torcs.evaluation.ticks import log_drives
 from sb3_torcs.torcs.window import VIEWS
 
 TORCS = "sb3_torcs:Torcs-v0"
@@ -246,6 +247,12 @@ def test_a_wrapper_records_it(tmp_path):
     env.close()
     video = str(*tmp_path.glob("videos/*.mp4"))
     assert imageio_ffmpeg.count_frames_and_secs(video) == (4, 8.0)
+
+
+def test_an_evaluation_that_notes_its_drive_draws_it(env):
+    log_drives(env, "anybody")
+    env.reset(seed=0)
+    assert is_a_picture(drive(env, 5))
 
 
 def test_a_wrapper_observes_it():

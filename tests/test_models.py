@@ -180,6 +180,14 @@ def test_a_missing_model_is_told_the_near_miss(saved):
         models.find_model(path.parent / "TorcsLite-v00.zip")
 
 
+@pytest.mark.parametrize("name", ["", " "])
+def test_an_empty_name_is_not_the_working_folder(saved, name, monkeypatch):
+    _, path = saved
+    monkeypatch.chdir(path.parent)
+    with pytest.raises(InvalidOption, match=f"'{name}' names no model; give the .zip"):
+        models.find_model(name)
+
+
 def test_an_empty_folder_holds_no_model(tmp_path):
     with pytest.raises(InvalidOption, match="holds no model"):
         models.find_model(tmp_path)
@@ -319,6 +327,12 @@ def test_a_model_that_is_given_other_options_is_told_its_own(capsys):
     assert "it learned there with action_repeat=5, range_finders='narrow', " in said
     assert "action='pedal'" in said
     assert said.endswith("; give it the same\n")
+
+
+def test_a_model_that_is_given_other_sensors_is_told_the_usual_ones(capsys):
+    words = ["evaluate", "ddpg-aalborg", "--env-kwargs", "sensors=[base,line]"]
+    assert main(words) == 2
+    assert "sensors=['base'], action='pedals'; give it the same" in capsys.readouterr().err
 
 
 def test_a_model_of_stacked_frames_without_a_record_is_told_what_to_write(env, tmp_path):

@@ -207,6 +207,13 @@ def test_a_ghost_is_read_as_it_was_written(ghost, file):
     assert [path.name for path in file.parent.iterdir()] == ["ghost.npz"]
 
 
+def test_a_ghost_drives_no_more_laps_than_it_has(ghost, file):
+    kwargs = {**ghost.env_kwargs, "laps": 4}
+    with gym.make("Torcs-v0", **kwargs) as env:
+        with pytest.raises(ModelMismatch, match="drove 3 laps, so it cannot drive 4"):
+            load_driver(file, env)
+
+
 def broken(kind, path):
     """Write a file that is no ghost."""
     if kind == "text":

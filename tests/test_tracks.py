@@ -224,6 +224,10 @@ class TestLoading:
 
 
 class TestCompactFile:
+    def test_a_spreadsheets_mark_before_the_text_is_no_part_of_it(self, tmp_path):
+        track = read_track_file(write(tmp_path, "\ufeff" + SMALL))
+        assert track.name == "ring"
+
     def test_a_file_says_what_it_says(self, tmp_path):
         track = read_track_file(write(tmp_path, SMALL))
         assert (track.name, track.category, track.source) == ("ring", "oval", "file")

@@ -41,6 +41,7 @@ from sb3_torcs.errors import (
     near_miss,
 )
 from sb3_torcs.sensors import choice_within
+from sb3_torcs.torcs.installation import INSTALL
 
 if TYPE_CHECKING:
     from sb3_torcs.torcs.installation import Game
@@ -80,6 +81,12 @@ def find_model(path: str | Path, *, prefer_last: bool = False) -> Path:
     :raises InvalidOption: if there is none
     """
     given = Path(os.path.expanduser(path))
+    advice = (
+        "give the .zip that a training saved, the folder of its run, or a shipped agent: "
+        f"{', '.join(shipped_agents())}"
+    )
+    if not str(path).strip():  # which would be the present folder
+        raise InvalidOption(f"{str(path)!r} names no model; {advice}")
     if given.is_file():
         return given
     if Path(f"{given}.zip").is_file():
@@ -88,10 +95,6 @@ def find_model(path: str | Path, *, prefer_last: bool = False) -> Path:
         given = AGENTS / str(path)
     if not given.is_dir():
         known = [*(file.name for file in given.parent.glob("*.zip")), *shipped_agents()]
-        advice = (
-            "give the .zip that a training saved, the folder of its run, or a shipped agent: "
-            f"{', '.join(shipped_agents())}"
-        )
         raise InvalidOption(f"there is no model '{given}'{near_miss(given.name, known, advice)}")
     best = given / BEST_MODEL
     last = [
@@ -153,7 +156,10 @@ def agent_record(driver: str | Path, game: Game | None) -> TrainingRecord:
     try:
         return driver_record(driver)
     except InvalidOption as error:
-        hint = near_miss(str(driver), () if game is None else game.robots())
+        if game is None:
+            missing = "there are no robots, since TORCS was not found"
+            raise InvalidOption(f"{error}; and {missing}; type: {INSTALL}") from None
+        hint = near_miss(str(driver), game.robots())
         raise InvalidOption(f"{error}; and there is no robot '{driver}'{hint}") from None
 
 
@@ -248,7 +254,7 @@ def check_spaces(
         option = _option_of(has)
         if record.env_id == name:
             said = ", ".join(f"{key}={value!r}" for key, value in _task(record).items())
-            advice = f"it learned there with {said or 'the defaults'}; give it the same"
+            advice = f"it learned there with {said}; give it the same"
         elif record.known or (frames_seen is None and option is None):
             advice = (
                 "give the --env that it was trained on, or train a model for this one: sb3-torcs "
@@ -275,7 +281,9 @@ def _task(record: TrainingRecord) -> dict[str, Any]:
     """Collect what of a training decides on the layout of observations and actions."""
     wrappers = ("env_wrapper", "frame_stack")
     found = {key: record.hyperparameters[key] for key in wrappers if key in record.hyperparameters}
-    return {**record.kept(DRIVEN_WITH), **found}
+    kept = record.kept(DRIVEN_WITH)
+    usual = {"sensors": ["base"], "action": "pedals"}  # what else may have been given here
+    return {**kept, **{key: value for key, value in usual.items() if key not in kept}, **found}
 
 
 def _option_of(space: spaces.Space[Any]) -> str | None:

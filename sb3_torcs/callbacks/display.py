@@ -100,7 +100,7 @@ class Display:
         head.add_column()
         head.add_column(ratio=1)
         head.add_column()
-        share = f"{100 * timesteps // max(self._total, 1):3d}%"
+        share = f"{min(100 * timesteps // max(self._total, 1), 100):3d}%"
         head.add_row(share, self._bar, f"{timesteps}/{self._total} timesteps")
         parts: list[RenderableType] = [head, Text(text, no_wrap=True, overflow="ellipsis")]
         if distances and not self._console.options.ascii_only:

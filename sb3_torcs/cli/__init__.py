@@ -78,6 +78,11 @@ def _parsed(words: list[str]) -> argparse.Namespace | None:
 def _run(args: argparse.Namespace) -> int:
     """Run a verb; print an error as one line."""
     try:
+        os.getcwd()
+    except FileNotFoundError:
+        print("sb3-torcs: the working folder was deleted; go to another one", file=sys.stderr)
+        return USAGE_ERROR
+    try:
         # Under nohup, SIGHUP is ignored and stays so.
         ends = [n for n in (SIGTERM, SIGHUP) if signal.getsignal(n) == signal.SIG_DFL]
         with answered(_end, *ends):

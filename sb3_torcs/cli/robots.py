@@ -20,6 +20,11 @@ __all__ = ["add_parser", "run"]
 
 ROBOT_HEADERS = ("robot", "index", "name", "car")
 
+DRIVING = {
+    "index": None, "track": "aalborg", "laps": 3, "rivals": None, "game": False, "telemetry": None,
+}  # fmt: skip
+"""Options of a drive, and what they are if they are not given."""
+
 DESCRIPTION = """\
 List the installed robots. With NAME, let one of them drive: alone in a practice session, or in a
 race against the robots that --with names.
@@ -43,8 +48,9 @@ def add_parser(subparsers: Any) -> None:
     add("name", nargs="?", metavar="NAME", help="the robot, e.g. inferno")
     add("--index", type=natural, metavar="I",
         help=f"which of the robot's drivers; default: that of {DEFAULT_CAR}")  # fmt: skip
-    add("--track", default="aalborg", metavar="T", help="the track; default: aalborg")
-    add("--laps", type=positive, default=3, metavar="N", help="laps to drive; default: 3")
+    add("--track", default=DRIVING["track"], metavar="T", help="the track; default: aalborg")
+    add("--laps", type=positive, default=DRIVING["laps"], metavar="N",
+        help="laps to drive; default: 3")  # fmt: skip
     add("--with", dest="rivals", metavar="NAME:I,…",
         help="robots to race against; they start behind")  # fmt: skip
     add("--game", action="store_true", help="run the race in the game's text mode")
@@ -68,8 +74,11 @@ def run(args: argparse.Namespace) -> int:
 
     game = find_game()
     if args.name is None:
+        _check_only_listed(args)
         _list(game, args.json)
         return 0
+    if args.index is not None and ":" in args.name:
+        raise InvalidOption(f"'{args.name}' has an index already; leave out --index {args.index}")
     if args.telemetry is not None and args.game:
         raise InvalidOption("--telemetry is written by the engine only; leave out --game")
     telemetry = None
@@ -89,6 +98,16 @@ def run(args: argparse.Namespace) -> int:
     if telemetry is not None:
         print(f"telemetry: {telemetry}")
     return 0
+
+
+def _check_only_listed(args: argparse.Namespace) -> None:
+    """Refuse options of a drive where no robot is named: robots are only listed."""
+    from sb3_torcs.errors import InvalidOption
+
+    for name, usual in DRIVING.items():
+        if getattr(args, name) != usual:
+            option = f"--{'with' if name == 'rivals' else name}"
+            raise InvalidOption(f"{option} is for a robot that drives; name one: robots inferno")
 
 
 def _list(game: Game, as_json: bool) -> None:

@@ -223,14 +223,14 @@ class TorcsEnv(RacingEnv):
         if self.picture != "game" or self.render_mode is None:
             return super().render()
         self.check_ready("render")
-        assert isinstance(self.backend, NativeBackend), "the constructor refuses others"
-        appearance = self.backend.engine.appearance()
+        backend: Any = self.backend  # a NativeBackend, perhaps in one that notes its drives
+        appearance = backend.engine.appearance()
         if self._viewer is None:
             from sb3_torcs.rendering.game_camera import (
                 GameView,
             )  # imported here because graphics take long to load
 
-            self._viewer = GameView(find_game(), self.backend.race_setup(), self._window)
+            self._viewer = GameView(find_game(), backend.race_setup(), self._window)
         try:
             frame: npt.NDArray[np.uint8] = self._viewer.frame(appearance)
         except BaseException:  # also Ctrl-C: the picture that was requested may still arrive

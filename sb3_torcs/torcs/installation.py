@@ -134,10 +134,13 @@ class Game:
         :param name: e.g. ``"car1-trb1"``
         :return: the file
         :raises UnknownCar: if there is none of this name
+        :raises InvalidOption: if that is no name
         """
+        if not isinstance(name, str):
+            raise InvalidOption(f"car is {name!r}; expected the name of one, e.g. '{DEFAULT_CAR}'")
         cars = self.cars()
-        if not isinstance(name, str) or name not in cars:
-            hint = near_miss(str(name), cars, f"it has {', '.join(cars)}")
+        if name not in cars:
+            hint = near_miss(name, cars, f"it has {', '.join(cars)}")
             raise UnknownCar(f"the game at {self.data} has no car '{name}'{hint}")
         return cars[name]
 

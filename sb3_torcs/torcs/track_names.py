@@ -69,7 +69,12 @@ def find_track(track: str | os.PathLike[str] | TrackFile, game: Game | None = No
     if game is not None:
         _refuse_half_a_track(name, game)
     names = [word for full in known for word in (full.rpartition("/")[2], full)]
-    where = "" if game is None else f"; Torcs-v0 has those of {game.data}, and TORCS's {XML} files"
+    if game is not None:
+        where = f"; Torcs-v0 has those of {game.data}, and TORCS's {XML} files"
+    elif not torcs_folders():
+        where = f"; those of the game are missing, since TORCS was not found; type: {INSTALL}"
+    else:
+        where = ""
     raise TrackNotFound(f"no track '{name}'{near_miss(name, names, LISTED)}{where}")
 
 

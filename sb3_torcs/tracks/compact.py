@@ -182,7 +182,7 @@ def read_track_file(path: Path) -> Track:
     """
     reader = _Reader(path)
     try:
-        text = read_bounded(path).decode("utf-8")
+        text = read_bounded(path).decode("utf-8-sig")  # spreadsheets put a mark before the text
     except UnicodeDecodeError as error:
         raise TrackFileError(f"{path}: is not UTF-8 text: {error}") from error
     begun = False
