@@ -19,6 +19,7 @@ from sb3_torcs.callbacks.lines import DrivenLap, driven_laps
 from sb3_torcs.errors import OutputNotWritable
 from sb3_torcs.evaluation.protocol import World
 from sb3_torcs.races.entrants import find_entrants
+from sb3_torcs.studies.config import read_study
 from sb3_torcs.training import zoo
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
@@ -130,6 +131,43 @@ def test_everywhere_teaches_by_models_that_are_there_or_were_made_before(tmp_pat
         made |= {f"{folder}/{track}.zip" for track in given.get("track", ["model"])}
     assert sum("specialists" in model for model in made) == 22
     assert "logs/everywhere/model.zip" in made
+
+
+def test_students_for_any_road_learn_from_the_models_of_the_study(tmp_path):
+    """With commands that only write down what they are asked."""
+    asked = tmp_path / "asked"
+    for name in ("python", "sb3-torcs"):
+        command = tmp_path / name
+        command.write_text(f'#!/bin/sh\necho "$@" >> {asked}\n')
+        command.chmod(0o755)
+    path = {"PATH": f"{tmp_path}:/usr/bin:/bin"}
+    subprocess.run(["sh", EXAMPLES / "any_road.sh"], env=path, check=True)
+    study, *calls = asked.read_text().splitlines()
+    folder = study.rpartition(" ")[2]
+    trials = read_study(EXAMPLES / "studies" / "open_roads.yml").trials
+    teachers = [name for call in calls for name in re.findall(rf"{folder}/[^ ,]*", call)]
+    assert teachers == [f"{folder}/default-seed{seed}/best_model.zip" for seed in range(15)]
+    assert {trial.seed for trial in trials} == set(range(15))
+    learned = " ".join(trials[0].env_kwargs["track"])
+    assert sum(learned in call for call in calls) == 5 + 2  # each student, and two evaluations
+
+
+def test_tracks_are_driven_and_compared_with_robots(tmp_path, game):
+    program = [sys.executable, EXAMPLES / "evaluate_tracks.py", "ppo-roads", "--jobs=1"]
+    words = ["--track", "michigan", "g-track-1", "aalborg", "--without", "aalborg"]
+    done = subprocess.run([*program, *words], capture_output=True, text=True, check=True)
+    assert re.search(r"^michigan +3 ", done.stdout, re.MULTILINE)
+    assert "ppo-roads: completes 2 of 2, 2 without damage; median gap" in done.stdout
+
+
+@pytest.mark.parametrize(("name", "words", "message"), [
+    ("specialize.py", ["ddpg-roads", "--track", "forza"], "ddpg-roads is no model of PPO"),
+    ("distill.py", ["--teach", "ddpg-roads", "forza"], "ddpg-roads is no model of PPO"),
+    ("distill.py", ["--teach", "ppo-roads"], "ppo-roads teaches nowhere"),
+])  # fmt: skip
+def test_who_cannot_teach_is_told_so(name, words, message, monkeypatch, tmp_path, game):
+    with pytest.raises(SystemExit, match=message):
+        run(monkeypatch, name, *words, "--folder", str(tmp_path))
 
 
 def test_teachers_who_drive_differently_are_refused(monkeypatch, tmp_path):
