@@ -456,7 +456,8 @@ def test_a_list_of_time_limits_goes_round_the_races(make, game, agents):
         ({"opponents": None}, InvalidOption, "opponents is None; expected a list"),
         ({"opponents": 5}, InvalidOption, "opponents is 5; expected a list"),
         ({"sensor_noise": "off"}, InvalidOption, "sensor_noise is 'off'; expected True or False"),
-        ({"car": 5}, UnknownCar, "5"),
+        ({"car": 5}, InvalidOption, "car is 5; expected the name of"),
+        ({"car": "car5"}, UnknownCar, "no car 'car5'"),
     ],
 )
 def test_a_wrong_option_of_the_game_is_told(options, error, message):

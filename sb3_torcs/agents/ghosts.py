@@ -244,8 +244,8 @@ def check_fits(ghost: Ghost, env: gym.Env[Any, Any], name: str | Path) -> None:
                 f"the ghost '{name}' was driven with {what} {value!r}, not {has[what]!r}: its "
                 "actions fit no other race; search one there: sb3-torcs optimize-lap"
             )
-    laps, driven = env.get_wrapper_attr("laps"), len(ghost.lap_times)
-    if laps is not None and laps > driven:
+    laps, driven = env.get_wrapper_attr("laps"), ghost.env_kwargs.get("laps")
+    if laps is not None and driven is not None and laps > driven:
         raise ModelMismatch(
             f"the ghost '{name}' drove {driven} laps, so it cannot drive {laps}; ask for no more"
         )
