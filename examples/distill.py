@@ -69,8 +69,9 @@ class School:
                 raise SystemExit(f"{','.join(names)} teaches nowhere; name its tracks behind it")
         self.env_kwargs = _same_for_all([name for names, _ in teaching for name in names])
         self.tracks = list(dict.fromkeys(track for _, tracks in teaching for track in tracks))
-        parts, self._teachers = [], []
-        for names, tracks in teaching:
+        self._teachers = [[_policy(name) for name in names] for names, _ in teaching]
+        parts = []
+        for _, tracks in teaching:
             part = TorcsVecEnv(
                 args.cars * len(tracks),
                 threads=args.threads,
@@ -82,7 +83,6 @@ class School:
             )
             part.env_method("set_random_speed", 80.0)
             part.env_method("set_hard_starts", 0.7)
-            self._teachers.append([_policy(name) for name in names])
             parts.append(part)
         self._sizes = [part.num_envs for part in parts]
         cars = JoinedVecEnv(parts)

@@ -15,7 +15,7 @@ from sb3_torcs.car import DEFAULT_CAR
 from sb3_torcs.cli.common import table
 from sb3_torcs.evaluation import evaluate, race_environment
 from sb3_torcs.evaluation.ladder import ROBOTS, reference_laps
-from sb3_torcs.tracks.catalogue import available_tracks
+from sb3_torcs.tracks.catalogue import lasting_name, load_track, tracks_of
 
 HEADERS = ("track", "laps", "flying lap s", "best robot s", "gap %", "damage", "distance m")
 
@@ -61,15 +61,6 @@ def best_robot(track: str) -> float:
     return min((laps[robot] for robot in ROBOTS if robot in laps), default=nan)
 
 
-def chosen(names: list[str]) -> list[str]:
-    """Replace kinds of tracks by the names of their tracks."""
-    tracks = []
-    for name in names:
-        of_kind = [track.name for track in available_tracks() if track.category == name]
-        tracks += of_kind or [name]
-    return tracks
-
-
 def drive(model: str, track: str) -> Drive:
     """Drive three laps from the grid."""
     record = driver_record(model)
@@ -98,7 +89,9 @@ def summary(drives: list[Drive]) -> str:
 
 def main() -> None:
     args = parser.parse_args()
-    tracks = [track for track in chosen(args.track) if track not in args.without]
+    listed = [track for name in args.track for track in tracks_of(name)]
+    names = [lasting_name(load_track(track)) for track in listed]
+    tracks = [name for name in names if name not in args.without]
     if not tracks:
         parser.error("no track is left; name another --track")
     with ProcessPoolExecutor(args.jobs, mp_context=get_context("spawn")) as pool:

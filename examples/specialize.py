@@ -34,6 +34,9 @@ parser.add_argument("--folder", type=Path, default=Path("logs/specialists"))
 
 def specialize(args: argparse.Namespace, track: str) -> Path:
     """Go on learning on one track, and return the model's file."""
+    file = find_model(args.driver)
+    if told_algorithm(saved_data(file)) != "ppo":
+        raise SystemExit(f"{args.driver} is no model of PPO; give one, e.g. ppo-roads")
     trained = driver_record(args.driver).env_kwargs
     env_kwargs = {name: value for name, value in trained.items() if name not in NOT_DRIVING}
     env_kwargs["track"] = track
@@ -43,9 +46,6 @@ def specialize(args: argparse.Namespace, track: str) -> Path:
     )
     cars.env_method("set_random_speed", 80.0)
     cars.env_method("set_hard_starts", 0.5)
-    file = find_model(args.driver)
-    if told_algorithm(saved_data(file)) != "ppo":
-        raise SystemExit(f"{args.driver} is no model of PPO; give one, e.g. ppo-roads")
     known = PPO.load(file, device="cpu")
     # A new learner, since shipped files hold no optimizer, and their learning rate has fallen.
     model = PPO(

@@ -214,6 +214,8 @@ def near_miss(name: str, known: Iterable[str], advice: str = "") -> str:
     """
     Complete a message about an unknown name with the name that was probably meant, and advice.
 
+    Capital and small letters count as the same.
+
     :param name: what was typed
     :param known: the names that exist
     :param advice: what else to say

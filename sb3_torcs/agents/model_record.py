@@ -18,6 +18,7 @@ import yaml
 
 from sb3_torcs.agents.model_file import as_mismatch
 from sb3_torcs.agents.model_policy import Spaces, restored_space
+from sb3_torcs.car import DEFAULT_CAR
 from sb3_torcs.envs.aids import AIDS
 from sb3_torcs.errors import ModelMismatch
 from sb3_torcs.files import read_yaml
@@ -98,6 +99,12 @@ class TrainingRecord:
     def known(self) -> bool:
         """Whether any part is known."""
         return self != TrainingRecord()
+
+    @property
+    def one_car(self) -> str:
+        """The car to drive: that of the training, or the usual one if it had none or several."""
+        car = self.env_kwargs.get("car")
+        return car if isinstance(car, str) else DEFAULT_CAR
 
     def kept(self, names: Iterable[str]) -> dict[str, Any]:
         """

@@ -12,7 +12,7 @@ from sb3_torcs.agents.model_record import DRIVEN_WITH
 from sb3_torcs.agents.models import agent_record, load_driver
 from sb3_torcs.agents.wrapping import wrapped
 from sb3_torcs.backends.seats import SeatWorld, SharedRace
-from sb3_torcs.car import DEFAULT_CAR, FloatArray, range_finder_angles
+from sb3_torcs.car import FloatArray, range_finder_angles
 from sb3_torcs.envs.torcs_race import RaceCarEnv
 from sb3_torcs.errors import InvalidAction, InvalidOption, ModelMismatch
 from sb3_torcs.torcs.installation import find_game
@@ -38,8 +38,7 @@ class CarOfAnAgent:
         self.driver = driver
         self.record = agent_record(driver, find_game())
         kwargs = self.record.env_kwargs
-        car = kwargs.get("car", DEFAULT_CAR)
-        self.car: str = car if isinstance(car, str) else DEFAULT_CAR
+        self.car = self.record.one_car
         self.gearbox: str = kwargs.get("gearbox", "automatic")
         self.angles: FloatArray = range_finder_angles(kwargs.get("range_finders", "scr"))
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from sb3_torcs.agents.models import agent_record, driver_name, load_driver, one_of
 from sb3_torcs.agents.robots import drive_log
 from sb3_torcs.agents.rollout import drive
-from sb3_torcs.car import DEFAULT_CAR, checked_laps
+from sb3_torcs.car import checked_laps
 from sb3_torcs.errors import BackendUnavailable, DriveFileError, InvalidOption
 from sb3_torcs.evaluation.protocol import RACE_LAPS, choose_world, race_environment
 from sb3_torcs.evaluation.ticks import log_drives
@@ -216,11 +216,9 @@ def _ready(
     if robot is not None:
         return lambda: drives_of(drive_log([robot], track, laps).frame())
     record = agent_record(driver, _game())
-    car = record.env_kwargs.get("car", DEFAULT_CAR)
-    one_car = {"car": car if isinstance(car, str) else DEFAULT_CAR}  # it may have learned several
     env = race_environment(
         choose_world(driver, record.env_id, track).env_id,
-        {**record.env_kwargs, **one_car},
+        {**record.env_kwargs, "car": record.one_car},
         track,
         laps=laps,
         hyperparameters=record.hyperparameters,

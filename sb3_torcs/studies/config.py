@@ -24,7 +24,7 @@ from sb3_torcs.agents.model_algorithm import SBX
 from sb3_torcs.errors import StudyError, near_miss, with_new_names
 from sb3_torcs.files import listed, read_yaml
 from sb3_torcs.torcs.track_names import RANDOM_TRACK
-from sb3_torcs.tracks.catalogue import CATEGORIES, available_tracks, load_track
+from sb3_torcs.tracks.catalogue import CATEGORIES, load_track, tracks_of
 from sb3_torcs.training import zoo
 from sb3_torcs.training.zoo_data import as_data
 
@@ -289,18 +289,11 @@ def _tracks(value: Any, what: str) -> tuple[str, ...]:
     if not listed or not tracks:
         categories = ", ".join(f"'{category}'" for category in CATEGORIES)
         raise StudyError(f"{what} is {value!r}; expected a list of tracks, or of {categories}")
-    tracks = list(chain.from_iterable(map(_in_category, tracks)))
+    tracks = list(chain.from_iterable(map(tracks_of, tracks)))
     names = [track_name(track) for track in tracks]
     if len(set(names)) < len(names):
         raise StudyError(f"{what}: {', '.join(names)}: one is there twice; take it out")
     return tuple(tracks)
-
-
-def _in_category(name: str) -> list[str]:
-    """Return the tracks of a category; any other name stands for itself."""
-    if name not in CATEGORIES:
-        return [name]
-    return [f"{s.category}/{s.name}" for s in available_tracks() if s.category == name]
 
 
 def _united(one: Sequence[str], other: Sequence[str]) -> tuple[str, ...]:

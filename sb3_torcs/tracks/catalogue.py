@@ -19,7 +19,7 @@ from sb3_torcs.tracks.generator import random_track
 from sb3_torcs.tracks.torcs_xml import read_track_xml
 from sb3_torcs.tracks.track import Track, TrackSummary, closed
 
-__all__ = ["CATEGORIES", "available_tracks", "lasting_name", "load_track"]
+__all__ = ["CATEGORIES", "available_tracks", "lasting_name", "load_track", "tracks_of"]
 
 
 CATEGORIES = ("road", "oval", "dirt")
@@ -58,6 +58,18 @@ def available_tracks() -> list[TrackSummary]:
             else (len(CATEGORIES), entry.name)
         ),
     )
+
+
+def tracks_of(name: str) -> list[str]:
+    """
+    Replace the name of a category by its tracks.
+
+    :param name: of a category, e.g. ``"oval"``, or of a track
+    :return: ``category/name`` of each of its tracks; any other name stands for itself
+    """
+    if name not in CATEGORIES:
+        return [name]
+    return [f"{s.category}/{s.name}" for s in available_tracks() if s.category == name]
 
 
 def lasting_name(track: Track) -> str:
