@@ -12,7 +12,7 @@ from typing import Any
 
 import yaml
 
-from sb3_torcs.errors import OutputNotWritable
+from sb3_torcs.errors import OutputNotWritable, Sb3TorcsError
 
 __all__ = [
     "listed",
@@ -117,7 +117,7 @@ def whole_file(
         finally:
             with contextlib.suppress(OSError):  # no folder, no file
                 aside.unlink()
-    except OutputNotWritable:
+    except Sb3TorcsError:  # some are an OSError, too
         raise
     except OSError as error:
         raise OutputNotWritable(
@@ -152,7 +152,7 @@ def read_yaml(text: str, loader_class: type[yaml.SafeLoader] = yaml.SafeLoader) 
         raise yaml.YAMLError("it nests too deep, or an alias is within what it stands for") from (
             error
         )
-    except ValueError as error:  # of an invalid date or number
+    except (ValueError, LookupError, AttributeError) as error:  # a value that its tag does not fit
         raise yaml.YAMLError(str(error)) from error
     finally:
         loader.dispose()

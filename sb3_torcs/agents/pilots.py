@@ -130,11 +130,6 @@ class Pilots:
         self.failed.setdefault(number, str(error))
         self._race.seats[number].retire()
 
-    def close(self) -> None:
-        """Close the race."""
-        for env in self._envs:
-            env.close()
-
 
 class Crew:
     """

@@ -118,7 +118,11 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _search(args: argparse.Namespace, kwargs: dict[str, Any]) -> tuple[Ghost | None, State, bool]:
-    """Search until the budget is used up or somebody stops it; return the best, and whether."""
+    """
+    Search until the budget is used up or somebody stops it.
+
+    :return: the best lap, how far the search came, and whether it was stopped
+    """
     from sb3_torcs.training.lap_search import Budget, LapSearch
     from sb3_torcs.training.lap_starts import find_starts
 

@@ -27,7 +27,7 @@ from sb3_torcs.errors import CarLost, InvalidAction, InvalidOption
 from sb3_torcs.rewards import Term
 from sb3_torcs.sensors import View
 
-__all__ = ["Batch", "Timestep", "fleet_of"]
+__all__ = ["Batch", "Outcome", "fleet_of"]
 
 Counts = npt.NDArray[np.int64]
 
@@ -39,7 +39,7 @@ CAR_NUMBERS = CAR_RECORD.itemsize // 8
 NO_TERM = -1
 
 
-class Timestep(NamedTuple):
+class Outcome(NamedTuple):
     """The outcome of a timestep of all races."""
 
     before: FloatArray  # (n, 111) cars
@@ -91,7 +91,7 @@ class _Driven:
     :param race: index of the race
     """
 
-    def __init__(self, world: Backend, timestep: Timestep, race: int) -> None:
+    def __init__(self, world: Backend, timestep: Outcome, race: int) -> None:
         self._world, self._timestep, self._race = world, timestep, race
 
     def step(self, controls: Controls, ticks: int) -> CarState:
@@ -206,7 +206,7 @@ class Batch:
         )  # fmt: skip
         self._driven[race] = []
 
-    def step(self, asked: npt.NDArray[np.floating]) -> Timestep:
+    def step(self, asked: npt.NDArray[np.floating]) -> Outcome:
         """
         Hold an action in each race.
 
@@ -253,7 +253,7 @@ class Batch:
         self._cars, self._controls = after, controls
         for driven in self._driven:
             driven.append(parts)
-        return Timestep(
+        return Outcome(
             before,
             after,
             observations,
@@ -267,7 +267,7 @@ class Batch:
             {race: self._fleet.failure(race) for race in failed},
         )
 
-    def finish(self, race: int, timestep: Timestep, act: Callable[[], Any]) -> Any:
+    def finish(self, race: int, timestep: Outcome, act: Callable[[], Any]) -> Any:
         """
         Let an environment take the timestep itself, with all its wrappers, without driving again.
 

@@ -15,13 +15,13 @@ from sb3_torcs.car import CarState, Controls
 from sb3_torcs.evaluation.ticks import TickedWorld
 from sb3_torcs.telemetry import CONTROL_FIELDS, STATE_FIELDS, write_telemetry
 
-__all__ = ["Recorder", "Stretch", "Timestep", "best_stretch"]
+__all__ = ["Recorded", "Recorder", "Stretch", "best_stretch"]
 
 VIDEO_TICKS = 2  # control ticks per frame: 25 frames per second, in real time
 VIDEO_FPS = 25
 
 
-class Timestep(NamedTuple):
+class Recorded(NamedTuple):
     """One timestep of a recorded drive."""
 
     action: npt.NDArray[np.float32]
@@ -38,7 +38,7 @@ class Stretch(NamedTuple):
     last: int  # exclusive
 
 
-def best_stretch(episodes: list[list[Timestep]]) -> Stretch:
+def best_stretch(episodes: list[list[Recorded]]) -> Stretch:
     """
     Find the fastest whole lap, or the longest drive if there is none.
 
@@ -71,7 +71,7 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
 
     def __init__(self, env_id: str, kwargs: dict[str, Any], max_episode_steps: int) -> None:
         self.env_id = env_id
-        self.episodes: list[list[Timestep]] = []
+        self.episodes: list[list[Recorded]] = []
         self._kwargs = kwargs
         self._limit = max_episode_steps
         self._seed: int | None = None
@@ -101,7 +101,7 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
         result = self.env.step(action)
         info = result[4]
         controls = self.get_wrapper_attr("controls")
-        self.episodes[-1].append(Timestep(action, info["car"], info["lap_time"], controls))
+        self.episodes[-1].append(Recorded(action, info["car"], info["lap_time"], controls))
         return result
 
     def names(self) -> dict[str, str]:

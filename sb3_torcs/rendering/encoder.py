@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from rich.progress import (
 )
 
 from sb3_torcs.errors import InvalidOption, OutputNotWritable
+from sb3_torcs.files import whole_file
 
 __all__ = ["PHOTOGRAPHIC", "write_video"]
 
@@ -43,6 +44,7 @@ PHOTOGRAPHIC: Mapping[str, Any] = {
 """For pictures that look like photographs: a quarter of the size, in a third of the time."""
 
 INDEX = b"moov"  # the name of its box in an mp4 file
+ADVICE = "choose a file in a folder that you may write to"
 BEGINNING = 64  # [bytes] that hold the names of the first boxes
 
 
@@ -75,30 +77,14 @@ def write_video(
     path = Path(path)
     if path.suffix.lower() != ".mp4":
         raise InvalidOption(f"the video's name is '{path}'; expected a name that ends in '.mp4'")
-    part = path.with_name(f".{path.stem}.{os.getpid()}.part.mp4")
-    try:
-        _claim(path, part)
-        with _progress(path.name, total, share) as advance:
-            _encode(path, part, frames, fps, advance, encoding)
-        part.replace(path)
-    finally:
-        with suppress(OSError):  # no folder, no part
-            part.unlink()
+    if path.is_dir():
+        raise OutputNotWritable(f"cannot write the video '{path}': it is a folder; {ADVICE}")
+    with (
+        whole_file(path, ADVICE, parents=True) as part,
+        _progress(path.name, total, share) as advance,
+    ):
+        _encode(path, part, frames, fps, advance, encoding)
     return path
-
-
-def _claim(path: Path, part: Path) -> None:
-    """Make the folder and an empty file in it, so that an error comes before any work."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if path.is_dir():
-            raise IsADirectoryError(f"'{path}' is a folder")
-        part.touch()
-    except OSError as error:
-        raise OutputNotWritable(
-            f"cannot write the video '{path}': {error.strerror or error}; "
-            "choose a file in a folder that you may write to"
-        ) from error
 
 
 @contextmanager

@@ -36,7 +36,7 @@ GEARS = {-1: "R", 0: "N"}
 
 def lap_clock(seconds: float) -> str:
     """
-    Format a lap time, e.g. ``1:23.456``.
+    Format a lap time to the hundredth, e.g. ``1:23.46``.
 
     :param seconds: the time [s]
     """

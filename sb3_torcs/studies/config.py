@@ -28,7 +28,7 @@ from sb3_torcs.tracks.catalogue import CATEGORIES, load_track, tracks_of
 from sb3_torcs.training import zoo
 from sb3_torcs.training.zoo_data import as_data
 
-__all__ = ["FIELDS", "Study", "Trial", "merged", "read_study", "track_name"]
+__all__ = ["FIELDS", "Study", "Trial", "merged", "read_study", "track_name", "trial_name"]
 
 REQUIRED = ("name", "seeds", "eval_interval")
 SOURCE = (
@@ -66,7 +66,7 @@ class Trial:
     @property
     def name(self) -> str:
         """What its folder is called."""
-        return f"{slug(self.variant)}-seed{self.seed}"
+        return trial_name(self.variant, self.seed)
 
     @property
     def budget(self) -> int:
@@ -163,6 +163,16 @@ def track_name(track: str) -> str:
     :return: the name without category
     """
     return track if track == RANDOM_TRACK else load_track(track).name
+
+
+def trial_name(variant: str, seed: int) -> str:
+    """
+    Return what the folder of a trial is called.
+
+    :param variant: of the study
+    :param seed: of the trial
+    """
+    return f"{slug(variant)}-seed{seed}"
 
 
 def slug(text: str) -> str:

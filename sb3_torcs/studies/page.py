@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_torcs.studies.config import slug
+from sb3_torcs.studies.config import trial_name
 from sb3_torcs.studies.estimates import Array, Estimate, estimate, share
 from sb3_torcs.studies.pictures import PANELS, curves_of
 from sb3_torcs.studies.results import Results
@@ -134,11 +135,13 @@ def _links(variants: Mapping[str, Sequence[Results]], folder: Path, output: Path
     rows: list[list[Cell | str]] = []
     for variant, group in variants.items():
         for trial in group:
-            home = folder / f"{slug(variant)}-seed{trial.seed}"
+            home = folder / trial_name(variant, trial.seed)
             cells = [_link(home / file, what, output) for what, file in BESIDE.items()]
             rows.append([f"{variant}, {trial.seed}", *cells])
-    example = folder / f"{slug(next(iter(variants)))}-seed{next(iter(variants.values()))[0].seed}"
-    how = f"sb3-torcs evaluate {example} --report {example}/lap.html --video {example}/lap.mp4"
+    variant, group = next(iter(variants.items()))
+    example = folder / trial_name(variant, group[0].seed)
+    report, video = f"{example}/lap.html", f"{example}/lap.mp4"
+    how = shlex.join(["sb3-torcs", "evaluate", str(example), "--report", report, "--video", video])
     told = f"A seed's lap report and video are made by: {how}. Then write this page again."
     return [table(["variant, seed", *BESIDE], [rows], words=3), paragraph(told, "note")]
 

@@ -15,13 +15,13 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from xml.etree import ElementTree
 from xml.parsers import expat
 
 from sb3_torcs.errors import TrackFileError
 
-__all__ = ["Node", "Section", "digests", "read_bounded", "read_params"]
+__all__ = ["Keys", "Node", "Section", "digests", "read_bounded", "read_params"]
 
 UNITS = {  # to SI; foot and rpm are TORCS's own
     "m": 1.0,
@@ -78,6 +78,31 @@ class Section:
         for name in names:
             section = section.children.get(name) or Section(section.place)
         return section
+
+
+class Keys(NamedTuple):
+    """Values of a section whose names have a common beginning."""
+
+    section: Section
+    prefix: str
+
+    def number(self, name: str, default: float) -> float:
+        """
+        Return a number.
+
+        :param name: after the prefix
+        :param default: if it is not there
+        """
+        return self.section.numbers.get(self.prefix + name, default)
+
+    def text(self, name: str, default: str = "") -> str:
+        """
+        Return a text.
+
+        :param name: after the prefix
+        :param default: if it is not there
+        """
+        return self.section.texts.get(self.prefix + name, default)
 
 
 class _Parser:

@@ -7,10 +7,9 @@ crashes where there is none. Worlds have no use for pits yet, so that nothing el
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 from sb3_torcs.errors import TrackFileError
-from sb3_torcs.torcs.params import Section
+from sb3_torcs.torcs.params import Keys, Section
 from sb3_torcs.tracks.track import Segment
 
 __all__ = ["check_pits"]
@@ -18,22 +17,6 @@ __all__ = ["check_pits"]
 LEFT, RIGHT = "left", "right"
 SHORTEST_PIT = 1.0  # [m]
 PLACES = ("entry", "start", "end", "exit")
-
-
-class _Pits(NamedTuple):
-    """Where a file says that the pits are."""
-
-    section: Section
-    prefix: str  # of the values' names
-
-    def text(self, name: str, default: str = "") -> str:
-        """
-        Return a text.
-
-        :param name: after the prefix
-        :param default: if it is not there
-        """
-        return self.section.texts.get(self.prefix + name, default)
 
 
 def check_pits(main: Section, version: int, names: Sequence[str], steps: Sequence[Segment]) -> None:
@@ -46,13 +29,13 @@ def check_pits(main: Section, version: int, names: Sequence[str], steps: Sequenc
     :param steps: of the road, as the game's loader cuts it
     :raises TrackFileError: naming the place
     """
-    pits = _Pits(main.child("Pits"), "") if version >= 4 else _Pits(main, "pit ")
+    pits = Keys(main.child("Pits"), "") if version >= 4 else Keys(main, "pit ")
     if version < 4 and pits.text("type", "no pit") == "no pit":
         return
     places = [pits.text(name) for name in PLACES]
     if not all(place in names for place in places):
         return  # the game then has no pits
-    length = pits.section.numbers.get(f"{pits.prefix}length", 15.0)
+    length = pits.number("length", 15.0)
     if length < SHORTEST_PIT:
         raise TrackFileError(
             f"{pits.section.place}: pits of {length:g} m; at least {SHORTEST_PIT:g} m are "

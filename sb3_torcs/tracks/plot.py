@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sb3_torcs.car import FloatArray
-from sb3_torcs.tracks.track import CURVATURE, LENGTH, Pose, Track
+from sb3_torcs.tracks.track import CURVATURE, LENGTH, Track
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -136,28 +136,13 @@ def _draw_start(axes: Axes, track: Track) -> None:
     scale = 0.05 * float(np.ptp(edges(track)[0], axis=0).max())
     places = [track.pose(0.0, offset)[:2] for offset in (half, -half)]
     axes.plot(*np.array(places).T, color=START_COLOUR, linewidth=2.5, solid_capstyle="butt")
-    tail = _beside(track.pose(0.0), half + 0.6 * scale)
+    tail = track.pose(0.0, half + 0.6 * scale)
     tip = (tail.x + scale * math.cos(tail.heading), tail.y + scale * math.sin(tail.heading))
     axes.annotate(
         "",
         xy=tip,
         xytext=tail[:2],
         arrowprops={"arrowstyle": "-|>", "color": START_COLOUR, "linewidth": 2.0},
-    )
-
-
-def _beside(pose: Pose, offset: float) -> Pose:
-    """
-    Step sideways.
-
-    :param pose: to start from
-    :param offset: how far to the left [m]
-    :return: the same direction, there
-    """
-    return Pose(
-        pose.x - offset * math.sin(pose.heading),
-        pose.y + offset * math.cos(pose.heading),
-        pose.heading,
     )
 
 

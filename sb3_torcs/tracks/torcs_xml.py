@@ -24,7 +24,7 @@ import numpy as np
 
 from sb3_torcs.errors import TrackFileError
 from sb3_torcs.torcs.installation import torcs_folders
-from sb3_torcs.torcs.params import Section, read_params
+from sb3_torcs.torcs.params import Keys, Section, read_params
 from sb3_torcs.tracks.pits import check_pits
 from sb3_torcs.tracks.track import Grid, Segment, Surface, Track
 
@@ -84,7 +84,7 @@ class _Builder:
         self.material = self.main.texts.get("surface", "asphalt")
         self.verges = {side: _Verge(side) for side in (LEFT, RIGHT)}
         for verge in self.verges.values():
-            verge.end_width = self._of(self.main, verge, "side").width("width", 0.0)
+            verge.end_width = _width(self._of(self.main, verge, "side"), "width", 0.0)
             self._update(self.main, verge)
         self.segments: list[Segment] = []
         self.fine: list[Segment] = []
@@ -92,11 +92,11 @@ class _Builder:
         self.names: list[str] = []
         """Of the segments that these steps are of."""
 
-    def _of(self, section: Section, verge: _Verge, part: str) -> _Keys:
+    def _of(self, section: Section, verge: _Verge, part: str) -> Keys:
         """Find what a section says of a part of the verge."""
         if self.version >= 4:
-            return _Keys(section.child(f"{verge.side.title()} {part.title()}"), "")
-        return _Keys(section, f"{verge.side[0]}{part} ")
+            return Keys(section.child(f"{verge.side.title()} {part.title()}"), "")
+        return Keys(section, f"{verge.side[0]}{part} ")
 
     def _update(self, section: Section, verge: _Verge) -> None:
         """
@@ -109,7 +109,7 @@ class _Builder:
         # Version 3 knows one barrier for the whole track.
         barrier = self._of(section if self.version >= 4 else self.main, verge, "barrier")
         verge.material = self._of(section, verge, "side").text("surface", verge.material)
-        verge.border_width = border.width("width", verge.border_width)
+        verge.border_width = _width(border, "width", verge.border_width)
         verge.border_material = border.text("surface", verge.border_material)
         verge.barrier_material = barrier.text("surface", verge.barrier_material)
 
@@ -123,9 +123,9 @@ class _Builder:
         """
         self._update(section, verge)
         side = self._of(section, verge, "side")
-        start = side.width("start width", verge.end_width)
-        end = start if self.version < 4 else side.width("width", start)
-        end = side.width("end width", end)
+        start = _width(side, "start width", verge.end_width)
+        end = start if self.version < 4 else _width(side, "width", start)
+        end = _width(side, "end width", end)
         verge.end_width = end
         border = verge.border_width
         wider = verge.material if start + end >= 2.0 * border else verge.border_material
@@ -269,44 +269,21 @@ def _quotient(length: float, step_length: float) -> int:
     return int(np.float32(length) / np.float32(step_length))
 
 
-class _Keys(NamedTuple):
-    """Values of a section whose names have a common beginning."""
+def _width(keys: Keys, name: str, default: float) -> float:
+    """
+    Read a width, which cannot be negative: the game's loader crashes at some that are.
 
-    section: Section
-    prefix: str
-
-    def number(self, name: str, default: float) -> float:
-        """
-        Return a number.
-
-        :param name: after the prefix
-        :param default: if it is not there
-        """
-        return self.section.numbers.get(self.prefix + name, default)
-
-    def width(self, name: str, default: float) -> float:
-        """
-        Return a width, which cannot be negative: the game's loader crashes at some that are.
-
-        :param name: after the prefix
-        :param default: if it is not there [m]
-        """
-        width = self.number(name, default)
-        if not 0.0 <= width <= MAX_WIDTH:
-            raise TrackFileError(
-                f"{self.section.place}: '{self.prefix}{name}' is {width:g} m; 0 to {MAX_WIDTH:g} "
-                "is allowed"
-            )
-        return width
-
-    def text(self, name: str, default: str) -> str:
-        """
-        Return a text.
-
-        :param name: after the prefix
-        :param default: if it is not there
-        """
-        return self.section.texts.get(self.prefix + name, default)
+    :param keys: of a part beside the road
+    :param name: after the prefix
+    :param default: if it is not there [m]
+    """
+    width = keys.number(name, default)
+    if not 0.0 <= width <= MAX_WIDTH:
+        raise TrackFileError(
+            f"{keys.section.place}: '{keys.prefix}{name}' is {width:g} m; 0 to {MAX_WIDTH:g} "
+            "is allowed"
+        )
+    return width
 
 
 def _positive(section: Section, name: str) -> float:

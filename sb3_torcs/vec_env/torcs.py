@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepR
 from sb3_torcs.backends.seats import Seat, SharedRace
 from sb3_torcs.backends.several import shared_worlds
 from sb3_torcs.car import check_count, is_count
-from sb3_torcs.envs.batch import Batch, Timestep
+from sb3_torcs.envs.batch import Batch, Outcome
 from sb3_torcs.envs.making import EnvMaker, env_makers
 from sb3_torcs.envs.racing import RacingEnv, RacingInfo
 from sb3_torcs.errors import EnvClosed, InvalidOption
@@ -38,7 +38,7 @@ class RaceInfo(MutableMapping[str, Any]):
 
     __slots__ = ("_race", "_timestep", "_values")
 
-    def __init__(self, timestep: Timestep, race: int) -> None:
+    def __init__(self, timestep: Outcome, race: int) -> None:
         self._timestep, self._race = timestep, race
         self._values: dict[str, Any] | None = None
 
@@ -238,7 +238,7 @@ class TorcsVecEnv(DummyVecEnv):
             raise failures[0]
         return timestep.observations, rewards, dones, infos
 
-    def _drive(self, batch: Batch) -> Timestep:
+    def _drive(self, batch: Batch) -> Outcome:
         """Take a timestep in all races, in which opponents that are agents drive, too."""
         for race in self._shared:
             race.ask()
@@ -258,7 +258,7 @@ class TorcsVecEnv(DummyVecEnv):
                         self._races[i].racing.end_race()
                 over[members] = True
 
-    def _finish(self, i: int, timestep: Timestep) -> tuple[float, bool, dict[str, Any]]:
+    def _finish(self, i: int, timestep: Outcome) -> tuple[float, bool, dict[str, Any]]:
         """Take the last timestep of an episode through all wrappers, and reset."""
         assert self._batch is not None
         race, env = self._races[i], self._envs[i]
