@@ -61,10 +61,11 @@ def model_samples(name, track):
         track,
         hyperparameters=record.hyperparameters,
     )
-    rows = [
-        {**timestep.car._asdict(), "throttle": timestep.action[1], "brake": timestep.action[2]}
-        for timestep in drive(env, load_driver(name, env))
-    ]
+    rows = []
+    for timestep in drive(env, load_driver(name, env)):
+        controls = env.get_wrapper_attr("controls")
+        pedals = {"throttle": controls.throttle, "brake": controls.brake}
+        rows.append({**timestep.car._asdict(), **pedals})
     env.close()
     return rows
 

@@ -567,7 +567,7 @@ def test_an_evaluation_writes_its_drives_as_the_robots_are_written(capsys, tmp_p
 
 
 def timestep(lap_time=None, distance=0.0):
-    return recording.Timestep(None, types.SimpleNamespace(distance_raced=distance), lap_time)
+    return recording.Recorded(None, types.SimpleNamespace(distance_raced=distance), lap_time)
 
 
 def test_the_best_stretch_is_the_fastest_whole_lap():
@@ -674,6 +674,9 @@ def test_an_output_that_takes_no_more_is_told():
         ({"resume": "none.zip"}, "there is no model 'none.zip'"),
         ({"algo": "dpg"}, "no algorithm 'dpg'; did you mean 'ddpg'?"),
         ({"zoo_args": ("--log-folder", "x")}, "before -- there are --algo, --env, --timesteps"),
+        ({"zoo_args": ("-n20",)}, "before -- there are --algo"),
+        ({"zoo_args": ("-conf", "b.yml")}, "before -- there are --algo"),
+        ({"zoo_args": ("--save-freq", "5", "-uuid")}, "before -- there are --algo"),
         ({"zoo_args": ("--hyperparams", "batchsize:8")}, "unknown key 'batchsize'"),
         ({"zoo_args": ("--hyperparams", "learning_rate:lin_1")}, "values are Python, e.g."),
         ({"zoo_args": ("--env-kwargs", "trak:'oval'")}, "did you mean 'track'?"),
@@ -979,8 +982,8 @@ def test_the_doctor_survives_what_is_broken():
     def broken():
         raise RuntimeError("no luck")
 
-    check = doctor._guarded(broken)
-    assert (check.ok, check.found) == (False, "RuntimeError: no luck")
+    check = doctor._guarded(broken, "this")
+    assert (check.name, check.ok, check.found) == ("this", False, "RuntimeError: no luck")
 
 
 def test_the_doctor_says_what_to_type(capsys, monkeypatch):

@@ -300,6 +300,10 @@ def test_a_space_comes_back_from_plain_data(space):
     assert model_policy.restored_space(said) == space
 
 
+def test_a_space_that_is_no_space_is_not_read():
+    assert model_policy.readable_space("Box(29,)") is None
+
+
 def test_a_model_of_discrete_actions_keeps_its_spaces(tmp_path):
     class Steer(gym.ActionWrapper):
         def __init__(self, env):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import zipfile
+from contextlib import suppress
 
 import gymnasium as gym
 import numpy as np
@@ -234,6 +235,18 @@ def test_what_is_no_ghost_is_refused(tmp_path, kind):
     broken(kind, path)
     with pytest.raises(ModelMismatch, match=r"is not a ghost \(.+\); give one that"):
         read_ghost(path)
+
+
+def test_damaged_ghosts_are_refused(file, tmp_path):
+    whole = np.frombuffer(file.read_bytes(), np.uint8)
+    rng = np.random.default_rng(0)
+    path = tmp_path / "damaged.npz"
+    for _ in range(60):
+        damaged = whole.copy()
+        damaged[rng.integers(0, len(whole), 8)] = rng.integers(0, 256, 8)
+        path.write_bytes(damaged.tobytes())
+        with suppress(ModelMismatch):
+            read_ghost(path)
 
 
 def test_a_full_disk_is_said_and_leaves_the_previous_ghost(ghost, file, monkeypatch):

@@ -11,7 +11,7 @@ from sb3_torcs.cli import main
 from sb3_torcs.errors import StudyError
 from sb3_torcs.evaluation.protocol import Episode
 from sb3_torcs.studies.config import read_study
-from sb3_torcs.studies.trial import Training, final_row
+from sb3_torcs.studies.trial import Training, _row, final_row
 
 CLOCKS = ("wall_s", "cpu_s")
 TINY = {
@@ -173,6 +173,22 @@ def test_the_best_model_is_one_that_the_command_and_stock_sb3_drive(tmp_path, ca
         again = final_row(wanted, checkpoint / "best_model.zip", "aalborg", kept)
         same = ("laps", "distance_m", "end", "return")
         assert [again[name] for name in same] == [kept[name] for name in same]
+
+
+def test_evaluations_drive_one_car_of_several(tmp_path, monkeypatch):
+    cars = ["car1-trb1", "car2-trb1"]
+    built = []
+    monkeypatch.setattr(
+        "sb3_torcs.studies.trial.race_environment",
+        lambda env_id, env_kwargs, track, **_: built.append(env_kwargs["car"]) or 1 / 0,
+    )
+    wanted = trial(tmp_path, {"env_kwargs": {"car": cars}}, env="Torcs-v0")
+    with pytest.raises(ZeroDivisionError):
+        final_row(wanted, tmp_path / "best_model.zip", "aalborg", {})
+    race = Episode(1, [80.0], 2587.5, "laps", 0.0, 0.0)
+    assert built == ["car1-trb1"]
+    times = dict.fromkeys(("decisions", "episodes", "wall_s", "cpu_s", "kept"))
+    assert _row(wanted, "final", "aalborg", race, times)["ladder"]
 
 
 def test_the_model_that_is_kept_is_the_best_by_the_protocol(tmp_path, monkeypatch):

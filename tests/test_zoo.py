@@ -146,6 +146,8 @@ def test_an_unknown_algorithm_is_told_the_near_miss():
 def test_an_unknown_policy_is_told_the_near_miss(tmp_path):
     said = complaint(tmp_path, {"policy": "MlpPolice"})
     assert said.startswith("unknown policy 'MlpPolice'; did you mean 'MlpPolicy'?")
+    said = complaint(tmp_path, {"policy": ["MlpPolicy"]})
+    assert said.startswith("unknown policy ['MlpPolicy']")
 
 
 def test_an_argument_of_the_policy_that_it_does_not_have_is_unknown(tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import tokenize
 import zipfile
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
@@ -14,6 +15,7 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 
+from sb3_torcs.agents.model_file import BROKEN
 from sb3_torcs.agents.rollout import Timestep, drive
 from sb3_torcs.envs.aids import AIDS
 from sb3_torcs.errors import InvalidOption, ModelMismatch, near_miss
@@ -135,7 +137,7 @@ def read_ghost(path: str | Path) -> Ghost:
         with np.load(file, allow_pickle=False) as content:
             actions, record = content["actions"], json.loads(str(content["record"]))
         return _ghost(actions, record)
-    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+    except (*BROKEN, OverflowError, SyntaxError, tokenize.TokenError) as error:
         raise ModelMismatch(
             f"'{file}' is not a ghost ({error}); give one that `sb3-torcs optimize-lap` wrote"
         ) from error

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     import torch as th
 
 __all__ = [
+    "BROKEN",
     "IDLE",
     "VALUES",
     "as_mismatch",

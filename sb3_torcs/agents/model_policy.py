@@ -143,8 +143,8 @@ def readable_space(item: Any) -> spaces.Space[Any] | None:
     :param item: of :func:`~sb3_torcs.agents.model_file.saved_data`
     :return: the space; ``None`` if the text is incomplete
     """
-    kind = re.fullmatch(r"<class 'gymnasium\.spaces\.\w+\.(\w+)'>", str(item.get(":type:")))
     try:
+        kind = re.fullmatch(r"<class 'gymnasium\.spaces\.\w+\.(\w+)'>", str(item.get(":type:")))
         if kind is None or "..." in f"{item.get('low')}{item.get('high')}":
             return None
         said = {"kind": kind[1], "shape": item.get("_shape"), **item}

@@ -95,20 +95,22 @@ def checks() -> list[Check]:
     :return: one result per check
     """
     results = [_python(), *(_package(name, module) for name, module in PACKAGES.items())]
-    lite = (_compile_cache, _bundled_tracks, _video_encoder, _torcslite)
-    results += [_guarded(check) for check in (*lite, _compiler, _extension)]
+    results += [_guarded(check) for check in (_compile_cache, _bundled_tracks, _video_encoder)]
+    results.append(_guarded(_torcslite, "TorcsLite-v0"))
+    results += [_guarded(check) for check in (_compiler, _extension)]
     game = _guarded(_game)
     results.append(game)
     for look in (_tracks, _cars, _layout):
         missing = Check(look.__name__.strip("_"), False, "there is no game to look at", game.fix)
         results.append(_guarded(look) if game.ok else missing)
+    results.append(_guarded(_torcs, "Torcs-v0"))
     extras = (_game_program, _game_libraries, _window, _video)
-    return results + [_guarded(check) for check in (_torcs, *extras)]
+    return results + [_guarded(check) for check in extras]
 
 
-def _guarded(check: Callable[[], Check]) -> Check:
+def _guarded(check: Callable[[], Check], name: str | None = None) -> Check:
     """Run a check; if it raises, the error is its result."""
-    name = check.__name__.strip("_").replace("_", " ")
+    name = name or check.__name__.strip("_").replace("_", " ")
     try:
         return check()
     except BackendUnavailable as error:

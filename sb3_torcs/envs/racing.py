@@ -290,6 +290,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         if self._closed:
             raise EnvClosed("reset after close; make a new environment with gym.make")
         super().reset(seed=seed)
+        self.car = None  # if the reset fails, no step is possible
         if self._draw_track is not None:
             self._draw_track(self.np_random)
         if options:
@@ -297,7 +298,6 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         else:
             start = self._starts.draw(self.np_random, self.track)
         self.delay = self.conditions.draw(self.np_random, self.backend, self.action_repeat)
-        self.car = None  # if the reset fails, no step is possible
         try:
             self.car = self.backend.reset(self.np_random, start)
         except InvalidOption:

@@ -85,7 +85,7 @@ class Footage:
                 np.array([engine.controls(slot) for slot in slots], float),
                 np.array([engine.finished(slot) for slot in slots]),
                 out,
-                engine.appearance(),
+                b"" if self.view is None else engine.appearance(),
             )
         )
 

@@ -10,6 +10,7 @@ import errno
 import socket
 from collections.abc import Sequence
 
+from sb3_torcs.car import checked_choice
 from sb3_torcs.errors import InvalidOption, PortTaken
 from sb3_torcs.torcs.installation import Game
 from sb3_torcs.torcs.process import GameProcess
@@ -80,7 +81,10 @@ def start_server(
     :param options: of :data:`SCR_OPTIONS`
     :param window: in which the race is shown or recorded; ``None`` runs it without one
     :return: the game, which waits for its clients
+    :raises InvalidOption: if there is no such option
     """
+    for option in options:
+        checked_choice("options", option, SCR_OPTIONS)
     numbers = [bound.fileno() for bound in sockets]
     arguments = WindowArguments(environment={}, descriptors=[], preload=None, files={})
     if window is not None:

@@ -21,11 +21,10 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_torcs.agents.model_record import BEST_MODEL, STATISTICS
+from sb3_torcs.agents.model_record import BEST_MODEL, STATISTICS, TrainingRecord
 from sb3_torcs.agents.model_writing import recipe, write_record
 from sb3_torcs.agents.models import ModelDriver, load_driver
 from sb3_torcs.agents.wrapping import frames_of
-from sb3_torcs.car import DEFAULT_CAR
 from sb3_torcs.errors import StudyError
 from sb3_torcs.evaluation.ladder import rung
 from sb3_torcs.evaluation.protocol import Episode, Merit, evaluate, merit, race_environment
@@ -297,9 +296,15 @@ def _with_statistics(env: Any, file: Path) -> Any:
 
 def _race_environment(trial: Trial, track: str) -> Any:
     """Build the environment of an evaluation; a study's wrappers are those of who started it."""
+    env_kwargs = {**trial.env_kwargs, "car": _car(trial)}
     return race_environment(
-        trial.env_id, trial.env_kwargs, track, hyperparameters=trial.entry, trust=True
+        trial.env_id, env_kwargs, track, hyperparameters=trial.entry, trust=True
     )
+
+
+def _car(trial: Trial) -> str:
+    """Choose the car that evaluations drive."""
+    return TrainingRecord(env_kwargs=trial.env_kwargs).one_car
 
 
 def _row(trial: Trial, phase: str, track: str, race: Episode, more: Row) -> Row:
@@ -320,7 +325,7 @@ def _row(trial: Trial, phase: str, track: str, race: Episode, more: Row) -> Row:
         "end": race.end,
         "damage": race.damage,
         "return": race.episode_return,
-        "ladder": rung(race, trial.env_id, trial.env_kwargs.get("car", DEFAULT_CAR), name),
+        "ladder": rung(race, trial.env_id, _car(trial), name),
         **more,
     }
     return {field: row[field] for field in FIELDS}

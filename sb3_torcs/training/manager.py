@@ -127,7 +127,7 @@ def _parser_of(words: list[str]) -> type[argparse.ArgumentParser]:
 
     class Parser(argparse.ArgumentParser):
         def __init__(self) -> None:
-            super().__init__(prog="rl_zoo3.train")
+            super().__init__(prog="rl_zoo3.train", allow_abbrev=False)
 
         def parse_args(self) -> argparse.Namespace:  # type: ignore[override]
             return super().parse_args(words)

@@ -33,8 +33,11 @@ PICTURES = "sb3_torcs.callbacks.LinePicturesCallback"
 WORKER = "sb3_torcs.training.zoo.UninterruptedWorker"
 OF_ONE_RUN = (PROGRESS, PICTURES, WORKER)
 """What options add to an entry; a training that is resumed has its own options."""
-OURS = ("--algo", "--env", "--n-timesteps", "-n", "--log-folder", "-f", "--conf-file", "--uuid")
-"""Words of the zoo that decide where things are; ours say the same."""
+PLACES = (
+    ("--algo",), ("--env",), ("-n", "--n-timesteps"), ("-f", "--log-folder"),
+    ("-conf", "--conf-file"), ("-uuid", "--uuid"),
+)  # fmt: skip
+"""Options of the zoo that decide where things are; ours say the same."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -127,12 +130,6 @@ def train_run(options: TrainOptions) -> Run:
     from sb3_torcs.training import zoo
 
     _check_numbers(options)
-    for word in options.zoo_args:
-        if word.partition("=")[0] in OURS:
-            raise InvalidOption(
-                f"'{word}' after -- is refused: sb3-torcs would not find the model; before -- "
-                "there are --algo, --env, --timesteps, --folder and --conf-file"
-            )
     resume = None if options.resume is None else find_model(options.resume, prefer_last=True)
     entry, changed, place = _entry(options, resume)
     with contextlib.closing(zoo.checked_env(changed, options.env, place)) as env:
@@ -216,6 +213,8 @@ def _changes(zoo_args: Sequence[str]) -> dict[str, Any]:
     parser.add_argument("-params", "--hyperparams", nargs="+", action=StoreDict, default={})
     parser.add_argument("--env-kwargs", nargs="+", action=StoreDict)
     parser.add_argument("--n-eval-envs", type=int, default=1)
+    for names in PLACES:
+        parser.add_argument(*names, nargs="?", const=True, dest="place")
     try:
         known, _ = parser.parse_known_args(zoo_args)
     except Exception as error:  # values are evaluated, which can raise anything
@@ -223,6 +222,11 @@ def _changes(zoo_args: Sequence[str]) -> dict[str, Any]:
             f"'{shlex.join(zoo_args)}' cannot be read ({error}); values are Python, e.g. "
             "--hyperparams gamma:0.98 \"learning_rate:'lin_0.001'\""
         ) from error
+    if known.place is not None:
+        raise InvalidOption(
+            f"'{shlex.join(zoo_args)}' after -- is refused: sb3-torcs would not find the model; "
+            "before -- there are --algo, --env, --timesteps, --folder and --conf-file"
+        )
     if known.n_eval_envs < 1:
         raise InvalidOption(f"--n-eval-envs is {known.n_eval_envs}; expected at least 1")
     if known.env_kwargs is None:

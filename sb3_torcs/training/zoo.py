@@ -364,7 +364,7 @@ def _policy(name: Any, algorithm: Any, place: Place) -> Callable[..., Any]:
     """Find the class that a policy's alias or dotted path stands for."""
     if isinstance(name, str) and "." in name:
         return _imported(name, "policy", place)
-    if name not in algorithm.policy_aliases:
+    if not isinstance(name, str) or name not in algorithm.policy_aliases:
         known = algorithm.policy_aliases
         advice = (
             f"allowed: {', '.join(known)}, or a dotted path such as "
