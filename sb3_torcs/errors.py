@@ -221,7 +221,7 @@ def near_miss(name: str, known: Iterable[str], advice: str = "") -> str:
     :param advice: what else to say
     :return: e.g. ``"; did you mean 'x'? it has x, y"``, or ``"; it has x, y"`` if none is close
     """
-    lowered = {str(one).lower(): str(one) for one in known}
+    lowered = {str(one).lower(): str(one) for one in known if str(one) != name}
     close = difflib.get_close_matches(name.lower(), lowered, n=1, cutoff=0.6)
     suggestion = [f"did you mean '{lowered[close[0]]}'?"] if close else []
     ending = " ".join([*suggestion, advice] if advice else suggestion)

@@ -99,6 +99,14 @@ def test_the_statistics_of_the_observations_go_on(run, tmp_path, beside):
     assert after == pytest.approx(before + 22, abs=2.01)
 
 
+def test_a_folder_without_its_last_model_goes_on_from_the_best_and_says_so(run, tmp_path, capsys):
+    copied = tmp_path / "run"
+    shutil.copytree(run, copied)
+    (copied / "TorcsLite-v0.zip").rename(copied / "best_model.zip")
+    gone_on(copied, tmp_path / "two", "--timesteps", "20")
+    assert "has no last model; going on from the best one" in capsys.readouterr().err
+
+
 def test_what_changes_how_it_sees_is_refused(run, tmp_path, capsys):
     words = ["train", "--resume", str(run), "--folder", str(tmp_path / "none"), "--no-progress"]
     assert main([*words, "--", "--hyperparams", "normalize:True"]) == 2

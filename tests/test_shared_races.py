@@ -12,6 +12,8 @@ import pytest
 import torch as th
 from stable_baselines3 import DDPG, PPO
 
+from sb3_torcs.agents import driver_record
+from sb3_torcs.agents.model_writing import RecordCallback
 from sb3_torcs.agents.scripted import ScriptedDriver
 from sb3_torcs.backends.native import Fleet, make_engine
 from sb3_torcs.backends.seats import REJOIN_SPEED
@@ -22,7 +24,7 @@ from sb3_torcs.evaluation.ticks import log_drives
 from sb3_torcs.policies.mirror import mirror_image, mirror_observations
 from sb3_torcs.sensors import View, feature_slices
 from sb3_torcs.torcs.installation import find_game
-from sb3_torcs.vec_env import TorcsVecEnv
+from sb3_torcs.vec_env import JoinedVecEnv, TorcsVecEnv
 
 TRACK = "g-track-1"
 TWO = [("bt", 2), ("", 0), ("inferno", 3), ("", 1)]
@@ -476,6 +478,18 @@ class TestVectorEnvironment:
         model.learn(256)
         assert model.num_timesteps == 256
         assert all(np.isfinite(p.detach().numpy()).all() for p in model.policy.parameters())
+
+    def test_a_model_records_how_its_cars_were_made(self, make, tmp_path):
+        envs = make(1, 2, track="g-track-1", action="pedal", max_episode_steps=50)
+        both = JoinedVecEnv([envs, make(1, 2, track="g-track-1", action="pedal")])
+        for number, learned in enumerate([envs, both]):
+            model = PPO("MlpPolicy", learned, n_steps=16, batch_size=32, device="cpu")
+            model.learn(16 * learned.num_envs, callback=RecordCallback())
+            model.save(tmp_path / f"{number}.zip")
+            record = driver_record(tmp_path / f"{number}.zip")
+            assert record.env_id == "Torcs-v0"
+            assert record.env_kwargs["track"] == "g-track-1"
+            assert record.env_kwargs["action"] == "pedal"
 
 
 class TestSensorsOfARace:

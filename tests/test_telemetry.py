@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import gymnasium as gym
 import numpy as np
 import pandas as pd
@@ -166,12 +168,21 @@ def test_what_is_no_drive_is_told(tmp_path, oval):
     (lambda frame: frame.assign(driver=None), "who drove where"),
     (lambda frame: frame.assign(distance_from_start=float("nan")), "distance is no number"),
     (lambda frame: frame.iloc[::-1], "out of order"),
+    (lambda frame: frame.assign(driver=7), "world is no text"),
+    (lambda frame: frame.assign(lap_time=None), "column lap_time holds no numbers"),
+    (lambda frame: frame.assign(steering="left"), "column steering holds no numbers"),
 ])  # fmt: skip
 def test_rows_that_are_no_drive_are_told(tmp_path, oval, change, says):
     path = written(tmp_path, log_of(oval, ("ana", 20.0)))
     change(pd.read_parquet(path)).to_parquet(path)
     with pytest.raises(DriveFileError, match=rf"is damaged: .*{says}; write it anew"):
         read_drives(path)
+
+
+def test_a_pipe_is_no_drive(tmp_path):
+    os.mkfifo(tmp_path / "drive.parquet")
+    with pytest.raises(DriveFileError, match="is no file"):
+        read_drives(tmp_path / "drive.parquet")
 
 
 def test_an_evaluation_writes_its_drives_as_parquet(tmp_path, capsys):

@@ -29,6 +29,7 @@ __all__ = [
     "Ghost",
     "GhostDriver",
     "check_fits",
+    "check_laps",
     "demonstration",
     "is_ghost",
     "read_ghost",
@@ -246,7 +247,19 @@ def check_fits(ghost: Ghost, env: gym.Env[Any, Any], name: str | Path) -> None:
                 f"the ghost '{name}' was driven with {what} {value!r}, not {has[what]!r}: its "
                 "actions fit no other race; search one there: sb3-torcs optimize-lap"
             )
-    laps, driven = env.get_wrapper_attr("laps"), ghost.env_kwargs.get("laps")
+    check_laps(ghost, env.get_wrapper_attr("laps"), name)
+
+
+def check_laps(ghost: Ghost, laps: int | None, name: str | Path) -> None:
+    """
+    Make sure that a ghost has enough laps.
+
+    :param ghost: that is to drive
+    :param laps: to drive; ``None`` drives as many as there are
+    :param name: of the ghost, for the message
+    :raises ModelMismatch: if it has fewer
+    """
+    driven = ghost.env_kwargs.get("laps")
     if laps is not None and driven is not None and laps > driven:
         raise ModelMismatch(
             f"the ghost '{name}' drove {driven} laps, so it cannot drive {laps}; ask for no more"

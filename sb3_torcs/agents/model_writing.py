@@ -35,6 +35,8 @@ from sb3_torcs.agents.model_record import (
 )
 from sb3_torcs.errors import ModelNotTrusted
 from sb3_torcs.torcs.track_names import lasting_kwargs
+from sb3_torcs.tracks.catalogue import lasting_name
+from sb3_torcs.tracks.track import Track
 
 __all__ = ["RecordCallback", "recipe", "write_driver", "write_record"]
 
@@ -183,6 +185,11 @@ def _recipe_of_environment(model: BaseAlgorithm) -> Recipe:
     if spec is None:
         return recipe(algo, None, {})
     kwargs = {name: value for name, value in spec.kwargs.items() if name != "render_mode"}
+    tracks = kwargs.get("track")
+    if isinstance(tracks, Track):
+        kwargs["track"] = lasting_name(tracks)
+    elif isinstance(tracks, (list, tuple)):
+        kwargs["track"] = [lasting_name(t) if isinstance(t, Track) else t for t in tracks]
     return recipe(algo, spec.id, {"env_kwargs": kwargs})
 
 

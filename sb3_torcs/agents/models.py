@@ -91,7 +91,8 @@ def find_model(path: str | Path, *, prefer_last: bool = False) -> Path:
         return given
     if Path(f"{given}.zip").is_file():
         return Path(f"{given}.zip")
-    if not given.is_dir() and str(path) in shipped_agents():
+    shipped = str(path) in shipped_agents()
+    if not given.is_dir() and shipped:
         given = AGENTS / str(path)
     if not given.is_dir():
         known = [*(file.name for file in given.parent.glob("*.zip")), *shipped_agents()]
@@ -104,7 +105,10 @@ def find_model(path: str | Path, *, prefer_last: bool = False) -> Path:
     for candidate in order:
         if candidate.is_file():
             return candidate
-    raise InvalidOption(f"the folder '{given}' holds no model; give the .zip that a training saved")
+    raise InvalidOption(
+        f"the folder '{given}' holds no model; give the .zip that a training saved"
+        + (", or rename the folder, which hides a shipped agent" if shipped else "")
+    )
 
 
 def shipped_agents() -> list[str]:

@@ -27,6 +27,7 @@ __all__ = [
     "setting",
     "table",
     "told_record",
+    "warn_unless_known",
 ]
 
 INTERRUPTED = 130
@@ -47,16 +48,27 @@ def told_record(driver: str, game: Game | None = None) -> TrainingRecord:
     :return: the record, which may be empty
     """
     from sb3_torcs.agents.models import agent_record, driver_record
-    from sb3_torcs.agents.scripted import SCRIPTED
 
     record = driver_record(driver) if game is None else agent_record(driver, game)
+    warn_unless_known(driver, record)
+    return record
+
+
+def warn_unless_known(driver: str, record: TrainingRecord) -> None:
+    """
+    Warn on standard error if there is no record of how a driver was trained.
+
+    :param driver: as typed
+    :param record: of its training, which may be empty
+    """
+    from sb3_torcs.agents.scripted import SCRIPTED
+
     if not record.known and driver != SCRIPTED:
         print(
             f"sb3-torcs: '{driver}' has no record of its training; track, car, action repeat "
             "and range finders are the defaults, unless you give them",
             file=sys.stderr,
         )
-    return record
 
 
 def positive(text: str) -> int:
@@ -110,10 +122,14 @@ def setting(text: str) -> tuple[str, Any]:
     from sb3_torcs.files import read_yaml
 
     name, equals, value = text.partition("=")
-    with contextlib.suppress(YAMLError):
-        if name.isidentifier() and equals:
-            return name, read_yaml(value)
-    raise argparse.ArgumentTypeError(f"{text!r}: expected NAME=VALUE, e.g. delay=2")
+    if not (name.isidentifier() and equals):
+        raise argparse.ArgumentTypeError(f"{text!r}: expected NAME=VALUE, e.g. delay=2")
+    try:
+        return name, read_yaml(value)
+    except YAMLError:
+        raise argparse.ArgumentTypeError(
+            f"{text!r}: {value!r} is no value of YAML; e.g. delay=[0, 5] has one"
+        ) from None
 
 
 @contextlib.contextmanager

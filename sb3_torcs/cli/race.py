@@ -17,6 +17,7 @@ from sb3_torcs.cli.common import (
     quiet_output,
     seed,
     table,
+    warn_unless_known,
 )
 from sb3_torcs.files import writable_file
 
@@ -117,6 +118,8 @@ def run(args: argparse.Namespace) -> int:
         raise InvalidOption(f"--{next(iter(files))} is for races of the engine; leave out --game")
     with quiet_output(args.json):
         entrants = find_entrants(args.drivers, find_game())
+        for agent in (entrant.agent for entrant in entrants if entrant.agent is not None):
+            warn_unless_known(agent.driver, agent.record)
         log = DriveLog() if "telemetry" in files or "report" in files else None
         footage = _footage(args)
         races = _held(args, entrants, log, footage)

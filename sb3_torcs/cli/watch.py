@@ -127,7 +127,7 @@ def _shows(game: Game, names: Sequence[str], args: argparse.Namespace) -> list[S
     :param names: of models or robots
     :param args: from the command line
     """
-    from sb3_torcs.agents.ghosts import is_ghost
+    from sb3_torcs.agents.ghosts import check_laps, is_ghost, read_ghost
     from sb3_torcs.agents.model_record import DRIVEN_WITH, TrainingRecord
     from sb3_torcs.agents.models import one_of
     from sb3_torcs.errors import InvalidOption
@@ -138,6 +138,8 @@ def _shows(game: Game, names: Sequence[str], args: argparse.Namespace) -> list[S
         raise InvalidOption(
             "a ghost drives as it did, alone on the road, whoever is there; leave --robots out"
         )
+    for name in filter(is_ghost, names):
+        check_laps(read_ghost(name), args.laps, name)
     if args.car is not None and all(robots):
         raise InvalidOption(
             f"--car is for models; a robot has one for each index, e.g. {names[0]}:1, and "

@@ -7,6 +7,7 @@ the metadata of each column.
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -164,6 +165,8 @@ def read_drives(path: str | Path) -> pd.DataFrame:
     import pyarrow as pa
 
     again = "write it anew: sb3-torcs evaluate MODEL --telemetry FILE.parquet"
+    if os.path.exists(path) and not os.path.isfile(path):  # to read a pipe would wait for a writer
+        raise DriveFileError(f"'{path}' is no file; {again}")
     try:
         frame = pd.read_parquet(path, page_checksum_verification=True)
     except FileNotFoundError:
@@ -188,7 +191,13 @@ def _damage(frame: pd.DataFrame) -> str | None:
     """Say what keeps rows from being drives, if anything does."""
     if frame[list(LABELS)].isna().any(axis=None):
         return "it does not say of each row who drove where"
-    if not np.isfinite(frame[["time", "distance_from_start"]].to_numpy(np.float64)).all():
+    if not all(isinstance(told, str) for name in LABELS[:-1] for told in frame[name].unique()):
+        return "a driver, track, car or world is no text"
+    numbers = frame[list(COLUMNS)].select_dtypes("number")
+    for name in COLUMNS:
+        if name not in numbers:
+            return f"its column {name} holds no numbers"
+    if not np.isfinite(frame[["time", "distance_from_start", "lap_time"]].to_numpy()).all():
         return "a time or a distance is no number"
     drives = frame.groupby(list(LABELS), sort=False, observed=True)
     if (drives["time"].diff() < 0.0).any():

@@ -69,13 +69,18 @@ def find_track(track: str | os.PathLike[str] | TrackFile, game: Game | None = No
     if game is not None:
         _refuse_half_a_track(name, game)
     names = [word for full in known for word in (full.rpartition("/")[2], full)]
+    raise TrackNotFound(f"no track '{name}'{near_miss(name, names, LISTED)}{_hint(name, game)}")
+
+
+def _hint(name: str, game: Game | None) -> str:
+    """Say more of a name that no track has."""
+    if os.path.isfile(name):
+        return f"; there is a file '{name}', and a track's ends in {XML} or {COMPACT}"
     if game is not None:
-        where = f"; Torcs-v0 has those of {game.data}, and TORCS's {XML} files"
-    elif not torcs_folders():
-        where = f"; those of the game are missing, since TORCS was not found; type: {INSTALL}"
-    else:
-        where = ""
-    raise TrackNotFound(f"no track '{name}'{near_miss(name, names, LISTED)}{where}")
+        return f"; Torcs-v0 has those of {game.data}, and TORCS's {XML} files"
+    if not torcs_folders():
+        return f"; those of the game are missing, since TORCS was not found; type: {INSTALL}"
+    return ""
 
 
 def kind_without_game(track: Any) -> str | None:

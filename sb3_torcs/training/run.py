@@ -253,14 +253,25 @@ def _check_resumed(
     from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
     from sb3_torcs.agents.model_algorithm import algorithm_class
+    from sb3_torcs.agents.model_record import BEST_MODEL
+    from sb3_torcs.training.keeping import REPLAY_BUFFER
     from sb3_torcs.training.resuming import check_resumable
 
     buffer = check_resumable(resume, env, options.algo, changed, trust=options.trust)
     if "learning_starts" in entry and buffer:
         entry["learning_starts"] = 0
-    if "n_steps" in entry and issubclass(algorithm_class(options.algo), OffPolicyAlgorithm):
+    replays = issubclass(algorithm_class(options.algo), OffPolicyAlgorithm)
+    if replays and not buffer:
+        _tell(f"there is no {REPLAY_BUFFER} beside '{resume}': the training fills an empty one")
+    if resume.name == BEST_MODEL and Path(str(options.resume)).expanduser().is_dir():
+        _tell(f"'{options.resume}' has no last model; going on from the best one")
+    if "n_steps" in entry and replays:
         # SB3 chooses the class of the replay buffer as before; given its own choice, it would warn.
         entry.setdefault("replay_buffer_class", None)
+
+
+def _tell(sentence: str) -> None:
+    sys.stderr.write(f"sb3-torcs: {sentence}\n")
 
 
 def _zoo_words(options: TrainOptions, wanted: int, env_kwargs: dict[str, Any]) -> list[str]:
