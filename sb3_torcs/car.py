@@ -351,7 +351,8 @@ def range_finder_angles(choice: RangeFinderName | Sequence[float]) -> FloatArray
     except (TypeError, ValueError):
         raise InvalidOption(f"range_finders is {choice!r}; {allowed}") from None
     if angles.shape != (19,) or not np.all(np.abs(angles) <= 90.0):
-        raise InvalidOption(f"range_finders has shape {angles.shape}: {choice!r}; {allowed}")
+        what = f"{len(angles)} angles" if angles.ndim == 1 else f"shape {angles.shape}"
+        raise InvalidOption(f"range_finders has {what}: {choice!r}; {allowed}")
     return np.radians(angles)
 
 

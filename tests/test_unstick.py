@@ -11,7 +11,7 @@ import pytest
 from conftest import ScriptedBackend
 from vectors import assert_they_see_the_same, both_kinds
 
-from sb3_torcs.car import Controls
+from sb3_torcs.car import FIRST_RIVAL, NO_RACE, RIVALS, Controls
 from sb3_torcs.envs.racing import RacingEnv
 from sb3_torcs.errors import InvalidOption
 
@@ -44,7 +44,7 @@ def held(oval, **state):
         ({"heading_error": 1.0, "distance_from_axis": -3.0}, -1.0, -1),
         ({"heading_error": -2.5, "distance_from_axis": -3.0}, -1.0, 1),
         ({"heading_error": -2.5, "distance_from_axis": 3.0}, 1.0, -1),
-        ({"heading_error": 1.0, "distance_from_axis": 0.5, "gear": -1}, -1.0, -1),  # goes on
+        ({"heading_error": 1.0, "distance_from_axis": 2.0, "gear": -1}, -1.0, -1),  # goes on
     ],
 )
 def test_a_stuck_car_goes_where_its_nose_or_its_tail_has_room(oval, state, steering, gear):
@@ -54,11 +54,24 @@ def test_a_stuck_car_goes_where_its_nose_or_its_tail_has_room(oval, state, steer
     assert controls.throttle > 0.0
 
 
+@pytest.mark.parametrize(
+    ("place", "rival", "gear"),
+    [(3.0, None, 1), (3.0, 4.0, 1), (3.0, -4.0, -1), (-3.0, None, -1), (-3.0, 4.0, 1)],
+)
+def test_it_does_not_push_a_car_that_stands_in_its_way(oval, place, rival, gear):
+    """Facing backwards, so that who is farther along the road stands behind it."""
+    race = NO_RACE.copy()
+    if rival is not None:
+        race[FIRST_RIVAL:].reshape(6, RIVALS)[:, 0] = rival, 0.0, 0.0, 0.0, 4.5, 2.0
+    state = {"heading_error": 3.0, "distance_from_axis": place, "race": race}
+    assert held(oval, speed_x=0.0, **state).gear == gear
+
+
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_a_car_that_stands_beside_the_road_comes_back_to_it(oval, side):
     """Which is 10 m wide: it turns to the axis, and no further than it needs."""
     along = held(oval, speed_x=0.0, distance_from_axis=side * 7.0)
-    assert along == Controls(-side * 0.7, 0.6, 0.0, 1)
+    assert along == Controls(-side * 0.7, 1.0, 0.0, 1)
     slanting = held(oval, speed_x=0.0, distance_from_axis=side * 7.0, heading_error=side * 0.35)
     assert slanting.steering == 0.0
 

@@ -5,16 +5,17 @@ from __future__ import annotations
 import math
 
 from sb3_torcs.car import CarState
+from sb3_torcs.rivals import blocked_ways
 
 __all__ = ["freeing_controls", "needs_freeing"]
 
 TURNED = math.pi / 6.0  # [rad] to the road from which a car stands across it
 SLOW = 5.0  # [m/s] below which a car is stuck that stands across the road, or beside it
 CREEP = 4.0  # [m/s] at most, forward and backward
-CREEP_THROTTLE, STOP_BRAKE = 0.6, 0.8
-# How far beyond the axis a car goes on in its direction, so that it does not change it all the
-# time: share of half the road.
-OVER_AXIS = 0.2
+CREEP_THROTTLE, STOP_BRAKE = 1.0, 0.8
+# How far beyond the axis a car goes on in its direction, since each change of it takes a second:
+# share of half the road.
+OVER_AXIS = 0.5
 BACK = 0.35  # [rad] at which a car comes back from beside the road
 BACK_STEERING = 2.0  # [-] per radian
 
@@ -34,8 +35,8 @@ def needs_freeing(car: CarState) -> bool:
 
 def freeing_controls(car: CarState) -> tuple[float, float, float, int]:
     """
-    Turn a car towards the road, forward while its nose points to the axis and else backward; from
-    beside the road drive back to it.
+    Turn a car towards the road, forward while its nose points to the axis and else backward, and
+    the other way where another car stands; from beside the road drive back to it.
 
     To turn is the rule of the driver that comes with the Simulated Car Racing championship's
     software (Loiacono, Cardamone and Lanzi, "Simulated Car Racing Championship: Competition
@@ -50,6 +51,9 @@ def freeing_controls(car: CarState) -> tuple[float, float, float, int]:
         return min(max(steering, -1.0), 1.0), CREEP_THROTTLE, 0.0, 1
     side = 1.0 if car.heading_error > 0.0 else -1.0
     forward = side * car.track_position > (OVER_AXIS if car.gear < 0 else -OVER_AXIS)
+    ahead, behind = blocked_ways(car)
+    if ahead != behind:
+        forward = behind
     way = 1.0 if forward else -1.0
     throttle = brake = 0.0
     if car.speed_x * way < -1.0:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from sb3_torcs.agents.models import agent_record, driver_name, load_driver, one_of
 from sb3_torcs.agents.robots import drive_log
 from sb3_torcs.agents.rollout import drive
-from sb3_torcs.car import checked_laps
+from sb3_torcs.car import check_count, checked_laps
 from sb3_torcs.errors import BackendUnavailable, DriveFileError, InvalidOption
 from sb3_torcs.evaluation.protocol import RACE_LAPS, choose_world, race_environment
 from sb3_torcs.evaluation.ticks import log_drives
@@ -90,6 +90,7 @@ def compare(
     :raises InvalidOption: if there is no such driver, or a drive is of another track
     :raises DriveFileError: if a file cannot be read, or nobody drives a whole lap
     """
+    check_count("laps", laps)
     checked_laps(laps)
     if not drivers:
         raise InvalidOption("there is nobody to compare; name drivers, e.g. ddpg-aalborg inferno")
@@ -164,7 +165,7 @@ def _track(
     if others:
         told = ", ".join(f"{drive.driver} on {drive.track}" for drive in others)
         raise DriveFileError(
-            f"laps of different tracks cannot be compared: {told}, and the others on {track}; "
+            f"laps of different tracks cannot be compared: {told}, not on {track}; "
             f"name drives of one track{'' if given is None else ', or leave out --track'}"
         )
     return track

@@ -145,15 +145,15 @@ def _passes(
     lost_before = 0.0
     for corner, (begin, end) in zip(corners, borders, strict=True):
         within = speed[(grid >= corner.begin) & (grid <= corner.end)]
-        apex = float(within.min())
+        entry_speed, exit_speed = np.interp([corner.begin, corner.end], grid, speed).tolist()
         lost_so_far = float(np.interp(end, grid, delta))
         passes.append(
             CornerPass(
                 distance=corner.begin,
                 braking_point=_braking_point(own, grid, begin, corner),
-                entry_speed=float(np.interp(corner.begin, grid, speed)),
-                apex_speed=apex,
-                exit_speed=float(np.interp(corner.end, grid, speed)),
+                entry_speed=entry_speed,
+                apex_speed=min(float(within.min()), entry_speed, exit_speed),
+                exit_speed=exit_speed,
                 time_lost=lost_so_far - lost_before,
             )
         )
