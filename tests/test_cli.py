@@ -732,11 +732,18 @@ def test_numbers_of_steps_have_to_be_positive(capsys):
 def test_the_words_for_the_zoo_say_what_was_asked():
     asked = TrainOptions(eval_episodes=2, seed=7)
     training = {"track": "aalborg", "start": "random", "max_episode_steps": 200, "laps": 2}
-    words = training_run._zoo_words(asked, 100000, training)
+    words = training_run._zoo_words(asked, 100000, {"env_kwargs": training})
     pairs = dict(itertools.pairwise(words))
     assert (pairs["--seed"], pairs["--eval-freq"], pairs["--eval-episodes"]) == ("7", "2500", "2")
     assert (pairs["--num-threads"], pairs["--device"]) == ("1", "cpu")
     assert words[words.index("--eval-env-kwargs") + 1 :] == ["track:'aalborg'", "laps:2"]
+
+
+def test_an_evaluation_comes_no_sooner_than_an_update():
+    asked = TrainOptions(algo="ppo")
+    for entry, freq in (({"n_steps": 128, "n_envs": 64}, "8192"), ({}, "2048")):
+        words = training_run._zoo_words(asked, 1500, {**entry, "env_kwargs": {}})
+        assert words[words.index("--eval-freq") + 1] == freq
 
 
 def test_the_evaluation_is_on_the_track_that_the_zoo_s_own_words_name(monkeypatch, tmp_path):
@@ -986,6 +993,19 @@ def test_the_doctor_survives_what_is_broken():
 
     check = doctor._guarded(broken, "this")
     assert (check.name, check.ok, check.found) == ("this", False, "RuntimeError: no luck")
+
+
+def test_a_cache_that_cannot_be_written_is_told_with_what_to_type(capsys, monkeypatch):
+    def refused(*_):
+        raise RuntimeError("cannot cache function 'f': no locator available for file 'x.py'")
+
+    check = doctor._guarded(refused)
+    assert check.fix == "export NUMBA_CACHE_DIR=/tmp/numba"
+    monkeypatch.setattr(doctor, "run", refused)
+    status, _, err = run(capsys, "doctor")
+    assert status == 2
+    assert err.startswith("sb3-torcs: numba cannot cache function")
+    assert err.endswith("type: export NUMBA_CACHE_DIR=/tmp/numba\n")
 
 
 def test_the_doctor_says_what_to_type(capsys, monkeypatch):

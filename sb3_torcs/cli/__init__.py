@@ -29,7 +29,7 @@ from sb3_torcs.cli import (
     train,
     watch,
 )
-from sb3_torcs.cli.common import INTERRUPTED
+from sb3_torcs.cli.common import CACHE_FIX, INTERRUPTED, lacks_cache
 from sb3_torcs.cli.parser import Parser
 from sb3_torcs.cli.plain import any_terminal, open_streams
 from sb3_torcs.errors import Sb3TorcsError
@@ -94,6 +94,11 @@ def _run(args: argparse.Namespace) -> int:
     except BrokenPipeError:  # the reader, e.g. `head`, has ended
         _drop_output()
         return READER_LEFT
+    except RuntimeError as error:
+        if not lacks_cache(error):
+            raise
+        print(f"sb3-torcs: numba {error}; type: {CACHE_FIX}", file=sys.stderr)
+        return USAGE_ERROR
     except OSError as error:
         where = error.filename or "the output"
         said = f"{error.strerror or error}: {where}; make room, or choose another folder"

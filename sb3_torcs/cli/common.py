@@ -16,9 +16,11 @@ if TYPE_CHECKING:
 
 __all__ = [
     "AGENT_HELP",
+    "CACHE_FIX",
     "INTERRUPTED",
     "MODEL_HELP",
     "TRUST_HELP",
+    "lacks_cache",
     "natural",
     "positive",
     "print_json",
@@ -33,10 +35,21 @@ __all__ = [
 INTERRUPTED = 130
 """The exit status after Ctrl-C, as shells have it."""
 
+CACHE_FIX = "export NUMBA_CACHE_DIR=/tmp/numba"
+
 AGENT_HELP = "a saved .zip, a run's folder, a shipped agent, or 'scripted'"
 MODEL_HELP = AGENT_HELP.replace(", or ", ", a ghost, or ")
 
 TRUST_HELP = "run the code that is pickled in the model: only if you trust its author"
+
+
+def lacks_cache(error: Exception) -> bool:
+    """
+    Tell whether numba has found no folder that it may write what it compiles to.
+
+    :param error: that an import has raised
+    """
+    return isinstance(error, RuntimeError) and "cannot cache function" in str(error)
 
 
 def told_record(driver: str, game: Game | None = None) -> TrainingRecord:

@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from sb3_torcs.car import DEFAULT_CAR
-from sb3_torcs.cli.common import print_json, quiet_output
+from sb3_torcs.cli.common import CACHE_FIX, lacks_cache, print_json, quiet_output
 from sb3_torcs.errors import BackendUnavailable, Sb3TorcsError
 from sb3_torcs.torcs.building import build_command
 from sb3_torcs.torcs.installation import find_game, linker_knows
@@ -116,7 +116,7 @@ def _guarded(check: Callable[[], Check], name: str | None = None) -> Check:
     except BackendUnavailable as error:
         return Check(name, False, *_found_and_fix(error))
     except Exception as error:
-        fix = "pip install --force-reinstall sb3-torcs"
+        fix = CACHE_FIX if lacks_cache(error) else "pip install --force-reinstall sb3-torcs"
         return Check(name, False, f"{type(error).__name__}: {error}", fix)
 
 
@@ -147,7 +147,7 @@ def _compile_cache() -> Check:
     try:
         from sb3_torcs.actions import automatic_gear
     except RuntimeError as error:  # no folder can be written
-        return Check("compile cache", False, str(error), "export NUMBA_CACHE_DIR=/tmp/numba")
+        return Check("compile cache", False, str(error), CACHE_FIX)
     return Check("compile cache", True, automatic_gear.stats.cache_path, None)
 
 

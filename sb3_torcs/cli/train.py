@@ -59,7 +59,7 @@ def add_parser(subparsers: Any) -> None:
         "--eval-freq",
         type=int,
         metavar="N",
-        help="timesteps between evaluations, 0 for none; default: one fortieth of --timesteps",
+        help="timesteps between evaluations, 0 for none; default: a fortieth of --timesteps",
     )
     add(
         "--eval-episodes",

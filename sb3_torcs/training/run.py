@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import dataclasses
+import inspect
 import shlex
 import signal
 import sys
@@ -142,7 +143,7 @@ def train_run(options: TrainOptions) -> Run:
         entry["env_wrapper"] = [*listed(entry.get("env_wrapper")), WORKER]
     if options.progress or options.pictures is not None:
         entry["callback"] = _with_display(options, entry.get("callback"))
-    words = _zoo_words(options, wanted, changed["env_kwargs"])
+    words = _zoo_words(options, wanted, changed)
     words += ["--log-folder", str(folder), "--tensorboard-log", str(tensorboard)]
     words += ["--trained-agent", str(resume)] if resume else []
     track = changed["env_kwargs"].get("track")
@@ -274,13 +275,28 @@ def _tell(sentence: str) -> None:
     sys.stderr.write(f"sb3-torcs: {sentence}\n")
 
 
-def _zoo_words(options: TrainOptions, wanted: int, env_kwargs: dict[str, Any]) -> list[str]:
+def _rollout(algo: str, entry: Mapping[str, Any]) -> int:
+    """Return the timesteps between two updates of an algorithm without a replay buffer, else 0."""
+    from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+
+    from sb3_torcs.agents.model_algorithm import algorithm_class
+
+    kind = algorithm_class(algo)
+    if not issubclass(kind, OnPolicyAlgorithm):
+        return 0
+    usual = inspect.signature(kind).parameters["n_steps"].default
+    return int(entry.get("n_steps", usual)) * int(entry.get("n_envs", 1))
+
+
+def _zoo_words(options: TrainOptions, wanted: int, entry: Mapping[str, Any]) -> list[str]:
     """Compose the zoo's command line, files and folders aside."""
     from sb3_torcs.training import zoo
 
+    env_kwargs = entry["env_kwargs"]
     eval_freq = options.eval_freq
     if eval_freq is None:
         eval_freq = max(wanted // EVALUATIONS, min(wanted, SHORTEST_EVAL_FREQ))
+        eval_freq = max(eval_freq, _rollout(options.algo, entry))  # between them nothing changes
     words = ["--n-timesteps", str(wanted), "--seed", str(options.seed)]
     words += ["--eval-freq", str(eval_freq), "--eval-episodes", str(options.eval_episodes)]
     words += ["--num-threads", "1", "--device", "cpu", "--verbose", "0", "--save-replay-buffer"]
