@@ -9,7 +9,7 @@ from numba import njit
 
 from sb3_torcs.car import CAR_WIDTH, FIRST_RIVAL, RIVALS, CarState, FloatArray
 
-__all__ = ["blocked_ways", "clarity", "needed_brake", "needed_turn", "see_rivals"]
+__all__ = ["clarity", "needed_brake", "needed_turn", "see_rivals"]
 
 NEARBY = 80.0  # [m] along the road, within which cars are seen
 HALF_ALONG, HALF_ACROSS = 10.0, 3.0  # [m] distances that are seen as 0.5
@@ -34,8 +34,6 @@ TURN = 1.5  # [m/s] steering × speed that makes room; with the default car a ya
 OVERDUE = 1.5  # most of this unit, for cars that would touch
 MOST_TURN = 0.25  # of the steering
 SLOWEST = 5.0  # [m/s] below which steering does not grow
-GAP_ALONG, GAP_ASIDE = 0.5, 0.3  # [m] between two cars, up to which one blocks the other's way
-
 VERGE = 0.5  # [m] to the edge of the road, from which on a car makes less room
 
 
@@ -141,27 +139,3 @@ def needed_turn(car: CarState) -> float:
         turn -= side * short * min(max(verge / VERGE, 0.0), 1.0)
     turn *= TURN / max(car.speed_x, SLOWEST)
     return float(min(max(turn, -MOST_TURN), MOST_TURN))
-
-
-def blocked_ways(car: CarState) -> tuple[bool, bool]:
-    """
-    Tell whether another car stands close before a car's nose, and behind its tail.
-
-    Others are taken to point along the road. Compiled code calls this function, too.
-
-    :param car: at the begin of a timestep, pointing anywhere
-    :return: whether its way forward and its way backward are blocked
-    """
-    cosine, sine = math.cos(car.heading_error), math.sin(car.heading_error)
-    nose = tail = False
-    rivals = car.race[FIRST_RIVAL:]
-    for i in range(RIVALS):
-        along, across = rivals[i], rivals[RIVALS + i]
-        length, width = rivals[4 * RIVALS + i], rivals[5 * RIVALS + i]
-        ahead = along * cosine - across * sine  # seen from the car
-        aside = along * sine + across * cosine
-        reach_ahead = 0.5 * (length + length * abs(cosine) + width * abs(sine)) + GAP_ALONG
-        reach_aside = 0.5 * (width + length * abs(sine) + width * abs(cosine)) + GAP_ASIDE
-        if abs(ahead) < reach_ahead and abs(aside) < reach_aside:
-            nose, tail = nose or ahead > 0.0, tail or ahead <= 0.0
-    return nose, tail

@@ -12,7 +12,7 @@ from vectors import assert_they_see_the_same, both_kinds
 
 from sb3_torcs.car import NO_RACE, RIVALS
 from sb3_torcs.errors import InvalidOption
-from sb3_torcs.rivals import blocked_ways, needed_brake, needed_turn, see_rivals
+from sb3_torcs.rivals import needed_brake, needed_turn, see_rivals
 from sb3_torcs.vec_env import TorcsVecEnv
 
 GAS = np.array([0.0, 1.0, 0.0], np.float32)
@@ -33,29 +33,6 @@ def brake(speed, *rival):
 
 def turn(*rival, **car):
     return needed_turn(car_state(**{"speed_x": 20.0, **car}, race=race_with(*rival)))
-
-
-class TestBlockedWays:
-    @pytest.mark.parametrize(
-        ("heading", "rival", "blocked"),
-        [
-            (0.0, (4.8, 0.0), (True, False)),
-            (0.0, (-4.8, 0.0), (False, True)),
-            (0.0, (5.2, 0.0), (False, False)),
-            (0.0, (3.0, 2.5), (False, False)),  # beside
-            (np.pi, (4.8, 0.0), (False, True)),  # it faces the wrong way
-            (np.pi / 2.0, (0.0, -3.5), (True, False)),  # it points to the right
-            (np.pi / 2.0, (0.0, 3.5), (False, True)),
-            (-np.pi / 2.0, (0.0, 3.5), (True, False)),
-            (np.pi / 2.0, (4.8, 0.0), (False, False)),
-        ],
-    )
-    def test_it_is_seen_from_the_car(self, heading, rival, blocked):
-        car = car_state(heading_error=heading, race=race_with(*rival))
-        assert blocked_ways(car) == blocked
-
-    def test_who_is_alone_is_free(self):
-        assert blocked_ways(car_state(race=NO_RACE)) == (False, False)
 
 
 class TestBraking:

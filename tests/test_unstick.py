@@ -11,7 +11,7 @@ import pytest
 from conftest import ScriptedBackend
 from vectors import assert_they_see_the_same, both_kinds
 
-from sb3_torcs.car import FIRST_RIVAL, NO_RACE, RIVALS, Controls
+from sb3_torcs.car import Controls
 from sb3_torcs.envs.racing import RacingEnv
 from sb3_torcs.errors import InvalidOption
 
@@ -52,19 +52,6 @@ def test_a_stuck_car_goes_where_its_nose_or_its_tail_has_room(oval, state, steer
     controls = held(oval, speed_x=0.0, **state)
     assert (controls.steering, controls.gear) == (steering, gear)
     assert controls.throttle > 0.0
-
-
-@pytest.mark.parametrize(
-    ("place", "rival", "gear"),
-    [(3.0, None, 1), (3.0, 4.0, 1), (3.0, -4.0, -1), (-3.0, None, -1), (-3.0, 4.0, 1)],
-)
-def test_it_does_not_push_a_car_that_stands_in_its_way(oval, place, rival, gear):
-    """Facing backwards, so that who is farther along the road stands behind it."""
-    race = NO_RACE.copy()
-    if rival is not None:
-        race[FIRST_RIVAL:].reshape(6, RIVALS)[:, 0] = rival, 0.0, 0.0, 0.0, 4.5, 2.0
-    state = {"heading_error": 3.0, "distance_from_axis": place, "race": race}
-    assert held(oval, speed_x=0.0, **state).gear == gear
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])

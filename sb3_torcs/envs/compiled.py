@@ -18,7 +18,7 @@ from sb3_torcs import actions, rewards
 from sb3_torcs.car import CarState, FloatArray
 from sb3_torcs.envs.ends import STUCK_TICKS, end_of, stands
 from sb3_torcs.envs.unstick import freeing_controls, needs_freeing
-from sb3_torcs.rivals import blocked_ways, needed_brake, needed_turn
+from sb3_torcs.rivals import needed_brake, needed_turn
 from sb3_torcs.sensors import encode_record
 
 __all__ = ["COMPILED", "aid_cars", "read_actions", "value_timesteps"]
@@ -48,7 +48,7 @@ def _derived(name: str) -> None:
 for _name in ("track_position", "off_track", "gap_ahead", "gap_behind", "contacts", "faults"):
     _derived(_name)
 _readers = (actions.action_layout(name).read for name in actions.ACTIONS)
-_aids = (needed_brake, needed_turn, blocked_ways, needs_freeing, freeing_controls)
+_aids = (needed_brake, needed_turn, needs_freeing, freeing_controls)
 for _function in (end_of, stands, rewards.safe_speed, *_aids, *_readers):
     register_jitable(_function)
 _read_pedals, _read_pedal, _read_manual = (

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 from sb3_torcs.car import CarState
-from sb3_torcs.rivals import blocked_ways
 
 __all__ = ["freeing_controls", "needs_freeing"]
 
@@ -35,8 +34,8 @@ def needs_freeing(car: CarState) -> bool:
 
 def freeing_controls(car: CarState) -> tuple[float, float, float, int]:
     """
-    Turn a car towards the road, forward while its nose points to the axis and else backward, and
-    the other way where another car stands; from beside the road drive back to it.
+    Turn a car towards the road, forward while its nose points to the axis and else backward; from
+    beside the road drive back to it.
 
     To turn is the rule of the driver that comes with the Simulated Car Racing championship's
     software (Loiacono, Cardamone and Lanzi, "Simulated Car Racing Championship: Competition
@@ -51,9 +50,6 @@ def freeing_controls(car: CarState) -> tuple[float, float, float, int]:
         return min(max(steering, -1.0), 1.0), CREEP_THROTTLE, 0.0, 1
     side = 1.0 if car.heading_error > 0.0 else -1.0
     forward = side * car.track_position > (OVER_AXIS if car.gear < 0 else -OVER_AXIS)
-    ahead, behind = blocked_ways(car)
-    if ahead != behind:
-        forward = behind
     way = 1.0 if forward else -1.0
     throttle = brake = 0.0
     if car.speed_x * way < -1.0:
