@@ -280,7 +280,7 @@ def test_a_search_that_was_ended_before_its_first_trial_is_told(monkeypatch, tmp
 def test_the_zoo_reads_the_words_of_the_training_not_those_of_the_process(capsys, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["own.py", "--own"])
     with pytest.raises(SystemExit):
-        zoo_training.train("ddpg", "TorcsLite-v0", {}, ["--n-timestep", "many"], [])
+        zoo_training.train("ddpg", "TorcsLite-v0", {}, ["--n-timesteps", "many"], [])
     assert "rl_zoo3.train: error: argument -n/--n-timesteps: invalid" in capsys.readouterr().err
 
 

@@ -10,7 +10,6 @@ import errno
 import socket
 from collections.abc import Sequence
 
-from sb3_torcs.car import checked_choice
 from sb3_torcs.errors import InvalidOption, PortTaken
 from sb3_torcs.torcs.installation import Game
 from sb3_torcs.torcs.process import GameProcess
@@ -18,13 +17,11 @@ from sb3_torcs.torcs.race_setup import RaceSetup
 from sb3_torcs.torcs.window import Window, WindowArguments, window_arguments
 from sb3_torcs.tracks.trial import check_track
 
-__all__ = ["SCR_OPTIONS", "SCR_PORT", "open_ports", "start_server"]
+__all__ = ["SCR_PORT", "open_ports", "start_server"]
 
 SCR_PORT = 3001
 """Of the first driver; the others follow. As the SCR server has it."""
 LAST_PORT = 65535
-SCR_OPTIONS = ("nofuel", "nodamage", "nolaptime", "noisy")
-"""What a server can leave out of a race or add to it, as patched ones call it."""
 
 
 def open_ports(
@@ -78,13 +75,11 @@ def start_server(
     :param race: with ``("scr_server", 0)`` and on among its drivers
     :param sockets: bound, the k-th for driver k; they can be closed here afterwards
     :param deadline: for an answer [s]; ``None`` waits for it, however long it takes
-    :param options: of :data:`SCR_OPTIONS`
+    :param options: ``nofuel``, ``nodamage``, ``nolaptime`` and ``noisy``, as patched servers call
+        them; the game refuses others
     :param window: in which the race is shown or recorded; ``None`` runs it without one
     :return: the game, which waits for its clients
-    :raises InvalidOption: if there is no such option
     """
-    for option in options:
-        checked_choice("options", option, SCR_OPTIONS)
     numbers = [bound.fileno() for bound in sockets]
     arguments = WindowArguments(environment={}, descriptors=[], preload=None, files={})
     if window is not None:
