@@ -416,6 +416,14 @@ def driven(capsys, *words):
 
 
 @pytest.mark.usefixtures("game")
+def test_a_robot_is_no_model(capsys):
+    status, _, err = run(capsys, "evaluate", "inferno")
+    assert status == 2
+    assert "'inferno' is a robot of the game" in err
+    assert err.endswith("type: sb3-torcs robots inferno\n")
+
+
+@pytest.mark.usefixtures("game")
 def test_who_does_not_say_where_it_was_trained_drives_in_the_game(capsys, plain):
     for name, track in (("scripted", "a-speedway"), (plain, "aalborg")):
         world, said = driven(capsys, name, "--track", track)
