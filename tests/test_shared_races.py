@@ -275,6 +275,10 @@ class TestMistakes:
         with pytest.raises(InvalidOption, match=f"{name} is .*, which is for a race of one agent"):
             TorcsVecEnv(1, 2, **option)
 
+    def test_no_option_at_all(self):
+        with pytest.raises(TypeError, match=r"no option 'oponents'; did you mean 'opponents'\?"):
+            make_race(2, oponents=["bt"])
+
     def test_their_usual_values_are_no_mistake(self, make):
         shown = {"picture": "above", "view": "behind", "boards": True, "render_size": [640, 480]}
         usual = {"backend": "native", "host": None, "port": None, "grip": 1.0, "mass": 1.0}
