@@ -104,6 +104,8 @@ def whole_file(
     :return: a path beside it with the same ending, which the block writes
     :raises OutputNotWritable: if the file cannot be written; the previous one is kept
     """
+    if path.is_dir():
+        raise OutputNotWritable(f"cannot write '{path}': it is a folder; {advice}")
     aside = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
     try:
         try:
@@ -152,8 +154,10 @@ def read_yaml(text: str, loader_class: type[yaml.SafeLoader] = yaml.SafeLoader) 
         raise yaml.YAMLError("it nests too deep, or an alias is within what it stands for") from (
             error
         )
-    except (ValueError, LookupError, AttributeError) as error:  # a value that its tag does not fit
+    except ValueError as error:  # of an invalid date or number
         raise yaml.YAMLError(str(error)) from error
+    except (LookupError, AttributeError) as error:
+        raise yaml.YAMLError(f"a value does not fit its tag, such as !!int ({error})") from error
     finally:
         loader.dispose()
 

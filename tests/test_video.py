@@ -84,7 +84,7 @@ def test_a_failure_keeps_the_previous_video(tmp_path):
 
 def test_a_folder_that_cannot_be_made_is_an_error_that_says_so(tmp_path):
     (tmp_path / "file").touch()
-    with pytest.raises(OutputNotWritable, match=r"cannot write .*lap\.mp4.*choose"):
+    with pytest.raises(OutputNotWritable, match=r"cannot write '.*lap\.mp4': .*; choose a file"):
         write_video(tmp_path / "file" / "lap.mp4", frames(), fps=10)
 
 

@@ -43,8 +43,9 @@ PHOTOGRAPHIC: Mapping[str, Any] = {
 }
 """For pictures that look like photographs: a quarter of the size, in a third of the time."""
 
-INDEX = b"moov"  # the name of its box in an mp4 file
 ADVICE = "choose a file in a folder that you may write to"
+
+INDEX = b"moov"  # the name of its box in an mp4 file
 BEGINNING = 64  # [bytes] that hold the names of the first boxes
 
 
@@ -77,8 +78,6 @@ def write_video(
     path = Path(path)
     if path.suffix.lower() != ".mp4":
         raise InvalidOption(f"the video's name is '{path}'; expected a name that ends in '.mp4'")
-    if path.is_dir():
-        raise OutputNotWritable(f"cannot write the video '{path}': it is a folder; {ADVICE}")
     with (
         whole_file(path, ADVICE, parents=True) as part,
         _progress(path.name, total, share) as advance,
