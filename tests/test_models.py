@@ -188,6 +188,20 @@ def test_an_empty_name_is_not_the_working_folder(saved, name, monkeypatch):
         models.find_model(name)
 
 
+def test_a_link_to_nothing_is_not_told_its_own_name(tmp_path):
+    (tmp_path / "ppo.zip").symlink_to(tmp_path / "gone.zip")
+    with pytest.raises(InvalidOption, match="there is no model") as caught:
+        models.find_model(tmp_path / "ppo.zip")
+    assert "did you mean 'ppo.zip'" not in str(caught.value)
+
+
+def test_a_folder_that_hides_a_shipped_agent_is_told_so(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "ppo-aalborg").mkdir()
+    with pytest.raises(InvalidOption, match=r"holds no model; .* hides a shipped agent"):
+        models.find_model("ppo-aalborg")
+
+
 def test_an_empty_folder_holds_no_model(tmp_path):
     with pytest.raises(InvalidOption, match="holds no model"):
         models.find_model(tmp_path)

@@ -35,13 +35,14 @@ from sb3_torcs.agents.scripted import SCRIPTED, ScriptedDriver
 from sb3_torcs.agents.wrapping import frames_of, normalizes, stacked_space, unrebuilt
 from sb3_torcs.car import range_finder_angles
 from sb3_torcs.errors import (
+    BackendUnavailable,
     InvalidOption,
     ModelMismatch,
     ModelNotTrusted,
     near_miss,
 )
 from sb3_torcs.sensors import choice_within
-from sb3_torcs.torcs.installation import INSTALL
+from sb3_torcs.torcs.installation import INSTALL, find_game
 
 if TYPE_CHECKING:
     from sb3_torcs.torcs.installation import Game
@@ -95,6 +96,11 @@ def find_model(path: str | Path, *, prefer_last: bool = False) -> Path:
     if not given.is_dir() and shipped:
         given = AGENTS / str(path)
     if not given.is_dir():
+        if _is_robot(str(path)):
+            raise InvalidOption(
+                f"'{path}' is a robot of the game, and a model is asked for; to drive the robot "
+                f"type: sb3-torcs robots {path}"
+            )
         known = [*(file.name for file in given.parent.glob("*.zip")), *shipped_agents()]
         raise InvalidOption(f"there is no model '{given}'{near_miss(given.name, known, advice)}")
     best = given / BEST_MODEL
@@ -109,6 +115,13 @@ def find_model(path: str | Path, *, prefer_last: bool = False) -> Path:
         f"the folder '{given}' holds no model; give the .zip that a training saved"
         + (", or rename the folder, which hides a shipped agent" if shipped else "")
     )
+
+
+def _is_robot(name: str) -> bool:
+    try:
+        return find_game().has_robot(name)
+    except BackendUnavailable:
+        return False
 
 
 def shipped_agents() -> list[str]:

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from sb3_torcs.agents.models import TrainingRecord
-    from sb3_torcs.errors import InvalidOption
     from sb3_torcs.torcs.installation import Game
 
 __all__ = [
@@ -62,31 +61,10 @@ def told_record(driver: str, game: Game | None = None) -> TrainingRecord:
     :return: the record, which may be empty
     """
     from sb3_torcs.agents.models import agent_record, driver_record
-    from sb3_torcs.errors import InvalidOption
 
-    if game is not None:
-        record = agent_record(driver, game)
-    else:
-        try:
-            record = driver_record(driver)
-        except InvalidOption as error:
-            raise _no_model(driver, error) from None
+    record = driver_record(driver) if game is None else agent_record(driver, game)
     warn_unless_known(driver, record)
     return record
-
-
-def _no_model(driver: str, error: InvalidOption) -> InvalidOption:
-    """Replace the error of a missing model if a robot is called so."""
-    from sb3_torcs.errors import BackendUnavailable, InvalidOption
-    from sb3_torcs.torcs.installation import find_game
-
-    with contextlib.suppress(BackendUnavailable):
-        if find_game().has_robot(driver):
-            return InvalidOption(
-                f"'{driver}' is a robot of the game, and a model is asked for; to drive the robot "
-                f"type: sb3-torcs robots {driver}"
-            )
-    return error
 
 
 def warn_unless_known(driver: str, record: TrainingRecord) -> None:
