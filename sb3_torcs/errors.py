@@ -214,7 +214,8 @@ def near_miss(name: str, known: Iterable[str], advice: str = "") -> str:
     """
     Complete a message about an unknown name with the name that was probably meant, and advice.
 
-    Capital and small letters count as the same.
+    Capital and small letters count as the same. The name itself, as of a link to nothing, is left
+    out.
 
     :param name: what was typed
     :param known: the names that exist

@@ -25,6 +25,7 @@ from sb3_torcs.agents import model_file, model_policy, models
 from sb3_torcs.agents.model_writing import RecordCallback, recipe, write_driver
 from sb3_torcs.errors import InvalidAction, ModelMismatch, ModelNotTrusted
 from sb3_torcs.policies import SplitHeadPolicy
+from sb3_torcs.tracks.catalogue import load_track
 
 OBSERVATIONS = np.linspace(-0.5, 0.5, 4 * 29, dtype=np.float32).reshape(4, 29)
 SPLIT = {"net_arch": [8, 8], "ema_decay": 0.9, "symmetric": True}
@@ -131,6 +132,15 @@ def test_each_file_of_a_training_tells_of_it(tmp_path):
             expected, _ = model.predict(normalized.normalize_obs(observation), deterministic=True)
             np.testing.assert_array_equal(driver.predict(observation)[0], expected)
         normalized.close()
+
+
+@pytest.mark.parametrize("several", [False, True])
+def test_a_track_that_was_given_as_such_is_recorded_by_its_name(tmp_path, several):
+    road = load_track("alpine-1")
+    with gym.make("TorcsLite-v0", track=[road, "aalborg"] if several else road) as env:
+        trained(DDPG, "MlpPolicy", env, **OFF_POLICY).save(tmp_path / "m.zip")
+    record = models.training_record(tmp_path / "m.zip")
+    assert record.env_kwargs["track"] == (["alpine-1", "aalborg"] if several else "alpine-1")
 
 
 def test_without_a_recipe_the_environment_tells(tmp_path):

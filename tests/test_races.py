@@ -315,6 +315,16 @@ def test_the_command_prints_one_object(capsys, game, tmp_path):
     assert picture.stat().st_size > 1000
 
 
+def test_an_agent_without_a_record_is_told(capsys, game, tmp_path):
+    file = tmp_path / "plain.zip"
+    PPO("MlpPolicy", "sb3_torcs:TorcsLite-v0", n_steps=2, batch_size=2, device="cpu").save(file)
+    words = ["race", str(file), "ppo-racer", "--track", "g-track-1", "--laps", "1", "--races", "1"]
+    assert main(words) == 0
+    said = capsys.readouterr().err
+    assert f"'{file}' has no record of its training" in said
+    assert "ppo-racer" not in said
+
+
 def test_ctrl_c_keeps_the_races_that_are_over(capsys, game, tmp_path, monkeypatch):
     held = protocol.run_race
 

@@ -107,6 +107,20 @@ def test_a_folder_without_its_last_model_goes_on_from_the_best_and_says_so(run, 
     assert "has no last model; going on from the best one" in capsys.readouterr().err
 
 
+def test_a_replay_buffer_that_is_missing_is_told(tmp_path, capsys):
+    own = {"n_timesteps": 40, "policy": "MlpPolicy", "learning_starts": 10, "buffer_size": 100}
+    (tmp_path / "own.yml").write_text(yaml.safe_dump({"TorcsLite-v0": own}))
+    words = ["train", "--no-progress", "--folder", str(tmp_path)]
+    assert main([*words, "--conf-file", str(tmp_path / "own.yml")]) == 0
+    begun = tmp_path / "ddpg" / "TorcsLite-v0_1"
+    (begun / "replay_buffer.pkl").unlink()
+    capsys.readouterr()
+    said = "there is no replay_buffer.pkl beside"
+    for folder, told in ((begun, True), (tmp_path / "ddpg" / "TorcsLite-v0_2", False)):
+        assert main([*words, "--resume", str(folder), "--timesteps", "20"]) == 0
+        assert (said in capsys.readouterr().err) == told
+
+
 def test_what_changes_how_it_sees_is_refused(run, tmp_path, capsys):
     words = ["train", "--resume", str(run), "--folder", str(tmp_path / "none"), "--no-progress"]
     assert main([*words, "--", "--hyperparams", "normalize:True"]) == 2

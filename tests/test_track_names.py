@@ -71,6 +71,14 @@ def test_what_is_no_file_is_told(fake, track):
         find_track(track, fake)
 
 
+def test_a_file_without_a_track_s_ending_is_told_so(fake, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "ring").touch()
+    for game in (fake, None):
+        with pytest.raises(TrackNotFound, match=r"file 'ring', and a track's ends in \.xml or"):
+            find_track("ring", game)
+
+
 def test_a_path_means_the_same_in_another_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     shutil.copy(BUNDLED_FOLDER / "road" / "aalborg.csv", "mine.csv")

@@ -209,6 +209,6 @@ class RacingProgressCallback(BaseCallback):
             curves = self._distances, self._lap_times, self._lap_length
             self._display.show(self.num_timesteps, text, *curves)
             return
-        share = min(100 * self.num_timesteps // max(self._total, 1), 100)  # PPO ends a rollout
+        share = min(100 * self.num_timesteps // max(self._total, 1), 100)  # PPO goes beyond
         self._out.write(f"{share}% {self.num_timesteps}/{self._total} timesteps, {text}\n")
         self._out.flush()

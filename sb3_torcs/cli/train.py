@@ -59,7 +59,8 @@ def add_parser(subparsers: Any) -> None:
         "--eval-freq",
         type=int,
         metavar="N",
-        help="timesteps between evaluations, 0 for none; default: a fortieth of --timesteps",
+        help="timesteps between evaluations, 0 for none; default: a fortieth of --timesteps, and "
+        "at least a rollout of PPO",
     )
     add(
         "--eval-episodes",

@@ -77,7 +77,7 @@ def _shared(races: int, agents: int, env_id: str, env_kwargs: dict[str, Any]) ->
     options = dict(env_kwargs)
     limits = _limits(options.pop("max_episode_steps", None), env_id, races)
     envs = [(env, limit) for limit in limits for env in make_race(agents, **options)]
-    for env, _ in envs:  # of which records of trainings are made, as of what gym.make makes
+    for env, _ in envs:  # RecordCallback reads it, as gym.make writes it
         env.spec = replace(gym.spec(env_id), kwargs=options, max_episode_steps=None)
     return [partial(_limited, env, limit) for env, limit in envs]
 

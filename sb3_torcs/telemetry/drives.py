@@ -165,12 +165,10 @@ def read_drives(path: str | Path) -> pd.DataFrame:
     import pyarrow as pa
 
     again = "write it anew: sb3-torcs evaluate MODEL --telemetry FILE.parquet"
-    if os.path.exists(path) and not os.path.isfile(path):  # to read a pipe would wait for a writer
-        raise DriveFileError(f"'{path}' is no file; {again}")
+    if not os.path.isfile(path):  # to read a pipe would wait for who writes it
+        raise DriveFileError(f"there is no file '{path}'; {again}")
     try:
         frame = pd.read_parquet(path, page_checksum_verification=True)
-    except FileNotFoundError:
-        raise DriveFileError(f"there is no file '{path}'; {again}") from None
     except (OSError, ValueError, pa.ArrowException) as error:
         told = str(error).splitlines()[0]
         raise DriveFileError(f"'{path}' cannot be read as a drive ({told}); {again}") from error

@@ -57,7 +57,7 @@ class TrainOptions:
     :param folder: gets ``ALGO/ENV_1``, ``ALGO/ENV_2``, ...
     :param tensorboard: its log folder; ``None`` is ``FOLDER/tensorboard``
     :param eval_freq: timesteps between evaluations; ``None`` is a fortieth of the
-        training, and at least 1000 where it has as many
+        training, and at least 1000 where it has as many, and a rollout of PPO
     :param eval_episodes: per evaluation
     :param resume: a saved model (.zip) or a run's folder to continue from, with the entry that it
         has learned by unless ``entry`` or ``conf_file`` is given
@@ -207,7 +207,7 @@ def _entry(
 
 
 def _changes(zoo_args: Sequence[str]) -> dict[str, Any]:
-    """Read the changes that the zoo will make to an entry by its arguments."""
+    """Read the changes that the zoo will make to an entry by its arguments, and refuse others."""
     from rl_zoo3.utils import StoreDict
 
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
@@ -215,7 +215,7 @@ def _changes(zoo_args: Sequence[str]) -> dict[str, Any]:
     parser.add_argument("--env-kwargs", nargs="+", action=StoreDict)
     parser.add_argument("--n-eval-envs", type=int, default=1)
     for names in PLACES:
-        parser.add_argument(*names, nargs="?", const=True, dest="place")
+        parser.add_argument(*names, nargs="?", const="", dest=names[-1])
     try:
         known, _ = parser.parse_known_args(zoo_args)
     except Exception as error:  # values are evaluated, which can raise anything
@@ -223,11 +223,12 @@ def _changes(zoo_args: Sequence[str]) -> dict[str, Any]:
             f"'{shlex.join(zoo_args)}' cannot be read ({error}); values are Python, e.g. "
             "--hyperparams gamma:0.98 \"learning_rate:'lin_0.001'\""
         ) from error
-    if known.place is not None:
-        raise InvalidOption(
-            f"'{shlex.join(zoo_args)}' after -- is refused: sb3-torcs would not find the model; "
-            "before -- there are --algo, --env, --timesteps, --folder and --conf-file"
-        )
+    for *_, name in PLACES:
+        if vars(known)[name] is not None:
+            raise InvalidOption(
+                f"'{name}' after -- is refused: sb3-torcs would not find the model; before -- "
+                "there are --algo, --env, --timesteps, --folder and --conf-file"
+            )
     if known.n_eval_envs < 1:
         raise InvalidOption(f"--n-eval-envs is {known.n_eval_envs}; expected at least 1")
     if known.env_kwargs is None:
@@ -295,8 +296,9 @@ def _zoo_words(options: TrainOptions, wanted: int, entry: Mapping[str, Any]) -> 
     env_kwargs = entry["env_kwargs"]
     eval_freq = options.eval_freq
     if eval_freq is None:
-        eval_freq = max(wanted // EVALUATIONS, min(wanted, SHORTEST_EVAL_FREQ))
-        eval_freq = max(eval_freq, _rollout(options.algo, entry))  # between them nothing changes
+        shortest = min(wanted, SHORTEST_EVAL_FREQ)
+        # Within a rollout the policy does not change.
+        eval_freq = max(wanted // EVALUATIONS, shortest, _rollout(options.algo, entry))
     words = ["--n-timesteps", str(wanted), "--seed", str(options.seed)]
     words += ["--eval-freq", str(eval_freq), "--eval-episodes", str(options.eval_episodes)]
     words += ["--num-threads", "1", "--device", "cpu", "--verbose", "0", "--save-replay-buffer"]
