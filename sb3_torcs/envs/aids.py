@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 from sb3_torcs.car import CarState, Controls, checked_flag
+from sb3_torcs.envs.slides import caught_steering, slides
 from sb3_torcs.envs.unstick import freeing_controls, needs_freeing
 from sb3_torcs.rivals import needed_brake, needed_turn
 
@@ -22,6 +23,7 @@ class Aids:
     unstick: bool  # a car that is stuck frees itself
     keep_distance: bool  # it brakes by itself for the car ahead
     keep_clear: bool  # it steers away by itself from those beside it
+    catch_slides: bool  # it steers against a slide, before it spins
 
     def __post_init__(self) -> None:
         for name in AIDS:
@@ -43,6 +45,8 @@ class Aids:
         if self.keep_clear:
             steering = min(max(controls.steering + needed_turn(car), -1.0), 1.0)
             controls = controls._replace(steering=steering)
+        if self.catch_slides and slides(car):
+            controls = controls._replace(steering=caught_steering(car), throttle=0.0, brake=0.0)
         return controls
 
 

@@ -17,6 +17,7 @@ from numba.extending import overload_attribute, register_jitable
 from sb3_torcs import actions, rewards
 from sb3_torcs.car import CarState, FloatArray
 from sb3_torcs.envs.ends import STUCK_TICKS, end_of, stands
+from sb3_torcs.envs.slides import caught_steering, sideslip, slides
 from sb3_torcs.envs.unstick import freeing_controls, needs_freeing
 from sb3_torcs.rivals import needed_brake, needed_turn
 from sb3_torcs.sensors import encode_record
@@ -48,7 +49,9 @@ def _derived(name: str) -> None:
 for _name in ("track_position", "off_track", "gap_ahead", "gap_behind", "contacts", "faults"):
     _derived(_name)
 _readers = (actions.action_layout(name).read for name in actions.ACTIONS)
-_aids = (needed_brake, needed_turn, needs_freeing, freeing_controls)
+_aids = (
+    needed_brake, needed_turn, needs_freeing, freeing_controls, sideslip, slides, caught_steering,
+)  # fmt: skip
 for _function in (end_of, stands, rewards.safe_speed, *_aids, *_readers):
     register_jitable(_function)
 _read_pedals, _read_pedal, _read_manual = (
@@ -100,11 +103,11 @@ def aid_cars(cars: Any, aids: npt.NDArray[np.bool_], controls: FloatArray) -> No
     Change controls as :class:`~sb3_torcs.envs.aids.Aids` does.
 
     :param cars: (n,) at the begin of a timestep
-    :param aids: (n, 3) which cars have which, in the order of :data:`~sb3_torcs.envs.aids.AIDS`
+    :param aids: (n, 4) which cars have which, in the order of :data:`~sb3_torcs.envs.aids.AIDS`
     :param controls: (n, 5) that were asked for, changed
     """
     for row in range(len(cars)):
-        unstick, keep_distance, keep_clear = aids[row, 0], aids[row, 1], aids[row, 2]
+        unstick, keep_distance, keep_clear, catch_slides = aids[row]
         if unstick and needs_freeing(cars[row]):
             steering, throttle, brake, gear = freeing_controls(cars[row])
             fields = (steering, throttle, brake, float(gear), 0.0)
@@ -118,6 +121,9 @@ def aid_cars(cars: Any, aids: npt.NDArray[np.bool_], controls: FloatArray) -> No
         if keep_clear:
             steering = controls[row, 0] + needed_turn(cars[row])
             controls[row, 0] = min(max(steering, -1.0), 1.0)
+        if catch_slides and slides(cars[row]):
+            controls[row, 0] = caught_steering(cars[row])
+            controls[row, 1] = controls[row, 2] = 0.0
 
 
 def _one_of(terms: Sequence[rewards.Term]) -> Any:

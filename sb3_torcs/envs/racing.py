@@ -122,6 +122,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         count for nothing meanwhile
     :param keep_distance: whether a car brakes by itself where it is too close to the car ahead
     :param keep_clear: whether a car steers away by itself from cars beside it
+    :param catch_slides: whether a car that slides steers against it by itself, before it spins
     :param delay: control ticks by which controls arrive late; or a pair, between which each
         episode draws
     :param grip: factor on the friction of all ground; or a pair, as for the delay
@@ -147,6 +148,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         unstick: bool = False,
         keep_distance: bool = False,
         keep_clear: bool = False,
+        catch_slides: bool = False,
         delay: int | Sequence[int] = 0,
         grip: float | Sequence[float] = 1.0,
         mass: float | Sequence[float] = 1.0,
@@ -166,7 +168,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         self.laps = checked_laps(laps)
         self.runoff = checked_runoff(runoff)
         self.recovery_ticks = round(checked_recovery(recovery) / CONTROL_TICK)
-        self.aids = Aids(unstick, keep_distance, keep_clear)
+        self.aids = Aids(unstick, keep_distance, keep_clear, catch_slides)
         self.render_mode = render_mode
         self.metadata = {
             **self.metadata,

@@ -88,6 +88,7 @@ class TorcsEnv(RacingEnv):
         for the backend ``"native"``
     :param keep_clear: whether a car steers away by itself from cars beside it; for the backend
         ``"native"``
+    :param catch_slides: whether a car that slides steers against it by itself, before it spins
     :param delay: control ticks of 0.02 s from an observation until the controls that answer it
         arrive; or a pair, e.g. ``(0, 5)``, between which each episode draws
     :param grip: factor on the friction of all ground; or a pair, e.g. ``(0.8, 1.1)``, between which
@@ -138,6 +139,7 @@ class TorcsEnv(RacingEnv):
         unstick: bool = False,
         keep_distance: bool = False,
         keep_clear: bool = False,
+        catch_slides: bool = False,
         delay: int | Sequence[int] = 0,
         grip: float | Sequence[float] = 1.0,
         mass: float | Sequence[float] = 1.0,
@@ -205,6 +207,7 @@ class TorcsEnv(RacingEnv):
             unstick=unstick,
             keep_distance=keep_distance,
             keep_clear=keep_clear,
+            catch_slides=catch_slides,
             delay=delay,
             grip=grip,
             mass=mass,

@@ -88,6 +88,7 @@ class TorcsLiteEnv(RacingEnv):
         game's robots do; actions count for nothing meanwhile
     :param keep_distance: ``False``; there are no other cars here
     :param keep_clear: ``False``; there are no other cars here
+    :param catch_slides: whether a car that slides steers against it by itself, before it spins
     :param delay: control ticks of 0.02 s from an observation until the controls that answer it
         arrive; or a pair, e.g. ``(0, 5)``, between which each episode draws
     :param grip: factor on the friction of all ground; or a pair, e.g. ``(0.8, 1.1)``, between which
@@ -115,6 +116,7 @@ class TorcsLiteEnv(RacingEnv):
         unstick: bool = False,
         keep_distance: bool = False,
         keep_clear: bool = False,
+        catch_slides: bool = False,
         delay: int | Sequence[int] = 0,
         grip: float | Sequence[float] = 1.0,
         render_mode: RenderMode | None = None,
@@ -147,6 +149,7 @@ class TorcsLiteEnv(RacingEnv):
             unstick=unstick,
             keep_distance=keep_distance,
             keep_clear=keep_clear,
+            catch_slides=catch_slides,
             delay=delay,
             grip=grip,
             render_mode=render_mode,

@@ -1,0 +1,47 @@
+"""How a car that slides is caught before it spins."""
+
+from __future__ import annotations
+
+import math
+
+from sb3_torcs.car import STEER_LOCK, CarState
+
+__all__ = ["caught_steering", "slides"]
+
+SIDESLIP = 0.3  # [rad] from which on a car slides; on asphalt it corners with about 0.1
+SLOWEST = 8.0  # [m/s] below which a car that slides comes to a stand soon enough
+
+
+def sideslip(car: CarState) -> float:
+    """
+    Return the angle between where a car goes and where it points [rad], left positive.
+
+    :param car: at the begin of a timestep
+    """
+    return math.atan2(car.speed_y, car.speed_x)
+
+
+def slides(car: CarState) -> bool:
+    """
+    Check whether a car slides: its tail has come round so far that it will spin.
+
+    Compiled code calls it, too.
+
+    :param car: at the begin of a timestep
+    """
+    if car.gear < 0 or car.speed_x <= 0.0 or math.hypot(car.speed_x, car.speed_y) < SLOWEST:
+        return False
+    return abs(sideslip(car)) > SIDESLIP
+
+
+def caught_steering(car: CarState) -> float:
+    """
+    Turn the front wheels to where the car goes, while nobody brakes or accelerates.
+
+    With neither, the tyres have all of their grip for turning the car back. Compiled code calls
+    it, too.
+
+    :param car: that :func:`slides`
+    :return: steering as of :class:`~sb3_torcs.car.Controls`
+    """
+    return min(max(sideslip(car) / STEER_LOCK, -1.0), 1.0)
