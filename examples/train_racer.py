@@ -2,8 +2,9 @@
 
 Each car of each race is an environment of TorcsVecEnv, so that stock PPO learns from all of them.
 It learns one track, or several, to race on those that it never saw. With --driver it goes on from a
-model that drives alone already, with --racer from one that races. With --ancestor it goes on from a
-racer that was trained so, and races against itself, this ancestor and robots.
+model that drives alone already, and sees what that model sees and other cars; with --racer it goes
+on from one that races. With --ancestor it goes on from a racer that was trained so, and races
+against itself, this ancestor and robots.
 """
 
 import argparse
@@ -19,13 +20,17 @@ from torch import nn
 
 from sb3_torcs.agents.model_file import VALUES, learned_weights
 from sb3_torcs.agents.model_writing import RecordCallback, recipe
-from sb3_torcs.agents.models import find_model
+from sb3_torcs.agents.models import find_model, training_record
 from sb3_torcs.callbacks import AdaptiveLearningRateCallback, LeanUpdatesCallback
 from sb3_torcs.policies import BoundedPolicy
 from sb3_torcs.sensors import feature_slices
 from sb3_torcs.vec_env import JoinedVecEnv, MirrorVecEnv, TorcsVecEnv
 
-SENSORS = ("base", "line", "rivals")
+FROM_NOTHING = {
+    "sensors": ["base", "line"], "range_finders": "narrow", "action": "pedal",
+    "gearbox": "road_speed", "action_repeat": 5,
+}  # fmt: skip
+"""How a racer drives that learns from nothing."""
 # The fields of robots, of which each race draws one. Those with a number drive another car.
 FIELDS = (
     ("berniw", "bt", "inferno", "lliaw", "olethros", "tita", "inferno:4"),
@@ -35,6 +40,20 @@ FIELDS = (
 )
 BESIDE_ANCESTORS = ((), ("bt", "berniw", "inferno:4"), ("lliaw", "olethros", "tita", "bt:3"))
 AGENTS = 3  # in each race, behind the others
+
+
+@dataclass(frozen=True)
+class Steps:
+    """How far a policy may go from what it knows, while it learns to race."""
+
+    rate: float  # of the learning rate at the begin, from which it adapts
+    kl: float  # target of the divergence per update, at the begin [nats]
+    last_kl: float  # at the end [nats]
+    log_std: tuple[float, float]  # of steering and pedal, with which it tries things
+
+
+BIG_STEPS = Steps(1.0, 0.01, 0.002, (-2.0, -0.7))  # of who has just learned to drive
+SMALL_STEPS = Steps(0.03, 0.006, 0.001, (-2.3, -1.0))  # of a model that drives or races well
 UNITS = [128, 128]  # of a new policy
 
 
@@ -87,7 +106,7 @@ parser.add_argument("--track", nargs="+", default=["aalborg"], help="one, or sev
 parser.add_argument("--alone", type=int, help="timesteps without other cars")
 parser.add_argument("--robots", type=int, default=6_000_000, help="timesteps in races")
 parser.add_argument("--driver", help="model that drives alone, to go on from, such as ppo-roads")
-parser.add_argument("--racer", help="model that races, to go on from, such as ppo-racer-roads")
+parser.add_argument("--racer", help="model that races, to go on from, such as ppo-racer")
 parser.add_argument("--ancestor", help="racer to go on from, and to race against")
 parser.add_argument(
     "--values",
@@ -231,44 +250,61 @@ def with_values(
     return model.policy.state_dict()
 
 
-def begin_to_race(weights: dict) -> None:
+def begin_to_race(weights: dict, sensors: Sequence[str]) -> None:
     """
     Let a policy that has never met a car see others without fright.
 
     Alone it saw zeros for rivals, so the weights of theirs are those that it was born with. A
-    driver that never saw them has none. Rivals come last.
+    driver that never saw them has none.
     """
-    features = feature_slices(SENSORS)
-    seen = min(where.start for name, where in features.items() if "rivals" in name)
-    missing = max(where.stop for where in features.values()) - seen
+    features = feature_slices(sensors)
+    size = max(where.stop for where in features.values())
+    rivals = {i for name in features if "rivals" in name for i in range(size)[features[name]]}
+    others = [i for i in range(size) if i not in rivals]
     for net in ("policy_net", "value_net"):
         name = f"mlp_extractor.{net}.0.weight"
         if name not in weights:
             continue
-        if weights[name].shape[1] not in (seen, seen + missing):
-            raise SystemExit(
-                "the driver sees other things; take one with the sensors base and line: ppo-roads"
-            )
-        weights[name] = nn.functional.pad(weights[name][:, :seen], (0, missing))
+        known = weights[name]
+        weights[name] = known.new_zeros(len(known), size)
+        weights[name][:, others] = known[:, others] if known.shape[1] == size else known
+
+
+def how_to_drive(known: str | None) -> dict:
+    """
+    Tell how a racer drives: as the model from which it goes on, and seeing other cars.
+
+    :param known: the model's name or path
+    """
+    drives = dict(FROM_NOTHING)
+    if known is not None:
+        usual = {"sensors": ["base"], "action": "pedals"}
+        drives = usual | training_record(find_model(known)).kept(FROM_NOTHING)
+    if drives["action"] != "pedal":
+        raise SystemExit(
+            f"'{known}' drives with action=\"{drives['action']}\"; take a model of PPO with "
+            'action="pedal", such as ppo-any-road'
+        )
+    sensors = drives["sensors"]
+    drives["sensors"] = [*sensors, *({"rivals"} - {*sensors})]
+    return drives
 
 
 def main() -> None:
     args = parser.parse_args()
     several = len(args.track) > 1
     settings = ALL_ROADS if several else ONE_TRACK
-    env_kwargs = {
-        "track": args.track if several else args.track[0],
-        "sensors": list(SENSORS), "range_finders": "narrow", "action": "pedal",
-        "gearbox": "road_speed", "action_repeat": 5,
-        "unstick": True, "keep_distance": True, "keep_clear": True,
-    }  # fmt: skip
     racer, driver = args.ancestor or args.racer, args.driver
     known = racer or driver
+    env_kwargs = {
+        "track": args.track if several else args.track[0], **how_to_drive(known),
+        "unstick": True, "keep_distance": True, "keep_clear": True, "catch_slides": True,
+    }  # fmt: skip
     weights = (
         learned_weights(find_model(known)) if known else learn_alone(args, env_kwargs, settings)
     )
     if racer is None:
-        begin_to_race(weights)
+        begin_to_race(weights, env_kwargs["sensors"])
     units = [len(weights[f"mlp_extractor.policy_net.{layer}.bias"]) for layer in (0, 2)]
 
     # Some cars stay alone, for the pace: in races they are seldom free to drive at their own.
@@ -277,13 +313,15 @@ def main() -> None:
     # Damage comes seldom and in heaps, so that short rollouts would lead astray. To follow a slower
     # car costs little at once, and much in the end, so it looks further ahead.
     weights = with_values(weights, cars, args, settings, units)
+    steps = SMALL_STEPS if known else BIG_STEPS
     model = make_model(cars, args.seed, 256, 0.99, settings, units)
+    vars(model)["learning_rate_factor"] = steps.rate  # of AdaptiveLearningRateCallback
     model.policy.load_state_dict(weights)
     # It has become sure of what to do, and has to try things again: who never brakes does not find
     # out that it ends a long contact.
     with th.no_grad():
-        model.policy.log_std.copy_(th.tensor([-2.0, -0.7]))
-    model.learn(args.robots, callback=callbacks(env_kwargs, args, "races", 0.01, 0.002))
+        model.policy.log_std.copy_(th.tensor(steps.log_std))
+    model.learn(args.robots, callback=callbacks(env_kwargs, args, "races", steps.kl, steps.last_kl))
     cars.close()
     model.save(args.folder / "model")
     print(f"saved {args.folder}/model.zip; race it: sb3-torcs race {args.folder}/model.zip inferno")

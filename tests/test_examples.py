@@ -75,21 +75,26 @@ def test_a_racer_is_trained_alone_and_against_robots(monkeypatch, capsys, tmp_pa
     assert racer.name == "model"
 
 
-@pytest.mark.parametrize("driver", ["ppo-roads", "ppo-everywhere"])
+@pytest.mark.parametrize("driver", ["ppo-roads", "ppo-any-road", "ppo-post"])
 def test_a_racer_goes_on_from_a_driver_that_never_saw_a_car(
     driver, monkeypatch, capsys, tmp_path, game
 ):
-    """Also from a student, whose file has no value function, and more units."""
+    """
+    Also from a student, whose file has no value function, more units, and a sensor that comes after
+    the rivals.
+    """
     budget = ["--driver", driver, "--values=1", "--robots=1", "--races=2"]
     run(monkeypatch, "train_racer.py", *budget, "--folder", str(tmp_path))
     assert f"{tmp_path}/model.zip" in capsys.readouterr().out
     weights = saved_weights(tmp_path / "model.zip")
     assert all(tensor.isfinite().all() for tensor in weights.values())
+    sees = driver_record(driver).env_kwargs.get("sensors", ["base"])
+    assert driver_record(tmp_path / "model.zip").env_kwargs["sensors"] == [*sees, "rivals"]
 
 
-def test_a_racer_needs_a_driver_that_sees_the_line(monkeypatch, tmp_path, game):
-    with pytest.raises(SystemExit, match="the sensors base and line"):
-        run(monkeypatch, "train_racer.py", "--driver=ppo-aalborg", "--folder", str(tmp_path))
+def test_a_racer_needs_a_driver_with_one_pedal(monkeypatch, tmp_path, game):
+    with pytest.raises(SystemExit, match="'ddpg-roads' drives with action=\"pedals\"; take a"):
+        run(monkeypatch, "train_racer.py", "--driver=ddpg-roads", "--folder", str(tmp_path))
 
 
 def test_specialists_teach_one_student(monkeypatch, capsys, tmp_path, game):
