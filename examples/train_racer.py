@@ -27,7 +27,7 @@ from sb3_torcs.sensors import feature_slices
 from sb3_torcs.vec_env import JoinedVecEnv, MirrorVecEnv, TorcsVecEnv
 
 FROM_NOTHING = {
-    "sensors": ["base", "line"], "range_finders": "narrow", "action": "pedal",
+    "sensors": ["base", "line", "rivals"], "range_finders": "narrow", "action": "pedal",
     "gearbox": "road_speed", "action_repeat": 5,
 }  # fmt: skip
 """How a racer drives that learns from nothing."""
@@ -40,20 +40,6 @@ FIELDS = (
 )
 BESIDE_ANCESTORS = ((), ("bt", "berniw", "inferno:4"), ("lliaw", "olethros", "tita", "bt:3"))
 AGENTS = 3  # in each race, behind the others
-
-
-@dataclass(frozen=True)
-class Steps:
-    """How far a policy may go from what it knows, while it learns to race."""
-
-    rate: float  # of the learning rate at the begin, from which it adapts
-    kl: float  # target of the divergence per update, at the begin [nats]
-    last_kl: float  # at the end [nats]
-    log_std: tuple[float, float]  # of steering and pedal, with which it tries things
-
-
-BIG_STEPS = Steps(1.0, 0.01, 0.002, (-2.0, -0.7))  # of who has just learned to drive
-SMALL_STEPS = Steps(0.03, 0.006, 0.001, (-2.3, -1.0))  # of a model that drives or races well
 UNITS = [128, 128]  # of a new policy
 
 
@@ -83,6 +69,20 @@ ALL_ROADS = Settings(
     off_line=(-4.0, -1.5), batch_size=2048, ent_coef=0.004, mirror=True,
     grip=[0.85, 1.0],
 )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Steps:
+    """How far a policy may go from what it knows, while it learns to race."""
+
+    rate: float  # of the learning rate at the begin, from which it adapts
+    kl: float  # target of the divergence per update, at the begin [nats]
+    last_kl: float  # at the end [nats]
+    log_std: tuple[float, float]  # of steering and pedal, with which it tries things
+
+
+BIG_STEPS = Steps(1.0, 0.01, 0.002, (-2.0, -0.7))  # of who has just learned to drive
+SMALL_STEPS = Steps(0.03, 0.006, 0.001, (-2.3, -1.0))  # of a model that drives or races well
 
 
 def reward_alone(off_line: float) -> dict[str, float]:
@@ -259,13 +259,19 @@ def begin_to_race(weights: dict, sensors: Sequence[str]) -> None:
     """
     features = feature_slices(sensors)
     size = max(where.stop for where in features.values())
-    rivals = {i for name in features if "rivals" in name for i in range(size)[features[name]]}
-    others = [i for i in range(size) if i not in rivals]
+    others = th.ones(size, dtype=th.bool)
+    for sensor, where in features.items():
+        others[where] = "rivals" not in sensor
     for net in ("policy_net", "value_net"):
         name = f"mlp_extractor.{net}.0.weight"
         if name not in weights:
             continue
         known = weights[name]
+        if known.shape[1] not in (others.sum(), size):
+            raise SystemExit(
+                "the driver sees several timesteps at once, or other sensors than its record "
+                "says; take another one, such as ppo-any-road"
+            )
         weights[name] = known.new_zeros(len(known), size)
         weights[name][:, others] = known[:, others] if known.shape[1] == size else known
 
@@ -276,17 +282,17 @@ def how_to_drive(known: str | None) -> dict:
 
     :param known: the model's name or path
     """
-    drives = dict(FROM_NOTHING)
-    if known is not None:
-        usual = {"sensors": ["base"], "action": "pedals"}
-        drives = usual | training_record(find_model(known)).kept(FROM_NOTHING)
+    if known is None:
+        return FROM_NOTHING
+    record = training_record(find_model(known))
+    drives = {"sensors": ["base"], "action": "pedals", **record.kept(FROM_NOTHING)}
+    advice = 'take a model of PPO with action="pedal" and BoundedPolicy, such as ppo-any-road'
     if drives["action"] != "pedal":
-        raise SystemExit(
-            f"'{known}' drives with action=\"{drives['action']}\"; take a model of PPO with "
-            'action="pedal", such as ppo-any-road'
-        )
-    sensors = drives["sensors"]
-    drives["sensors"] = [*sensors, *({"rivals"} - {*sensors})]
+        raise SystemExit(f"'{known}' drives with action=\"{drives['action']}\"; {advice}")
+    policy = "none that is known" if record.policy is None else record.policy["class"]
+    if not policy.endswith("BoundedPolicy"):
+        raise SystemExit(f"the policy of '{known}' is {policy}; {advice}")
+    drives["sensors"] = [*dict.fromkeys((*drives["sensors"], "rivals"))]
     return drives
 
 
@@ -315,7 +321,7 @@ def main() -> None:
     weights = with_values(weights, cars, args, settings, units)
     steps = SMALL_STEPS if known else BIG_STEPS
     model = make_model(cars, args.seed, 256, 0.99, settings, units)
-    vars(model)["learning_rate_factor"] = steps.rate  # of AdaptiveLearningRateCallback
+    vars(model)["learning_rate_factor"] = steps.rate  # AdaptiveLearningRateCallback goes on from it
     model.policy.load_state_dict(weights)
     # It has become sure of what to do, and has to try things again: who never brakes does not find
     # out that it ends a long contact.

@@ -9,11 +9,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from stable_baselines3 import PPO
 
 from sb3_torcs.agents.model_file import saved_weights
+from sb3_torcs.agents.model_writing import RecordCallback
 from sb3_torcs.agents.models import AGENTS, driver_record, shipped_agents
 from sb3_torcs.callbacks.lines import DrivenLap, driven_laps
 from sb3_torcs.errors import OutputNotWritable
@@ -95,6 +97,20 @@ def test_a_racer_goes_on_from_a_driver_that_never_saw_a_car(
 def test_a_racer_needs_a_driver_with_one_pedal(monkeypatch, tmp_path, game):
     with pytest.raises(SystemExit, match="'ddpg-roads' drives with action=\"pedals\"; take a"):
         run(monkeypatch, "train_racer.py", "--driver=ddpg-roads", "--folder", str(tmp_path))
+
+
+def test_a_racer_needs_a_driver_that_sees_one_timestep(monkeypatch, tmp_path, game):
+    with pytest.raises(SystemExit, match="sees several timesteps at once, or"):
+        run(monkeypatch, "train_racer.py", "--driver=ppo-robust", "--folder", str(tmp_path))
+
+
+def test_a_racer_needs_a_driver_with_its_policy(monkeypatch, tmp_path, game):
+    with gym.make("Torcs-v0", action="pedal") as env:
+        model = PPO("MlpPolicy", env, n_steps=2, batch_size=2, device="cpu")
+        model.learn(2, callback=RecordCallback())
+    model.save(tmp_path / "other.zip")
+    with pytest.raises(SystemExit, match="ActorCriticPolicy; take a model of PPO with"):
+        run(monkeypatch, "train_racer.py", "--driver", str(tmp_path / "other.zip"))
 
 
 def test_specialists_teach_one_student(monkeypatch, capsys, tmp_path, game):
