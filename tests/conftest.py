@@ -14,6 +14,7 @@ import pytest
 import torch._dynamo  # noqa: F401
 
 from sb3_torcs.car import CONTROL_TICK, CarState
+from sb3_torcs.envs.racing import RacingEnv
 from sb3_torcs.errors import BackendUnavailable
 from sb3_torcs.sensors import SENSORS
 from sb3_torcs.torcs.installation import find_game
@@ -101,6 +102,15 @@ class ScriptedBackend:
 
     def close(self):
         self.closed += 1
+
+
+def held_with(aid, oval, asked, **state):
+    """What a car with a driver aid holds in the timestep after the one that ends with a state."""
+    env = RacingEnv(ScriptedBackend(oval, state, {}), recovery=10.0, **{aid: True})
+    env.reset(seed=0)
+    env.step(asked)
+    env.step(asked)
+    return env.controls
 
 
 def plainly_encoded(car):

@@ -231,9 +231,3 @@ def test_a_world_without_races_has_nobody_to_keep_from(game, world, aid):
         InvalidOption, match=f"other cars, which is needed for '{aid}'; use Torcs-v0 with"
     ):
         gym.make(**world, **{aid: True})
-
-
-@pytest.mark.parametrize("aid", AIDS)
-def test_only_yes_or_no_is_an_answer(aid):
-    with pytest.raises(InvalidOption, match=f"{aid} is 1; expected True or False"):
-        gym.make("TorcsLite-v0", **{aid: 1})

@@ -8,24 +8,16 @@ from functools import partial
 import gymnasium as gym
 import numpy as np
 import pytest
-from conftest import ScriptedBackend
+from conftest import held_with
 from vectors import assert_they_see_the_same, both_kinds
 
 from sb3_torcs.car import STEER_LOCK, Controls
-from sb3_torcs.envs.racing import RacingEnv
-from sb3_torcs.errors import InvalidOption
 
 ASKED = np.array([0.3, 0.0, 0.4], np.float32)
 AS_ASKED = Controls(*map(float, ASKED))
 
 
-def held(oval, **state):
-    """What a car holds in the timestep after the one that ends with a state."""
-    env = RacingEnv(ScriptedBackend(oval, state, {}), recovery=10.0, catch_slides=True)
-    env.reset(seed=0)
-    env.step(ASKED)
-    env.step(ASKED)
-    return env.controls
+held = partial(held_with, "catch_slides", asked=ASKED)
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
@@ -86,9 +78,3 @@ def test_races_driven_at_once_catch_slides_as_single_ones_do(request, env_id):
             envs.set_options({"distance": 1200.0, "speed": 60.0})
         ours.action_space.low[2] = theirs.action_space.low[2] = 0.2
         assert_they_see_the_same(ours, theirs)
-
-
-@pytest.mark.parametrize("catch_slides", [1, "yes", None])
-def test_only_yes_or_no_is_an_answer(catch_slides):
-    with pytest.raises(InvalidOption, match=r"catch_slides is .*; expected True or False"):
-        gym.make("TorcsLite-v0", catch_slides=catch_slides)

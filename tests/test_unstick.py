@@ -8,12 +8,10 @@ from functools import partial
 import gymnasium as gym
 import numpy as np
 import pytest
-from conftest import ScriptedBackend
+from conftest import held_with
 from vectors import assert_they_see_the_same, both_kinds
 
 from sb3_torcs.car import Controls
-from sb3_torcs.envs.racing import RacingEnv
-from sb3_torcs.errors import InvalidOption
 
 ASKED = np.array([0.3, 0.9, 0.0], np.float32)
 FREELY = {"unstick": True, "recovery": 15.0, "runoff": 8.0}
@@ -28,13 +26,7 @@ def make(request):
     return partial(gym.make, name, **({"backend": "scr"} if other else {}))
 
 
-def held(oval, **state):
-    """What a car holds in the timestep after the one that ends with a state."""
-    env = RacingEnv(ScriptedBackend(oval, state, {}), recovery=10.0, unstick=True)
-    env.reset(seed=0)
-    env.step(ASKED)
-    env.step(ASKED)
-    return env.controls
+held = partial(held_with, "unstick", asked=ASKED)
 
 
 @pytest.mark.parametrize(
@@ -121,9 +113,3 @@ def test_who_has_not_asked_for_it_drives_on(make):
     controls = env.unwrapped.controls
     assert controls == Controls(*map(float, ASKED))
     env.close()
-
-
-@pytest.mark.parametrize("unstick", [1, "yes", None])
-def test_only_yes_or_no_is_an_answer(unstick):
-    with pytest.raises(InvalidOption, match="expected True or False"):
-        gym.make("TorcsLite-v0", unstick=unstick)
