@@ -6,7 +6,7 @@ import math
 
 from sb3_torcs.car import STEER_LOCK, CarState
 
-__all__ = ["caught_steering", "slides"]
+__all__ = ["caught_steering", "sideslip", "slides"]
 
 SIDESLIP = 0.3  # [rad] from which on a car slides; on asphalt it corners with about 0.1
 SLOWEST = 8.0  # [m/s] below which a car that slides comes to a stand soon enough
@@ -14,7 +14,9 @@ SLOWEST = 8.0  # [m/s] below which a car that slides comes to a stand soon enoug
 
 def sideslip(car: CarState) -> float:
     """
-    Return the angle between where a car goes and where it points [rad], left positive.
+    Return the angle from where a car points to where it goes [rad], left positive.
+
+    Compiled code calls it, too.
 
     :param car: at the begin of a timestep
     """
@@ -36,10 +38,10 @@ def slides(car: CarState) -> bool:
 
 def caught_steering(car: CarState) -> float:
     """
-    Turn the front wheels to where the car goes, while nobody brakes or accelerates.
+    Return the steering that points the front wheels where the car goes.
 
-    With neither, the tyres have all of their grip for turning the car back. Compiled code calls
-    it, too.
+    Leave the pedals alone meanwhile: then the tyres have all of their grip to turn the car back.
+    Compiled code calls it, too.
 
     :param car: that :func:`slides`
     :return: steering as of :class:`~sb3_torcs.car.Controls`
