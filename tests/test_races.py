@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import gymnasium as gym
 import numpy as np
@@ -16,6 +17,7 @@ from sb3_torcs.agents.pilots import Crew
 from sb3_torcs.agents.robots import race as robots_race
 from sb3_torcs.agents.scripted import ScriptedDriver
 from sb3_torcs.cli import main
+from sb3_torcs.envs.aids import AIDS, aids_named
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.evaluation.comparing import saved_drives
 from sb3_torcs.races import protocol
@@ -281,6 +283,51 @@ def test_no_report_is_made_of_a_race_without_a_whole_lap(capsys, game, monkeypat
     assert (report.exists(), picture.is_file()) == (False, True)
     assert f"picture: {picture}" in printed.out
     assert "report:" not in printed.out
+
+
+def test_an_agent_that_learned_alone_may_get_aids(game):
+    """``ppo-racer-roads`` is ``ppo-any-road`` with all aids: the same race to the bit."""
+    races = [
+        run_race(find_entrants(["bt", "inferno", agent], game, aids), SHORT, laps=1)
+        for agent, aids in (("ppo-any-road", AIDS), ("ppo-racer-roads", ()), ("ppo-any-road", ()))
+    ]
+    aided, shipped, alone = (
+        [{**standing.as_dict(), "driver": None} for standing in race.standings] for race in races
+    )
+    assert aided == shipped != alone
+
+
+@pytest.mark.parametrize(
+    ("names", "aids"),
+    [
+        ("all", AIDS),
+        ("keep_clear", ("keep_clear",)),
+        ("unstick, keep_clear", ("unstick", "keep_clear")),
+    ],
+)
+def test_aids_are_named_on_the_command_line(names, aids):
+    assert aids_named(names) == aids
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        ("keep_clea", "no driver aid 'keep_clea'; did you mean 'keep_clear'"),
+        ("unstick,", "no driver aid ''; driver aids: unstick"),
+        ("unstick,all", "no driver aid 'all'; driver aids: unstick.*or 'all' alone"),
+    ],
+)
+def test_no_such_aid(capsys, game, names, message):
+    assert main(["race", "scripted", "bt", "--aids", names]) == 2
+    assert re.search(message, capsys.readouterr().err)
+
+
+def test_an_agent_with_aids_and_without_a_record_is_still_told(game, tmp_path):
+    file = tmp_path / "plain.zip"
+    PPO("MlpPolicy", "sb3_torcs:TorcsLite-v0", n_steps=2, batch_size=2, device="cpu").save(file)
+    (entrant,) = find_entrants([str(file)], game, ["unstick"])
+    assert not entrant.agent.record.known
+    assert entrant.agent.kept(["action"]) == {"unstick": True}
 
 
 def test_policies_of_one_driver_are_asked_at_once(monkeypatch, game):

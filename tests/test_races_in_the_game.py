@@ -94,10 +94,24 @@ def test_an_agent_that_sees_more_than_the_server_tells_is_refused(game, alone):
         env_kwargs={"sensors": ["base", "rivals", "race", "car"]}
     )
     with pytest.raises(
-        ModelMismatch, match=r"sensors 'car', 'race', 'rivals', of which.*leave out --game"
+        ModelMismatch, match=r"drives with 'car', 'race', 'rivals', for which.*leave out --game"
     ):
         run_game_race(order, TRACK, laps=1)
     assert list(alone.iterdir()) == []
+
+
+def test_aids_that_look_at_other_cars_are_refused(game, alone):
+    order = find_entrants(["bt", "scripted"], game, ["unstick", "keep_clear"])
+    with pytest.raises(ModelMismatch, match=r"'scripted' drives with 'keep_clear', for which"):
+        run_game_race(order, TRACK, laps=1)
+    assert list(alone.iterdir()) == []
+
+
+def test_aids_work_in_the_game_as_in_the_engine(game):
+    order = find_entrants(["scripted", "bt"], game, ["unstick", "catch_slides"])
+    assert told(run_game_race(order, TRACK, laps=1)) == as_the_game_tells(
+        run_race(order, TRACK, laps=1)
+    )
 
 
 def test_what_the_game_does_not_tell_cannot_be_drawn(capsys, tmp_path, game):

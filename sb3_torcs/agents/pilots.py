@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -29,18 +29,29 @@ class CarOfAnAgent:
     What an agent's car needs before its race is loaded.
 
     :param driver: as of :func:`~sb3_torcs.agents.models.load_driver`
+    :param aids: names of driver aids that it gets besides those that it was trained with
     :raises InvalidOption: if there is no such agent, or it is a ghost
     """
 
-    def __init__(self, driver: str) -> None:
+    def __init__(self, driver: str, aids: Iterable[str] = ()) -> None:
         if is_ghost(driver):
             raise InvalidOption(f"'{driver}' is a ghost, which looks at nobody and cannot race")
         self.driver = driver
         self.record = agent_record(driver, find_game())
+        self._aids = dict.fromkeys(aids, True)
         kwargs = self.record.env_kwargs
         self.car = self.record.one_car
         self.gearbox: str = kwargs.get("gearbox", "automatic")
         self.angles: FloatArray = range_finder_angles(kwargs.get("range_finders", "scr"))
+
+    def kept(self, names: Iterable[str]) -> dict[str, Any]:
+        """
+        Tell how the agent drives: as in its training, and with the aids that it was given.
+
+        :param names: of options of an environment
+        :return: those that its training had, and the aids
+        """
+        return {**self.record.kept(names), **self._aids}
 
 
 class Pilots:
@@ -57,7 +68,7 @@ class Pilots:
     def __init__(self, cars: Sequence[CarOfAnAgent], race: SharedRace, trust: bool = False) -> None:
         self._race = race
         self._envs = [
-            RaceCarEnv(seat, **car.record.kept(OF_THE_ENV))
+            RaceCarEnv(seat, **car.kept(OF_THE_ENV))
             for car, seat in zip(cars, race.seats, strict=True)
         ]
         self._teams: dict[str, list[int]] = {}

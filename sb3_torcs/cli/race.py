@@ -45,7 +45,8 @@ LAST_RACE = ("place", "driver", "from", "laps", "time s", "best lap s", "damage"
 
 DESCRIPTION = """\
 Let drivers race against each other: robots of the game, shipped agents, files of trained ones. Each
-agent sees and drives as in its training; the rules and the flag are the game's.
+agent sees and drives as in its training; the rules and the flag are the game's. One that learned
+alone hits others, unless --aids all lets it brake and steer for them.
 
 Drivers and worlds are deterministic, so races differ by the grid, which is drawn from the seed of
 each race: --grid last puts the first driver behind all others, whose order is drawn; random draws
@@ -81,6 +82,9 @@ def add_parser(subparsers: Any) -> None:
     add("--laps", type=positive, default=5, metavar="N", help="laps of a race; default: 5")
     add("--races", type=positive, default=20, metavar="N", help="races to hold; default: 20")
     add("--grid", choices=GRIDS, default="last", help="who starts where; default: last")
+    add("--aids", metavar="NAMES",
+        help="driver aids for each agent, besides those that it learned with: all, or names with "
+        "commas between them, e.g. keep_distance,keep_clear")  # fmt: skip
     add("--field", type=positive, metavar="N", help="cars in a race; default: all drivers")
     add("--seed", type=seed, default=0, metavar="S", help="seed of the first race; default: 0")
     add("--video", metavar="FILE.mp4",
@@ -109,6 +113,7 @@ def run(args: argparse.Namespace) -> int:
         for what, suffixes in FILES.items()
         if getattr(args, what)
     }
+    from sb3_torcs.envs.aids import aids_named
     from sb3_torcs.errors import InvalidOption
     from sb3_torcs.races.entrants import find_entrants
     from sb3_torcs.telemetry import DriveLog
@@ -117,7 +122,8 @@ def run(args: argparse.Namespace) -> int:
     if args.game and files:
         raise InvalidOption(f"--{next(iter(files))} is for races of the engine; leave out --game")
     with quiet_output(args.json):
-        entrants = find_entrants(args.drivers, find_game())
+        aids = aids_named(args.aids) if args.aids is not None else ()
+        entrants = find_entrants(args.drivers, find_game(), aids)
         for agent in (entrant.agent for entrant in entrants if entrant.agent is not None):
             warn_unless_known(agent.driver, agent.record)
         log = DriveLog() if "telemetry" in files or "report" in files else None

@@ -7,9 +7,10 @@ from dataclasses import dataclass, fields
 from sb3_torcs.car import CarState, Controls, checked_flag
 from sb3_torcs.envs.slides import caught_steering, slides
 from sb3_torcs.envs.unstick import freeing_controls, needs_freeing
+from sb3_torcs.errors import InvalidOption, near_miss
 from sb3_torcs.rivals import needed_brake, needed_turn
 
-__all__ = ["AIDS", "NEED_RIVALS", "Aids"]
+__all__ = ["AIDS", "NEED_RIVALS", "Aids", "aids_named"]
 
 
 @dataclass
@@ -55,3 +56,21 @@ AIDS = tuple(aid.name for aid in fields(Aids))
 
 NEED_RIVALS = ("keep_distance", "keep_clear")
 """Those that have to see other cars."""
+
+
+def aids_named(names: str) -> tuple[str, ...]:
+    """
+    Read the names of driver aids.
+
+    :param names: with commas between them, or ``"all"``
+    :return: the names
+    :raises InvalidOption: if there is no aid of such a name
+    """
+    if names == "all":
+        return AIDS
+    aids = tuple(name.strip() for name in names.split(","))
+    for aid in aids:
+        if aid not in AIDS:
+            advice = f"driver aids: {', '.join(AIDS)}; or 'all' alone"
+            raise InvalidOption(f"no driver aid '{aid}'{near_miss(aid, AIDS, advice)}")
+    return aids

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -31,16 +31,17 @@ class Entrant:
     agent: CarOfAnAgent | None = None
 
 
-def find_entrants(drivers: Sequence[str], game: Game) -> list[Entrant]:
+def find_entrants(drivers: Sequence[str], game: Game, aids: Iterable[str] = ()) -> list[Entrant]:
     """
     Find drivers by their names.
 
     :param drivers: robots, e.g. ``"inferno"`` or ``"bt:3"``; shipped agents; or paths of models
     :param game: the installation
+    :param aids: names of driver aids that each agent gets besides its own
     :return: in the same order; names that would be equal have folders before them
     :raises InvalidOption: if one is named twice, or there is none of this name
     """
-    entrants = [_find(driver, game) for driver in drivers]
+    entrants = [_find(driver, game, aids) for driver in drivers]
     driven = [_driven(entrant) for entrant in entrants]
     for driver, what in zip(drivers, driven, strict=True):
         if driven.count(what) > 1:
@@ -48,9 +49,9 @@ def find_entrants(drivers: Sequence[str], game: Game) -> list[Entrant]:
     return _told_apart(entrants)
 
 
-def _find(driver: str, game: Game) -> Entrant:
+def _find(driver: str, game: Game, aids: Iterable[str]) -> Entrant:
     if not game.has_robot(driver):
-        return Entrant(driver_name(driver), agent=CarOfAnAgent(driver))
+        return Entrant(driver_name(driver), agent=CarOfAnAgent(driver, aids))
     robot = name, index = game.parse_robot(driver)
     usual = game.parse_robot(name) == robot
     return Entrant(name if usual else f"{name}:{index}", robot=robot)

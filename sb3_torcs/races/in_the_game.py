@@ -12,6 +12,7 @@ import numpy as np
 from sb3_torcs.agents import text_mode
 from sb3_torcs.agents.model_record import DRIVEN_WITH
 from sb3_torcs.agents.remote import Agent
+from sb3_torcs.envs.aids import NEED_RIVALS
 from sb3_torcs.errors import GameFailed, InvalidOption, ModelMismatch, ServerLost
 from sb3_torcs.races.entrants import Entrant
 from sb3_torcs.races.protocol import Race, Standing
@@ -126,14 +127,16 @@ def _client(entrant: Entrant, race: RaceSetup, port: int, trust: bool) -> Agent:
     """Load an agent with what it sees and drives as in its training."""
     pilot = entrant.agent
     assert pilot is not None, "robots are the game's"
-    untold = (NEEDS_RACE | NEEDS_CAR).intersection(pilot.record.env_kwargs.get("sensors", ()))
+    options = pilot.kept(DRIVEN_WITH)
+    untold = sorted((NEEDS_RACE | NEEDS_CAR).intersection(options.get("sensors", ())))
+    untold += [aid for aid in NEED_RIVALS if options.get(aid)]
     if untold:
         raise ModelMismatch(
-            f"'{entrant.name}' was trained with sensors {', '.join(map(repr, sorted(untold)))}, of "
-            "which the game's server does not tell; leave out --game"
+            f"'{entrant.name}' drives with {', '.join(map(repr, untold))}, for which the game's "
+            "server tells too little; leave out --game"
         )
     settings: dict[str, Any] = {
-        **pilot.record.kept(DRIVEN_WITH),
+        **options,
         "track": race.track, "car": pilot.car, "host": "127.0.0.1", "port": port,
     }  # fmt: skip
     return Agent(pilot.driver, settings, trust=trust, name=entrant.name)
