@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from sb3_torcs.agents.models import driver_record, load_driver
 from sb3_torcs.agents.robots import race
 from sb3_torcs.callbacks.metrics import BRAKING
+from sb3_torcs.errors import ends_in_a_line
 from sb3_torcs.evaluation.protocol import drive, race_environment
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.tracks.catalogue import load_track
@@ -167,7 +168,7 @@ def draw_bends(figure, laps, track):
         axes.set(xticks=[], yticks=[])
 
 
-if __name__ == "__main__":
+def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("drivers", nargs="+", help="models, shipped agents or robots")
     parser.add_argument("--track", default="aalborg")
@@ -192,3 +193,8 @@ if __name__ == "__main__":
     draw_bends(bends, laps, track)
     figure.savefig(args.out, dpi=100)
     print(args.out)
+
+
+if __name__ == "__main__":
+    with ends_in_a_line():
+        main()

@@ -19,6 +19,7 @@ from sb3_torcs.agents.models import driver_record, load_driver
 from sb3_torcs.agents.rollout import Driver, drive
 from sb3_torcs.car import Start
 from sb3_torcs.cli.common import table
+from sb3_torcs.errors import ends_in_a_line
 
 ROUNDING = 1e-6  # [-] between observations, which are at most 3
 SAME = 1e-4  # [-] between two actions that count as equal
@@ -121,4 +122,5 @@ def times(laps: list[float]) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    with ends_in_a_line():
+        main()

@@ -23,7 +23,7 @@ from sb3_torcs.agents.models import find_model, load_driver, saved_timesteps, tr
 from sb3_torcs.callbacks.lines import draw_learning, driven_laps
 from sb3_torcs.callbacks.progress import spoken_moment
 from sb3_torcs.cli.common import positive, seed
-from sb3_torcs.errors import OutputNotWritable, Sb3TorcsError
+from sb3_torcs.errors import OutputNotWritable, ends_in_a_line
 from sb3_torcs.evaluation.protocol import choose_world, evaluate, time_limit
 from sb3_torcs.evaluation.recording import Recorder, best_stretch
 from sb3_torcs.files import writable_folder
@@ -322,7 +322,5 @@ def again(folder: Path, how: str) -> str:
 
 
 if __name__ == "__main__":
-    try:
+    with ends_in_a_line():
         sys.exit(main())
-    except Sb3TorcsError as error:
-        sys.exit(f"error: {error}")

@@ -22,6 +22,7 @@ from sb3_torcs.agents.model_file import learned_weights, saved_data
 from sb3_torcs.agents.model_record import DRIVEN_WITH
 from sb3_torcs.agents.model_writing import recipe, write_record
 from sb3_torcs.agents.models import driver_record, find_model
+from sb3_torcs.errors import ends_in_a_line
 from sb3_torcs.policies import BoundedPolicy
 from sb3_torcs.policies.imitation import Imitation, mean_actions
 from sb3_torcs.vec_env import JoinedVecEnv, MirrorVecEnv, TorcsVecEnv
@@ -176,4 +177,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with ends_in_a_line():
+        main()

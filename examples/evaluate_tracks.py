@@ -13,6 +13,7 @@ from rich.progress import track as progress
 from sb3_torcs.agents import driver_record, load_driver
 from sb3_torcs.car import DEFAULT_CAR
 from sb3_torcs.cli.common import table
+from sb3_torcs.errors import ends_in_a_line
 from sb3_torcs.evaluation import evaluate, race_environment
 from sb3_torcs.evaluation.ladder import ROBOTS, reference_laps
 from sb3_torcs.tracks.catalogue import lasting_name, load_track, tracks_of
@@ -104,4 +105,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with ends_in_a_line():
+        main()

@@ -16,6 +16,7 @@ from sb3_torcs.agents.model_file import learned_weights, saved_data
 from sb3_torcs.agents.model_writing import RecordCallback, recipe
 from sb3_torcs.agents.models import driver_record, find_model
 from sb3_torcs.callbacks import AdaptiveLearningRateCallback, LeanUpdatesCallback
+from sb3_torcs.errors import ends_in_a_line
 from sb3_torcs.vec_env import TorcsVecEnv
 
 CARS, TIMESTEPS = 64, 128  # at once, and of each between updates
@@ -79,4 +80,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with ends_in_a_line():
+        main()

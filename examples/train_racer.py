@@ -22,6 +22,7 @@ from sb3_torcs.agents.model_file import VALUES, learned_weights
 from sb3_torcs.agents.model_writing import RecordCallback, recipe
 from sb3_torcs.agents.models import find_model, training_record
 from sb3_torcs.callbacks import AdaptiveLearningRateCallback, LeanUpdatesCallback
+from sb3_torcs.errors import ends_in_a_line
 from sb3_torcs.policies import BoundedPolicy
 from sb3_torcs.sensors import feature_slices
 from sb3_torcs.vec_env import JoinedVecEnv, MirrorVecEnv, TorcsVecEnv
@@ -334,4 +335,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with ends_in_a_line():
+        main()

@@ -5,10 +5,11 @@ Each message says what was received, what is allowed, and what to type next.
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import functools
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, TypeVar
 
 __all__ = [
@@ -50,6 +51,7 @@ __all__ = [
     "UnknownRobot",
     "WorkerLost",
     "ZooConfigError",
+    "ends_in_a_line",
     "near_miss",
     "renamed",
     "with_new_names",
@@ -208,6 +210,19 @@ class PackageMissing(Sb3TorcsError, ImportError):
 
 class ZooConfigError(Sb3TorcsError, ValueError):
     """A hyperparameter file has a mistake, such as a key that nothing reads."""
+
+
+@contextlib.contextmanager
+def ends_in_a_line() -> Iterator[None]:
+    """
+    Let a script end with the message of an error of this package, not with a traceback.
+
+    :raises SystemExit: with the message
+    """
+    try:
+        yield
+    except Sb3TorcsError as error:
+        raise SystemExit(f"error: {error}") from None
 
 
 def near_miss(name: str, known: Iterable[str], advice: str = "") -> str:

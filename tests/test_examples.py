@@ -191,6 +191,23 @@ def test_who_cannot_teach_is_told_so(name, words, message, monkeypatch, tmp_path
         run(monkeypatch, name, *words, "--folder", str(tmp_path))
 
 
+@pytest.mark.parametrize(
+    ("script", "words"),
+    [
+        ("evaluate_tracks.py", ["ppo-any-raod", "--track", "g-track-1"]),
+        ("distill.py", ["--teach", "ppo-any-raod", "aalborg"]),
+        ("specialize.py", ["ppo-any-raod", "--track", "aalborg"]),
+        ("train_racer.py", ["--driver", "ppo-any-raod"]),
+        ("compare_scr.py", ["ppo-any-raod"]),
+        ("compare_laps.py", ["ppo-any-raod"]),
+    ],
+)
+def test_a_wrong_name_ends_a_script_in_a_line(script, words, monkeypatch, tmp_path, game):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit, match=r"^error: there is no model 'ppo-any-raod'; did you mean"):
+        run(monkeypatch, script, *words)
+
+
 def test_teachers_who_drive_differently_are_refused(monkeypatch, tmp_path):
     teaching = ["--teach", "ppo-roads", "forza", "--teach", "ppo-racer", "aalborg"]
     with pytest.raises(SystemExit, match="ppo-racer drives with "):
