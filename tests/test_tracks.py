@@ -279,6 +279,19 @@ class TestCompactFile:
         with pytest.raises(TrackFileError, match=rf"ring\.csv, line {line}: .*{message}"):
             load_track(path)
 
+    @pytest.mark.parametrize(
+        ("grid", "message"),
+        [
+            ("-1.0,0.0", "the grid is -1 m before the line; expected 0 to "),
+            ("1e9,0.0", r"the grid is 1e\+09 m before the line; expected 0 to "),
+            ("7.0,-5.5", "the grid is -5.5 m from the axis, and the road ends at 5 m"),
+        ],
+    )
+    def test_a_grid_beside_the_road_is_refused(self, tmp_path, grid, message):
+        path = write(tmp_path, SMALL.replace("7.0,-2.0", grid))
+        with pytest.raises(TrackFileError, match=message):
+            load_track(path)
+
     @pytest.mark.parametrize("text", ["", "sb3-torcs track,1\nname,ring\n", "# nothing\n"])
     def test_a_file_without_segments_is_refused(self, tmp_path, text):
         with pytest.raises(TrackFileError, match="the file ends without a segment"):

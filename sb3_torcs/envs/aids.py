@@ -10,7 +10,7 @@ from sb3_torcs.envs.unstick import freeing_controls, needs_freeing
 from sb3_torcs.errors import InvalidOption, near_miss
 from sb3_torcs.rivals import needed_brake, needed_turn
 
-__all__ = ["AIDS", "NEED_RIVALS", "Aids", "aids_named"]
+__all__ = ["AIDS", "NEED_RIVALS", "Aids", "aided", "aids_named"]
 
 
 @dataclass
@@ -39,16 +39,37 @@ class Aids:
         """
         if self.unstick and needs_freeing(car):
             return Controls(*freeing_controls(car))
-        if self.keep_distance:
-            brake = needed_brake(car)
-            if brake > 0.0:
-                controls = controls._replace(throttle=0.0, brake=max(controls.brake, brake))
-        if self.keep_clear:
-            steering = min(max(controls.steering + needed_turn(car), -1.0), 1.0)
-            controls = controls._replace(steering=steering)
-        if self.catch_slides and slides(car):
-            controls = controls._replace(steering=caught_steering(car), throttle=0.0, brake=0.0)
-        return controls
+        steering, throttle, brake = aided(
+            car, controls[:3], self.keep_distance, self.keep_clear, self.catch_slides
+        )
+        return controls._replace(steering=steering, throttle=throttle, brake=brake)
+
+
+def aided(
+    car: CarState,
+    asked: tuple[float, float, float],
+    keep_distance: bool,
+    keep_clear: bool,
+    catch_slides: bool,
+) -> tuple[float, float, float]:
+    """
+    Change steering, throttle and brake where an aid steps in. Compiled code calls it, too.
+
+    :param car: at the begin of a timestep
+    :param asked: steering, throttle and brake
+    :param keep_distance: as of :class:`Aids`, and so on
+    :return: the same three
+    """
+    steering, throttle, brake = asked
+    if keep_distance:
+        least = needed_brake(car)
+        if least > 0.0:
+            throttle, brake = 0.0, max(brake, least)
+    if keep_clear:
+        steering = min(max(steering + needed_turn(car), -1.0), 1.0)
+    if catch_slides and slides(car):
+        steering, throttle, brake = caught_steering(car), 0.0, 0.0
+    return steering, throttle, brake
 
 
 AIDS = tuple(aid.name for aid in fields(Aids))

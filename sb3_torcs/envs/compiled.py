@@ -16,6 +16,7 @@ from numba.extending import overload_attribute, register_jitable
 
 from sb3_torcs import actions, rewards
 from sb3_torcs.car import CarState, FloatArray
+from sb3_torcs.envs.aids import aided
 from sb3_torcs.envs.ends import STUCK_TICKS, end_of, stands
 from sb3_torcs.envs.slides import caught_steering, sideslip, slides
 from sb3_torcs.envs.unstick import freeing_controls, needs_freeing
@@ -51,6 +52,7 @@ for _name in ("track_position", "off_track", "gap_ahead", "gap_behind", "contact
 _readers = (actions.action_layout(name).read for name in actions.ACTIONS)
 _aids = (
     needed_brake, needed_turn, needs_freeing, freeing_controls, sideslip, slides, caught_steering,
+    aided,
 )  # fmt: skip
 for _function in (end_of, stands, rewards.safe_speed, *_aids, *_readers):
     register_jitable(_function)
@@ -114,16 +116,9 @@ def aid_cars(cars: Any, aids: npt.NDArray[np.bool_], controls: FloatArray) -> No
             for i in range(5):
                 controls[row, i] = fields[i]
             continue
-        if keep_distance:
-            brake = needed_brake(cars[row])
-            if brake > 0.0:
-                controls[row, 1], controls[row, 2] = 0.0, max(controls[row, 2], brake)
-        if keep_clear:
-            steering = controls[row, 0] + needed_turn(cars[row])
-            controls[row, 0] = min(max(steering, -1.0), 1.0)
-        if catch_slides and slides(cars[row]):
-            controls[row, 0] = caught_steering(cars[row])
-            controls[row, 1] = controls[row, 2] = 0.0
+        asked = (controls[row, 0], controls[row, 1], controls[row, 2])
+        steering, throttle, brake = aided(cars[row], asked, keep_distance, keep_clear, catch_slides)
+        controls[row, 0], controls[row, 1], controls[row, 2] = steering, throttle, brake
 
 
 def _one_of(terms: Sequence[rewards.Term]) -> Any:
