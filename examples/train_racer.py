@@ -74,14 +74,15 @@ ALL_ROADS = Settings(
 
 @dataclass(frozen=True)
 class Steps:
-    """How far a policy may go from what it knows, while it learns to race."""
+    """How far a policy may go from what it knows."""
 
-    rate: float  # of the learning rate at the begin, from which it adapts
+    rate: float  # factor on the learning rate at the begin, from which it adapts
     kl: float  # target of the divergence per update, at the begin [nats]
     last_kl: float  # at the end [nats]
-    log_std: tuple[float, float]  # of steering and pedal, with which it tries things
+    log_std: tuple[float, float]  # of steering and pedal, with which it tries things at the begin
 
 
+ALONE = Steps(1.0, 0.012, 0.003, (-1.0, -0.3))  # of who does not know how to drive
 BIG_STEPS = Steps(1.0, 0.01, 0.002, (-2.0, -0.7))  # of who has just learned to drive
 SMALL_STEPS = Steps(0.03, 0.006, 0.001, (-2.3, -1.0))  # of a model that drives or races well
 
@@ -136,7 +137,7 @@ def make_model(
         policy_kwargs={
             "net_arch": list(units),
             "activation_fn": nn.ReLU,
-            "log_std_init": [-1.0, -0.3],  # steering, pedal
+            "log_std_init": list(ALONE.log_std),
         },
         seed=seed,
         device="cpu",
@@ -144,13 +145,15 @@ def make_model(
 
 
 def callbacks(
-    env_kwargs: dict, args: argparse.Namespace, stage: str, kl: float, last_kl: float
+    env_kwargs: dict, args: argparse.Namespace, stage: str, steps: Steps
 ) -> list[BaseCallback]:
     """Save models with what `sb3-torcs race` has to know of their training."""
     asked = recipe("ppo", "Torcs-v0", {"env_kwargs": env_kwargs})
     every = CheckpointCallback(4096, str(args.folder), name_prefix=stage)  # timesteps of each car
-    learning = [LeanUpdatesCallback(), AdaptiveLearningRateCallback(kl=kl, last_kl=last_kl)]
-    return [RecordCallback(asked), *learning, every]
+    adaptive = AdaptiveLearningRateCallback(
+        kl=steps.kl, last_kl=steps.last_kl, first_factor=steps.rate
+    )
+    return [RecordCallback(asked), LeanUpdatesCallback(), adaptive, every]
 
 
 def cars_alone(
@@ -208,7 +211,7 @@ def learn_alone(args: argparse.Namespace, env_kwargs: dict, settings: Settings) 
     cars = mirrored(cars_alone(settings.cars_alone, args, env_kwargs, settings), settings)
     model = make_model(cars, args.seed, 128, 0.985, settings, UNITS)
     timesteps = args.alone or settings.timesteps_alone
-    model.learn(timesteps, callback=callbacks(env_kwargs, args, "alone", 0.012, 0.003))
+    model.learn(timesteps, callback=callbacks(env_kwargs, args, "alone", ALONE))
     cars.close()
     return model.policy.state_dict()
 
@@ -322,13 +325,12 @@ def main() -> None:
     weights = with_values(weights, cars, args, settings, units)
     steps = SMALL_STEPS if known else BIG_STEPS
     model = make_model(cars, args.seed, 256, 0.99, settings, units)
-    vars(model)["learning_rate_factor"] = steps.rate  # AdaptiveLearningRateCallback goes on from it
     model.policy.load_state_dict(weights)
     # It has become sure of what to do, and has to try things again: who never brakes does not find
     # out that it ends a long contact.
     with th.no_grad():
         model.policy.log_std.copy_(th.tensor(steps.log_std))
-    model.learn(args.robots, callback=callbacks(env_kwargs, args, "races", steps.kl, steps.last_kl))
+    model.learn(args.robots, callback=callbacks(env_kwargs, args, "races", steps))
     cars.close()
     model.save(args.folder / "model")
     print(f"saved {args.folder}/model.zip; race it: sb3-torcs race {args.folder}/model.zip inferno")

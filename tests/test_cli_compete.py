@@ -44,7 +44,7 @@ def test_an_agent_drives_to_the_end_and_says_how_long_it_took(race, capsys):
     latency = figures["latency_ms"]
     assert 0.0 < latency["median"] <= latency["p99"] <= latency["longest"]
     process.wait(10.0)
-    (late,) = re.findall(r"timesteps, (\d+) late", process.words())
+    (late,) = re.findall(r"control ticks, (\d+) late", process.words())
     assert late == "0"
 
 

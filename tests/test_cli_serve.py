@@ -76,7 +76,7 @@ def test_a_client_drives_a_race_to_its_end(folder):
     out, err = process.communicate(timeout=PATIENCE)
     assert process.returncode == 0, err
     assert f"waiting for SCR clients at 127.0.0.1, UDP port {port}; the game waits" in out
-    assert f"scr_server 0: {client.address}: {client.answers} timesteps, 0 late" in out
+    assert f"scr_server 0: {client.address}: {client.answers} control ticks, 0 late" in out
     assert f"{client.address}, car1-trb1, a-speedway" in out
 
 
@@ -132,10 +132,10 @@ def test_a_client_that_thinks_too_long_loses_ticks_and_is_told(folder):
     out, err = process.communicate(timeout=PATIENCE)
     assert process.returncode == 0, err
     assert "2 ms per answer" in out
-    (told,) = re.findall(r"^scr_server 0: .*: (\d+) timesteps, (\d+) late", out, re.MULTILINE)
-    timesteps, late = map(int, told)
+    (told,) = re.findall(r"^scr_server 0: .*: (\d+) control ticks, (\d+) late", out, re.MULTILINE)
+    ticks, late = map(int, told)
     assert late >= 40
-    assert timesteps > client.answers
+    assert ticks > client.answers
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -152,7 +152,7 @@ def test_what_was_driven_until_it_is_ended_is_told(folder, number):
         process.send_signal(number)
         out, _ = process.communicate(timeout=PATIENCE)
         assert one.last() == other.last() == b"***shutdown***\0"
-    assert re.search(rf"scr_server 0: {one.address}: 10\d timesteps, 0 late", out)
+    assert re.search(rf"scr_server 0: {one.address}: 10\d control ticks, 0 late", out)
     assert "the race was ended early:\nrace on a-speedway\n" in out
     results = out.partition("the race was ended early")[2]
     assert results.count(" no\n") == 3  # nobody is out

@@ -183,6 +183,22 @@ def test_a_target_that_falls_is_missed_later():
     assert factors == [1.0, 1.0, 1.0 / 1.5]
 
 
+def test_the_first_steps_may_be_smaller_and_a_resumed_training_goes_on_with_its_own():
+    model = make()
+    callback = AdaptiveLearningRateCallback(kl=1e9, first_factor=0.1)
+    model.learn(120, callback=[callback, rates := Rates()])
+    assert [rate for _, rate in rates.seen] == pytest.approx([0.001, 0.0015])
+    again = AdaptiveLearningRateCallback(kl=1e9, first_factor=0.1)
+    model.learn(40, callback=again, reset_num_timesteps=False)
+    assert again.factor >= 0.2
+
+
+@pytest.mark.parametrize("factor", [0.0, 5.0, float("nan"), "small"])
+def test_no_such_first_factor(factor):
+    with pytest.raises(InvalidOption, match=f"first_factor is {factor!r}; expected 0.01 to 4"):
+        AdaptiveLearningRateCallback(first_factor=factor)
+
+
 def test_only_ppo_tells_a_divergence():
     with pytest.raises(InvalidOption, match="the model is a A2C; take it out"):
         A2C("MlpPolicy", ToyRace()).learn(5, callback=AdaptiveLearningRateCallback())

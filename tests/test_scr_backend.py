@@ -418,7 +418,7 @@ def test_both_sides_count_the_same_lost_ticks(think):
         agent.driver = SimpleNamespace(predict=predict)
         agent.drive()
         game.wait(20.0)
-        (told,) = re.findall(r"timesteps, (\d+) late", game.words())
+        (told,) = re.findall(r"control ticks, (\d+) late", game.words())
     assert agent.backend.lost_ticks > 0
     assert abs(int(told) - agent.backend.lost_ticks) <= 2
 

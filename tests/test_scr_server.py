@@ -359,7 +359,7 @@ class TestRace:
         assert number(states[-2], "lastLapTime") > 60
         client.nothing_comes()
         process.wait(PATIENCE)
-        told = re.search(r"scr_server 0: [\d.:]+: (\d+) timesteps, 0 late", process.words())
+        told = re.search(r"scr_server 0: [\d.:]+: (\d+) control ticks, 0 late", process.words())
         assert told
         assert int(told[1]) == pytest.approx(len(states), abs=2)
 
@@ -737,7 +737,7 @@ class TestTheEnd:
         process.end_race()
         assert process.poll() == 0
         assert second.receive() == b"***shutdown***\0"
-        assert "scr_server 0: nobody: 0 timesteps, 0 late" in process.words()
+        assert "scr_server 0: nobody: 0 control ticks, 0 late" in process.words()
         del first
 
     def test_who_has_no_name_goes_by_the_address(self, serve):
@@ -928,7 +928,7 @@ class TestDeadline:
         while not state.startswith(b"***"):
             state = client.ask(action(state))
         process.wait(PATIENCE)
-        assert re.search(r"\d+ timesteps, 3 late", process.words())
+        assert re.search(r"\d+ control ticks, 3 late", process.words())
 
     def test_late_answers_are_counted_and_used(self, serve):
         """A client that thinks for three deadlines: the game goes on meanwhile."""

@@ -163,22 +163,36 @@ class AdaptiveLearningRateCallback(_WhileLearning):
     :param kl: target of the divergence per update [nats]
     :param last_kl: the same at the end of the training, to which it falls linearly [nats]; ``None``
         is ``kl``
+    :param first_factor: on the model's learning rate at the begin. One below 1 keeps what a policy
+        knows that drives well already, 0.01 to 4
     :param verbose: as in ``BaseCallback``
-    :raises InvalidOption: if a target is not above 0, or the model is not PPO
+    :raises InvalidOption: if a target is not above 0, the factor is out of its range, or the model
+        is not PPO
     """
 
-    def __init__(self, *, kl: float = 0.01, last_kl: float | None = None, verbose: int = 0) -> None:
+    def __init__(
+        self,
+        *,
+        kl: float = 0.01,
+        last_kl: float | None = None,
+        first_factor: float = 1.0,
+        verbose: int = 0,
+    ) -> None:
         super().__init__(verbose)
         last_kl = kl if last_kl is None else last_kl
         for name, target in (("kl", kl), ("last_kl", last_kl)):
             if not is_number(target) or target <= 0.0:
                 raise InvalidOption(f"{name} is {target!r}; pass a divergence above 0, e.g. 0.01")
-        self.kl, self.last_kl = kl, last_kl
+        if not is_number(first_factor) or not LEAST_RATE <= first_factor <= MOST_RATE:
+            raise InvalidOption(
+                f"first_factor is {first_factor!r}; expected {LEAST_RATE:g} to {MOST_RATE:g}"
+            )
+        self.kl, self.last_kl, self.first_factor = kl, last_kl, first_factor
 
     @property
     def factor(self) -> float:
         """By which the model's own learning rate is multiplied."""
-        return float(vars(self.model).get("learning_rate_factor", 1.0))
+        return float(vars(self.model).get("learning_rate_factor", self.first_factor))
 
     def _on_training_start(self) -> None:
         if not isinstance(self.model, PPO):

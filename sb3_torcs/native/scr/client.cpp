@@ -133,7 +133,7 @@ std::optional<Action> Client::ask(const State& state) {
     read_all(false);
     if (answer_) return answer_;
     tell(state);
-    timesteps_++;
+    ticks_++;
     owed_++;
     const bool forever = deadline_ == Clock::duration::zero();
     const Clock::time_point until = Clock::now() + deadline_;

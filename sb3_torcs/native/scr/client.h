@@ -54,8 +54,8 @@ public:
     // Name and address, where both are known.
     std::string description() const;
 
-    long timesteps() const { return timesteps_; }  // states that were sent
-    long late() const { return late_; }            // of them, answered too late
+    long ticks() const { return ticks_; }  // states that were sent
+    long late() const { return late_; }    // of them, answered too late
 
 private:
     using Clock = std::chrono::steady_clock;
@@ -104,7 +104,7 @@ private:
     std::optional<Action> answer_, late_answer_;
     long owed_ = 0;  // states that may still be answered, by who does not say which one he answers
     char message_[LONGEST_MESSAGE];
-    long timesteps_ = 0, late_ = 0;
+    long ticks_ = 0, late_ = 0;
 };
 
 // Ends the game when its owner is gone. Checks only now and then.

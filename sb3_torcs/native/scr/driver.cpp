@@ -78,8 +78,8 @@ void Driver::leave() {
         // The race may end at the line, before a client hears of its last lap.
         if (car_->race.crossings != told_crossings_) client_.tell(sense());
         const std::string who = client_.description();
-        std::printf("scr_server %d: %s: %ld timesteps, %ld late\n", index_,
-                    who.empty() ? "nobody" : who.c_str(), client_.timesteps(), client_.late());
+        std::printf("scr_server %d: %s: %ld control ticks, %ld late\n", index_,
+                    who.empty() ? "nobody" : who.c_str(), client_.ticks(), client_.late());
         std::fflush(stdout);
     }
     if (leaving() != Leaving::UNNOTICED) client_.dismiss(for_good ? SHUTDOWN : RESTART);
