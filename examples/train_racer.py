@@ -3,8 +3,8 @@
 Each car of each race is an environment of TorcsVecEnv, so that stock PPO learns from all of them.
 It learns one track, or several, to race on those that it never saw. With --driver it goes on from a
 model that drives alone already, and sees what that model sees and other cars; with --racer it goes
-on from one that races. With --ancestor it goes on from a racer that was trained so, and races
-against itself, this ancestor and robots.
+on from one that races. With --ancestor it goes on from either, and races against itself, this
+ancestor and robots.
 """
 
 import argparse
@@ -39,8 +39,6 @@ FIELDS = (
     ("lliaw", "olethros", "tita", "inferno:4", "bt", "tita:4", "berniw"),
     ("tita", "bt", "berniw"),
 )
-BESIDE_ANCESTORS = ((), ("bt", "berniw", "inferno:4"), ("lliaw", "olethros", "tita", "bt:3"))
-AGENTS = 3  # in each race, behind the others
 UNITS = [128, 128]  # of a new policy
 
 
@@ -87,19 +85,56 @@ BIG_STEPS = Steps(1.0, 0.01, 0.002, (-2.0, -0.7))  # of who has just learned to 
 SMALL_STEPS = Steps(0.03, 0.006, 0.001, (-2.3, -1.0))  # of a model that drives or races well
 
 
-def reward_alone(off_line: float) -> dict[str, float]:
+@dataclass(frozen=True)
+class Races:
+    """How agents race."""
+
+    agents: int  # in each race, one behind the other
+    fields: Sequence[Sequence[str]]  # the others, of which each race draws one
+    places: list[int | None]  # on the grid, of the first agent; None is behind all others
+    limits: list[int]  # on the timesteps of an episode
+    aids: tuple[str, ...]  # by which cars brake and steer by themselves
+    reward: dict[str, float]  # its terms for others
+
+
+BEHIND_ROBOTS = Races(
+    agents=3, fields=FIELDS, places=[None],
+    limits=[450, 450, 1400],  # damage is done in the crowd of the first minute
+    aids=("unstick", "keep_distance", "keep_clear", "catch_slides"),
+    reward={"damage": -0.3, "places": 20.0, "fault": -10.0, "crash": -1.0},
+)  # fmt: skip
+
+
+def against(ancestor: str) -> Races:
+    """
+    Tell how agents race against an ancestor, which is as fast as they are.
+
+    Who keeps a distance stays behind, so they do not.
+    """
+    fields = (
+        (ancestor, ancestor), (ancestor, "bt"), (ancestor, "inferno", "bt"),
+        ("berniw", ancestor, "inferno"),
+    )  # fmt: skip
+    return Races(
+        agents=2, fields=fields, places=[1, 2, 3], limits=[450, 1400, 1400],
+        aids=("unstick", "keep_clear", "catch_slides"),
+        reward={"damage": -0.1, "places": 50.0, "fault": -3.0, "crash": -10.0},
+    )  # fmt: skip
+
+
+def reward_alone(settings: Settings) -> dict[str, float]:
     """Return the weights of the reward's terms for a car that is alone."""
     return {
-        "progress": 1.0, "off_line": off_line, "leaving": -0.5, "damage": -0.02, "crash": -1.0,
-        "scale": 0.1,
+        "progress": 1.0, "off_line": settings.off_line[0], "leaving": -0.5, "damage": -0.02,
+        "crash": -1.0, "scale": 0.1,
     }  # fmt: skip
 
 
-def reward_in_races(off_line: float) -> dict[str, float]:
+def reward_in_races(settings: Settings, races: Races) -> dict[str, float]:
     """Return the weights of the reward's terms for a car among others."""
     return {
-        "progress": 1.0, "off_line": off_line, "leaving": -0.3, "damage": -0.3, "passing": 1.0,
-        "places": 20.0, "contact": -1.0, "fault": -10.0, "crash": -1.0, "scale": 0.1,
+        "progress": 1.0, "off_line": settings.off_line[1], "leaving": -0.3, "passing": 1.0,
+        "contact": -1.0, **races.reward, "scale": 0.1,
     }  # fmt: skip
 
 
@@ -109,7 +144,7 @@ parser.add_argument("--alone", type=int, help="timesteps without other cars")
 parser.add_argument("--robots", type=int, default=6_000_000, help="timesteps in races")
 parser.add_argument("--driver", help="model that drives alone, to go on from, such as ppo-roads")
 parser.add_argument("--racer", help="model that races, to go on from, such as ppo-racer")
-parser.add_argument("--ancestor", help="racer to go on from, and to race against")
+parser.add_argument("--ancestor", help="model to go on from, and to race against")
 parser.add_argument(
     "--values",
     type=int,
@@ -163,7 +198,7 @@ def cars_alone(
     cars = TorcsVecEnv(
         number,
         threads=args.threads,
-        reward=reward_alone(settings.off_line[0]),
+        reward=reward_alone(settings),
         start="random",
         max_episode_steps=settings.episode,
         grip=settings.grip,
@@ -179,29 +214,25 @@ def mirrored(cars: VecEnv, settings: Settings) -> VecEnv:
     return MirrorVecEnv(cars) if settings.mirror else cars
 
 
-def fields(args: argparse.Namespace) -> tuple[tuple[str, ...], ...]:
-    """Tell who may start in front of the agents: robots, or the ancestor, too."""
-    if args.ancestor is None:
-        return FIELDS
-    return tuple((*[args.ancestor] * 2, *robots) for robots in BESIDE_ANCESTORS)
-
-
-def cars_in_races(args: argparse.Namespace, env_kwargs: dict, settings: Settings) -> TorcsVecEnv:
+def cars_in_races(
+    args: argparse.Namespace, env_kwargs: dict, settings: Settings, races: Races
+) -> TorcsVecEnv:
     """
-    Make races that begin on the grid, with the agents behind.
+    Make races that begin on the grid.
 
     A start elsewhere would let each robot plan its line anew. A car that spins, or is pushed off
     the road, learns to come back to it.
     """
     return TorcsVecEnv(
         args.races,
-        agents=AGENTS,
+        agents=races.agents,
         threads=args.threads,
-        reward=reward_in_races(settings.off_line[1]),
-        opponents=fields(args),
+        reward=reward_in_races(settings, races),
+        opponents=races.fields,
+        grid_place=races.places,
         runoff=8.0,
         recovery=20.0,
-        max_episode_steps=[450, 450, 1400],  # damage is done in the crowd of the first minute
+        max_episode_steps=races.limits,
         **env_kwargs,
     )
 
@@ -300,26 +331,36 @@ def how_to_drive(known: str | None) -> dict:
     return drives
 
 
+def has_raced(args: argparse.Namespace) -> bool:
+    """Tell whether the model from which a racer goes on has met other cars."""
+    if args.ancestor is None:
+        return args.racer is not None
+    return "rivals" in training_record(find_model(args.ancestor)).env_kwargs.get("sensors", ())
+
+
 def main() -> None:
     args = parser.parse_args()
     several = len(args.track) > 1
-    settings = ALL_ROADS if several else ONE_TRACK
-    racer, driver = args.ancestor or args.racer, args.driver
-    known = racer or driver
+    # Pace counts most against an equal, and less grip and a dear racing line cost pace.
+    settings = ALL_ROADS if several and not args.ancestor else ONE_TRACK
+    races = against(args.ancestor) if args.ancestor else BEHIND_ROBOTS
+    known = args.ancestor or args.racer or args.driver
     env_kwargs = {
         "track": args.track if several else args.track[0], **how_to_drive(known),
-        "unstick": True, "keep_distance": True, "keep_clear": True, "catch_slides": True,
+        **dict.fromkeys(races.aids, True),
     }  # fmt: skip
     weights = (
         learned_weights(find_model(known)) if known else learn_alone(args, env_kwargs, settings)
     )
-    if racer is None:
+    if not has_raced(args):
         begin_to_race(weights, env_kwargs["sensors"])
     units = [len(weights[f"mlp_extractor.policy_net.{layer}.bias"]) for layer in (0, 2)]
 
     # Some cars stay alone, for the pace: in races they are seldom free to drive at their own.
     beside = cars_alone(settings.beside_races * args.races, args, env_kwargs, settings)
-    cars = mirrored(JoinedVecEnv([cars_in_races(args, env_kwargs, settings), beside]), settings)
+    cars = mirrored(
+        JoinedVecEnv([cars_in_races(args, env_kwargs, settings, races), beside]), settings
+    )
     # Damage comes seldom and in heaps, so that short rollouts would lead astray. To follow a slower
     # car costs little at once, and much in the end, so it looks further ahead.
     weights = with_values(weights, cars, args, settings, units)

@@ -14,10 +14,11 @@ import numpy as np
 import pytest
 from stable_baselines3 import PPO
 
-from sb3_torcs.agents.model_file import saved_weights
+from sb3_torcs.agents.model_file import learned_weights, saved_weights
 from sb3_torcs.agents.model_writing import RecordCallback
-from sb3_torcs.agents.models import AGENTS, driver_record, shipped_agents
+from sb3_torcs.agents.models import AGENTS, driver_record, find_model, shipped_agents
 from sb3_torcs.callbacks.lines import DrivenLap, driven_laps
+from sb3_torcs.envs.aids import AIDS
 from sb3_torcs.errors import OutputNotWritable
 from sb3_torcs.evaluation.protocol import World
 from sb3_torcs.races.entrants import find_entrants
@@ -92,6 +93,18 @@ def test_a_racer_goes_on_from_a_driver_that_never_saw_a_car(
     assert all(tensor.isfinite().all() for tensor in weights.values())
     sees = driver_record(driver).env_kwargs.get("sensors", ["base"])
     assert driver_record(tmp_path / "model.zip").env_kwargs["sensors"] == [*sees, "rivals"]
+
+
+@pytest.mark.parametrize("ancestor", ["ppo-any-road", "ppo-racer"])
+def test_a_racer_races_against_its_ancestor(ancestor, monkeypatch, tmp_path, game):
+    """Which drives alone, and has no value function, or races; both are kept but for an update."""
+    budget = ["--ancestor", ancestor, "--values=1", "--robots=1", "--races=2"]
+    run(monkeypatch, "train_racer.py", *budget, "--track", "g-track-1", "--folder", str(tmp_path))
+    record = driver_record(tmp_path / "model.zip")
+    assert record.kept(AIDS) == {"unstick": True, "keep_clear": True, "catch_slides": True}
+    bias = "action_net.linear.bias"
+    before, after = (learned_weights(find_model(m))[bias] for m in (ancestor, tmp_path / "model"))
+    np.testing.assert_allclose(after, before, atol=0.01)
 
 
 def test_a_racer_needs_a_driver_with_one_pedal(monkeypatch, tmp_path, game):
