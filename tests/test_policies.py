@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from stable_baselines3 import DDPG, PPO, SAC, TD3
+from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -181,6 +181,12 @@ def test_a_wrong_option_is_named_with_what_is_allowed(kwargs, message):
     """Before any network is built."""
     with pytest.raises(InvalidOption, match=message):
         make_model(**kwargs)
+
+
+@pytest.mark.parametrize("algorithm", [PPO, A2C, SAC])
+def test_other_algorithms_are_told_their_policies(algorithm):
+    with pytest.raises(InvalidOption, match="a policy of DDPG and TD3; give PPO and A2C Bounded"):
+        algorithm(SplitHeadPolicy, ToyRace())
 
 
 # ------------------------------------------------------------------------------ shortcuts

@@ -76,6 +76,8 @@ class SplitHeadPolicy(ExactPolicy, TD3Policy):
     :param fast_matmul: allow another kernel for speed, see
         :mod:`sb3_torcs.policies.fast_matmul`; ``policy.fast_matmul_found`` says what was found
     :param kwargs: the other arguments of ``TD3Policy``
+    :raises InvalidOption: if an argument has no such value, or the algorithm is neither DDPG nor
+        TD3
     """
 
     def __init__(
@@ -94,6 +96,11 @@ class SplitHeadPolicy(ExactPolicy, TD3Policy):
         fast_matmul: bool = False,
         **kwargs: Any,
     ) -> None:
+        if "use_sde" in kwargs:  # all algorithms but DDPG and TD3 pass it
+            raise InvalidOption(
+                "SplitHeadPolicy is a policy of DDPG and TD3; give PPO and A2C BoundedPolicy, and "
+                'SAC, TQC and CrossQ their own "MlpPolicy"'
+            )
         net_arch = kwargs.pop("net_arch", None)
         net_arch = list(NET_ARCH) if net_arch is None else net_arch
         heads = heads_for(action_space) if heads is None else heads
