@@ -140,7 +140,9 @@ def leaving(before: CarState, after: CarState, controls: Controls) -> float:
     (Wurman et al., Nature 602, 2022, charge both so). So a car that cannot stay on the road still
     learns to brake.
     """
-    return after.speed_x**2 + after.speed_y**2 if after.off_track else 0.0
+    # As products: Python's power differs in the last bit from what compiled code makes of it.
+    speed_x, speed_y = after.speed_x, after.speed_y
+    return speed_x * speed_x + speed_y * speed_y if after.off_track else 0.0
 
 
 TERMS: dict[str, Term] = {
@@ -151,6 +153,7 @@ TERMS: dict[str, Term] = {
     )
 }  # fmt: skip
 
+LARGEST = 1e9  # of a weight, so that no reward is infinite
 SCALE = 0.1  # [1/m] a reward of 1 for ten metres along the road
 CRASH = -1.0  # when an episode ends off the road, backwards, stuck or damaged
 
@@ -183,7 +186,7 @@ class Reward:
         mapping may also hold ``scale`` (a factor on all terms, 1 if left out) and ``crash`` (added
         once, unscaled, when the episode ends badly, 0 if left out)
     :raises UnknownRewardTerm: if a name is unknown
-    :raises InvalidOption: if a weight is not a finite number
+    :raises InvalidOption: if a weight is no number from -1e9 to 1e9
     """
 
     def __init__(self, reward: RewardChoice) -> None:
@@ -206,9 +209,10 @@ class Reward:
                 raise UnknownRewardTerm(
                     f"no reward term '{name}'{near_miss(str(name), TERMS, advice)}"
                 )
-            if not is_number(weight):
+            if not is_number(weight) or abs(weight) > LARGEST:
                 raise InvalidOption(
-                    f"weight of reward term '{name}' is {weight!r}; expected a number"
+                    f"weight of reward term '{name}' is {weight!r}; expected a number from "
+                    f"{-LARGEST:g} to {LARGEST:g}"
                 )
         self.weights = {name: float(weight) for name, weight in weights.items()}
         scale = self.weights.get("scale", 1.0)

@@ -126,6 +126,16 @@ def test_passing_is_the_speed_against_cars_nearby(rivals, gained):
     assert TERMS["passing"](BEFORE, AFTER._replace(race=race), GAS) == pytest.approx(gained)
 
 
+def test_squares_are_products_as_in_compiled_code():
+    """Python's power rounds about one of a thousand squares otherwise."""
+    speeds = np.random.default_rng(0).uniform(1.0, 90.0, 10_000)
+    odd = [float(speed) for speed in speeds if float(speed) ** 2 != float(speed) * float(speed)]
+    assert odd
+    for speed in odd:
+        car = car_state(speed_x=speed, distance_from_axis=100.0)
+        assert TERMS["leaving"](BEFORE, car, GAS) == speed * speed
+
+
 def test_a_weight_multiplies_duration_and_scale():
     assert Reward({"speed_off_axis": -2.0, "scale": 0.1})(BEFORE, AFTER, GAS, None) == {
         "speed_off_axis": -2.0 * 0.1 * 0.5 * 5.0,
@@ -163,9 +173,9 @@ def test_an_unknown_name_offers_the_near_miss():
         Reward({3: 1.0})
 
 
-@pytest.mark.parametrize("weight", [math.nan, math.inf, "1", None, True])
+@pytest.mark.parametrize("weight", [math.nan, math.inf, "1", None, True, 1e308])
 def test_a_weight_must_be_a_number(weight):
-    with pytest.raises(InvalidOption, match="expected a number"):
+    with pytest.raises(InvalidOption, match="expected a number from -1e\\+09 to 1e\\+09"):
         Reward({"progress": weight})
 
 
