@@ -23,6 +23,8 @@ from sb3_torcs.policies.exact import ExactDriver, ExactPolicy
 
 __all__ = ["BoundedHead", "BoundedPolicy"]
 
+LARGEST_LOG_STD = 20
+
 
 class BoundedHead(nn.Module):
     """
@@ -62,9 +64,10 @@ class BoundedPolicy(ExactPolicy, ActorCriticPolicy):
     :param observation_space: as in ``ActorCriticPolicy``
     :param action_space: a ``Box`` with finite bounds
     :param lr_schedule: as in ``ActorCriticPolicy``
-    :param log_std_init: as in ``ActorCriticPolicy``, or one number per actuator
+    :param log_std_init: as in ``ActorCriticPolicy``, or one number per actuator, -20 to 20
     :param kwargs: the other arguments of ``ActorCriticPolicy``, but for ``use_sde``
-    :raises InvalidOption: if the action space has no bounds, or with ``use_sde``
+    :raises InvalidOption: if the action space has no bounds, if ``log_std_init`` has other numbers,
+        or with ``use_sde``
     """
 
     action_net: BoundedHead
@@ -84,15 +87,9 @@ class BoundedPolicy(ExactPolicy, ActorCriticPolicy):
             )
         if kwargs.get("use_sde"):
             raise InvalidOption("BoundedPolicy has no use_sde; leave it out, or use MlpPolicy")
-        number = np.size(log_std_init)
-        if number not in (1, get_action_dim(action_space)):
-            raise InvalidOption(
-                f"log_std_init has {number} numbers; expected one, or "
-                f"{get_action_dim(action_space)}, one per actuator"
-            )
-        self._first_log_std = log_std_init
+        self._first_log_std = _log_std(log_std_init, get_action_dim(action_space))
         super().__init__(observation_space, action_space, lr_schedule, **kwargs)
-        self.log_std_init = log_std_init  # type: ignore[assignment]  # for copies of this policy
+        self.log_std_init = self._first_log_std  # type: ignore[assignment]  # for copies of it
 
     def _build(self, lr_schedule: Schedule) -> None:
         """Make the networks as SB3 does, and bound the mean."""
@@ -106,6 +103,26 @@ class BoundedPolicy(ExactPolicy, ActorCriticPolicy):
         """Return a copy of what gives the mean action, which drives if it is deterministic."""
         network = nn.Sequential(self.mlp_extractor.policy_net, self.action_net)
         return ExactDriver(self, self.pi_features_extractor, copy.deepcopy(network))
+
+
+def _log_std(given: Any, actuators: int) -> float | list[float]:
+    """Check the logarithms of standard deviations, and return them as plain numbers."""
+    try:
+        numbers = np.asarray(given, dtype=float)
+    except (TypeError, ValueError):
+        numbers = np.array(np.nan)
+    if numbers.size not in (1, actuators):
+        raise InvalidOption(
+            f"log_std_init has {numbers.size} numbers; expected one, or {actuators}, one per "
+            "actuator"
+        )
+    if not (np.abs(numbers) <= LARGEST_LOG_STD).all():
+        raise InvalidOption(
+            f"log_std_init is {given!r}; expected numbers from {-LARGEST_LOG_STD} to "
+            f"{LARGEST_LOG_STD}, e.g. -1.0"
+        )
+    plain: float | list[float] = numbers.tolist()
+    return plain
 
 
 BoundedPolicy.__module__ = "sb3_torcs.policies"  # which hyperparameter files name

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, cast
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import DDPG, TD3
@@ -23,6 +24,7 @@ from stable_baselines3.td3.policies import Actor, TD3Policy
 from torch import nn
 
 from sb3_torcs.actions import layout_of_width
+from sb3_torcs.car import check_count, is_number
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.policies import fast_matmul as matmul
 from sb3_torcs.policies.exact import ExactDriver, ExactPolicy
@@ -104,9 +106,11 @@ class SplitHeadPolicy(ExactPolicy, TD3Policy):
         net_arch = kwargs.pop("net_arch", None)
         net_arch = list(NET_ARCH) if net_arch is None else net_arch
         heads = heads_for(action_space) if heads is None else heads
-        bias = (0.0,) * len(heads) if head_bias is None else tuple(head_bias)
+        bias = _bias(head_bias, len(heads))
         _check_heads(heads, bias, action_space)
         _check_net_arch(net_arch)
+        _check_flags(layer_norm=layer_norm, fast_matmul=fast_matmul)
+        check_count("n_critics", kwargs.get("n_critics", 2))
         _check_symmetric(symmetric, observation_space, action_space)
         self.own_kwargs: dict[str, Any] = {
             "heads": tuple(heads),
@@ -243,10 +247,29 @@ def _check_heads(heads: Sequence[str], bias: Sequence[float], action_space: spac
         )
 
 
+def _bias(given: Any, number: int) -> tuple[float, ...]:
+    """Check the initial values before the output functions; ``None`` is 0 for each."""
+    if given is None:
+        return (0.0,) * number
+    values = np.asarray(given)
+    if values.ndim != 1 or not all(is_number(value) for value in values.tolist()):
+        raise InvalidOption(
+            f"head_bias={given!r}: pass one finite number per action, e.g. {(0.0,) * number}"
+        )
+    return tuple(map(float, values))
+
+
+def _check_flags(**flags: Any) -> None:
+    for name, value in flags.items():
+        if not isinstance(value, bool):
+            raise InvalidOption(f"{name}={value!r}: pass True or False")
+
+
 def _check_net_arch(net_arch: Any) -> None:
     critic = net_arch.get("qf") if isinstance(net_arch, dict) else net_arch
     actor = net_arch.get("pi") if isinstance(net_arch, dict) else net_arch
-    if not actor or not critic or len(critic) != 2:
+    others = isinstance(net_arch, dict) and net_arch.keys() - {"pi", "qf"}
+    if others or not actor or not critic or len(critic) != 2:
         raise InvalidOption(
             f"net_arch={net_arch!r}: the critic has two layer sizes (the action joins at the "
             "second) and the actor at least one; pass net_arch=[300, 600], or "
@@ -257,8 +280,7 @@ def _check_net_arch(net_arch: Any) -> None:
 def _check_symmetric(
     symmetric: Any, observation_space: spaces.Space, action_space: spaces.Space
 ) -> None:
-    if not isinstance(symmetric, bool):
-        raise InvalidOption(f"symmetric={symmetric!r}: pass True or False")
+    _check_flags(symmetric=symmetric)
     ours = sensors_of(observation_space) and layout_of_width(get_action_dim(action_space))
     if symmetric and not ours:
         raise InvalidOption(
@@ -269,13 +291,13 @@ def _check_symmetric(
 
 
 def _positive(name: str, value: float) -> float:
-    if not 0.0 < value < float("inf"):
+    if not is_number(value) or value <= 0.0:
         raise InvalidOption(f"{name}={value!r}: pass a number above 0, e.g. {name}=1.0")
     return float(value)
 
 
 def _share(name: str, value: float | None) -> float | None:
-    if value is not None and not 0.0 <= value < 1.0:
+    if value is not None and not (is_number(value) and 0.0 <= value < 1.0):
         raise InvalidOption(
             f"{name}={value!r}: pass a share in [0, 1), e.g. {name}=0.9995, or None"
         )
