@@ -10,7 +10,7 @@ from stadium import COASTING, stadium, state
 
 from sb3_torcs.cli import main
 from sb3_torcs.cli.race import _followed
-from sb3_torcs.races import video
+from sb3_torcs.races import protocol, video
 from sb3_torcs.races.entrants import find_entrants
 from sb3_torcs.races.protocol import run_race
 from sb3_torcs.races.video import Footage, Moment, gaps
@@ -112,6 +112,30 @@ def test_the_first_race_is_recorded_and_comes_out_as_if_nobody_looked(
     assert path == tmp_path / "race.mp4"
     assert len(frames) == total > video.LAST_PICTURE + 8
     assert {frame.shape for frame in frames} == {(720, 960, 3)}
+
+
+@pytest.mark.parametrize(("ends", "said"), [
+    (KeyboardInterrupt, "drawing the video of the first race; Ctrl-C again leaves it out"),
+    (SystemExit, "no video, since the command was told to end"),  # by SIGTERM
+])  # fmt: skip
+def test_ctrl_c_draws_what_is_over_and_sigterm_ends(
+    ends, said, monkeypatch, capsys, game, tmp_path
+):
+    held = protocol.run_race
+
+    def run_race(*arguments, **options):
+        if options["seed"] == 1:
+            raise ends
+        return held(*arguments, **options)
+
+    drawn = []
+    monkeypatch.setattr(protocol, "run_race", run_race)
+    monkeypatch.setattr(video.Footage, "save", lambda self, path, *_: drawn.append(path))
+    words = ["race", "scripted", "bt", "--track", "g-track-1", "--laps", "1", "--json"]
+    file = tmp_path / "race.mp4"
+    assert main([*words, "--video", str(file)]) == 130
+    assert said in capsys.readouterr().err
+    assert drawn == ([file] if ends is KeyboardInterrupt else [])
 
 
 def test_a_video_that_is_no_mp4_is_refused_before_any_race(capsys):

@@ -322,6 +322,11 @@ def test_no_such_aid(capsys, game, names, message):
     assert re.search(message, capsys.readouterr().err)
 
 
+def test_robots_get_no_aids(capsys, game):
+    assert main(["race", "inferno", "bt", "--aids", "all"]) == 2
+    assert "--aids is for agents, and all drivers are robots" in capsys.readouterr().err
+
+
 def test_an_agent_with_aids_and_without_a_record_is_still_told(game, tmp_path):
     file = tmp_path / "plain.zip"
     PPO("MlpPolicy", "sb3_torcs:TorcsLite-v0", n_steps=2, batch_size=2, device="cpu").save(file)

@@ -37,6 +37,7 @@ FILES = {
 NEED_THE_LAST = ("telemetry", "report")
 """What is written only if all races were held."""
 
+DRAWING = "sb3-torcs: drawing the video of the first race; Ctrl-C again leaves it out\n"
 GRIDS = ("last", "reverse", "random")
 BAR = "{l_bar}{bar}| {n:.1f}/{total} races [{elapsed}<{remaining}]"
 UNKNOWN = "-"  # in tables
@@ -56,7 +57,8 @@ holds the first driver and N - 1 of the others, who are drawn.
 Win rates and mean places come with their 95 % intervals. Ratings are those of openskill
 (Plackett-Luce).
 
-Ctrl-C ends the command after the races that are over, and tells how they went.
+Ctrl-C ends the command after the races that are over, and tells how they went. Then it draws the
+video of the first one, if there is to be any; Ctrl-C again leaves it out.
 
 With --game the installed game holds the same races, and comes to the same standings. It does not
 count contacts and metres.
@@ -111,24 +113,18 @@ def run(args: argparse.Namespace) -> int:
     files = {
         what: writable_file(getattr(args, what), suffixes)
         for what, suffixes in FILES.items()
-        if getattr(args, what)
+        if getattr(args, what) is not None
     }
-    from sb3_torcs.envs.aids import aids_named
     from sb3_torcs.errors import InvalidOption
-    from sb3_torcs.races.entrants import find_entrants
     from sb3_torcs.telemetry import DriveLog
-    from sb3_torcs.torcs.installation import find_game
 
     if args.game and files:
         raise InvalidOption(f"--{next(iter(files))} is for races of the engine; leave out --game")
     with quiet_output(args.json):
-        aids = aids_named(args.aids) if args.aids is not None else ()
-        entrants = find_entrants(args.drivers, find_game(), aids)
-        for agent in (entrant.agent for entrant in entrants if entrant.agent is not None):
-            warn_unless_known(agent.driver, agent.record)
+        entrants = _entrants(args)
         log = DriveLog() if "telemetry" in files or "report" in files else None
         footage = _footage(args)
-        races = _held(args, entrants, log, footage)
+        races, at_once = _held(args, entrants, log, footage)
     for race in races:
         for driver, why in race.failures.items():
             print(f"sb3-torcs: race {race.seed}: {driver} is out: {why}", file=sys.stderr)
@@ -138,9 +134,12 @@ def run(args: argparse.Namespace) -> int:
         _show(races)
     stopped = len(races) < args.races
     if stopped:
-        _drop_those_of_the_last(files)
+        _drop(files, NEED_THE_LAST, "the last race was not held")
+    if at_once:
+        _drop(files, ("video",), "the command was told to end")
     with quiet_output(args.json):
-        if footage is not None:
+        if footage is not None and "video" in files:
+            sys.stderr.write(DRAWING if stopped else "")
             footage.save(files["video"], _followed(entrants, races[0]), args.laps)
         _write(files, races[-1], log, entrants[0].name)
     if not args.json:
@@ -149,11 +148,28 @@ def run(args: argparse.Namespace) -> int:
     return INTERRUPTED if stopped else 0
 
 
-def _drop_those_of_the_last(files: dict[str, Path]) -> None:
-    """Leave out the files that need the last race, which was not held."""
-    for what in NEED_THE_LAST:
+def _entrants(args: argparse.Namespace) -> list[Entrant]:
+    """Find the drivers, and warn of agents without a record."""
+    from sb3_torcs.envs.aids import aids_named
+    from sb3_torcs.errors import InvalidOption
+    from sb3_torcs.races.entrants import find_entrants
+    from sb3_torcs.torcs.installation import find_game
+
+    aids = () if args.aids is None else aids_named(args.aids)
+    entrants = find_entrants(args.drivers, find_game(), aids)
+    agents = [entrant.agent for entrant in entrants if entrant.agent is not None]
+    if aids and not agents:
+        raise InvalidOption("--aids is for agents, and all drivers are robots; leave it out")
+    for agent in agents:
+        warn_unless_known(agent.driver, agent.record)
+    return entrants
+
+
+def _drop(files: dict[str, Path], kinds: Sequence[str], why: str) -> None:
+    """Leave out files, and say why."""
+    for what in kinds:
         if files.pop(what, None) is not None:
-            print(f"sb3-torcs: no {what}, since the last race was not held", file=sys.stderr)
+            print(f"sb3-torcs: no {what}, since {why}", file=sys.stderr)
 
 
 def _footage(args: argparse.Namespace) -> Footage | None:
@@ -208,11 +224,13 @@ def _held(
     entrants: Sequence[Entrant],
     log: DriveLog | None,
     footage: Footage | None,
-) -> list[Race]:
+) -> tuple[list[Race], bool]:
     """
     Hold the races behind a progress bar; the first one is recorded, the last one is noted.
 
-    Ctrl-C ends them early; those that are over are returned.
+    Ctrl-C ends them early, and so do SIGTERM and SIGHUP.
+
+    :return: those that are over, and whether the command has to end at once
     """
     from tqdm import tqdm
 
@@ -247,10 +265,11 @@ def _held(
             ):  # fmt: skip
                 races.append(race)
                 tell(0.0)
-        except (KeyboardInterrupt, SystemExit):  # SIGTERM
+        except (KeyboardInterrupt, SystemExit) as ended:
             if not races:
                 raise
-    return races
+            return races, isinstance(ended, SystemExit)
+    return races, False
 
 
 def _as_json(args: argparse.Namespace, races: list[Race]) -> dict[str, Any]:
