@@ -255,8 +255,10 @@ def _numbers(action: Any, names: tuple[str, ...]) -> list[float]:
             "take it from env.action_space.sample() or model.predict(observation)"
         )
     try:
+        if any(isinstance(value, str | bytes) for value in action):
+            raise TypeError
         return [float(value) for value in action]
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise InvalidAction(
             f"action is {action!r}; expected {_COUNTS[len(names)]} numbers: {', '.join(names)}"
         ) from None

@@ -84,7 +84,7 @@ def writable_file(file: str | Path, suffixes: tuple[str, ...]) -> Path:
     """
     path = Path(os.path.expanduser(file))
     if path.suffix.lower() not in suffixes:
-        raise OutputNotWritable(f"'{path}' should end in {' or '.join(suffixes)}")
+        raise OutputNotWritable(f"'{file}' should end in {' or '.join(suffixes)}")
     if path.is_dir():
         raise OutputNotWritable(f"'{path}' is a folder; give a file in it")
     writable_folder(path.parent)

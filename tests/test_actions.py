@@ -71,7 +71,10 @@ def test_another_shape_is_refused(action):
         controls_from_action(action)
 
 
-@pytest.mark.parametrize("action", [["a", "b", "c"], [None] * 3, np.array(["a", "b", "c"])])
+@pytest.mark.parametrize(
+    "action",
+    [["a", "b", "c"], ["0", "1", "0"], [None] * 3, np.array(["a", "b", "c"]), (0, 10**400, 0)],
+)
 def test_what_is_no_number_is_refused(action):
     with pytest.raises(InvalidAction, match="expected three numbers: steering, throttle, brake"):
         controls_from_action(action)

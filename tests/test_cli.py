@@ -13,6 +13,7 @@ import sys
 import time
 import types
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import yaml
@@ -21,10 +22,10 @@ from stable_baselines3 import DDPG
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_torcs import __version__
-from sb3_torcs.agents import model_record, models
+from sb3_torcs.agents import ScriptedDriver, model_record, models
 from sb3_torcs.bench.stages import KEYS
 from sb3_torcs.cli import VERBS, common, doctor, evaluate, main, train
-from sb3_torcs.errors import BackendUnavailable, InvalidOption, ZooConfigError
+from sb3_torcs.errors import BackendUnavailable, InvalidOption, OutputNotWritable, ZooConfigError
 from sb3_torcs.evaluation import protocol as evaluation
 from sb3_torcs.evaluation import recording
 from sb3_torcs.telemetry import TELEMETRY_FIELDS
@@ -562,6 +563,17 @@ def test_the_time_limit_cuts_no_lap_of_a_car_that_does_not_count_as_standing():
     assert evaluation.time_limit({**kwargs, "track": "random"}) > 55890
 
 
+@pytest.mark.parametrize("laps", [None, "1", 0, 1.5])
+def test_an_evaluation_has_a_number_of_laps(laps):
+    with pytest.raises(InvalidOption, match=f"laps is {laps!r}; expected a whole number >= 1"):
+        evaluation.race_environment("TorcsLite-v0", {}, track="aalborg", laps=laps)
+
+
+def test_an_evaluation_is_of_one_environment():
+    with pytest.raises(InvalidOption, match="VectorEnv is no single environment"):
+        evaluation.evaluate(gym.make_vec("TorcsLite-v0", num_envs=2), ScriptedDriver())
+
+
 def test_an_evaluation_writes_its_drives_as_the_robots_are_written(capsys, tmp_path):
     file = tmp_path / "drive.csv"
     words = ["scripted", "--env", "TorcsLite-v0", "--track", "g-track-1", "--laps", "1"]
@@ -789,6 +801,13 @@ def test_numbers_of_a_training_from_python_are_checked_too(tmp_path, name, value
     ):
         training_run.train(options(tmp_path, **{name: value}))
     assert list(tmp_path.glob("logs*")) == []
+
+
+def test_pictures_that_cannot_be_written_leave_no_other_folder(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputNotWritable, match="cannot write to the folder"):
+        training_run.train(options(tmp_path, pictures=tmp_path / "file"))
+    assert not list(tmp_path.glob("logs*"))
 
 
 def test_the_pictures_come_after_the_entry_s_callbacks_and_the_bar_before(tmp_path):

@@ -221,6 +221,7 @@ def test_a_window_shows_the_race(folder):
         (["--track", "nowhere.xml"], "there is no track file"),
         (["--host", "::1"], "choose another with --port, or another address with --host"),
         (["--track", "forzza"], "no track 'forzza'; did you mean 'forza'?"),
+        (["--robots", ""], "robot '': expected NAME"),
         (["--robots", "infernal"], "no robot 'infernal'; did you mean 'inferno'?"),
         (["--car", "car1-trb9"], "no car 'car1-trb9'; did you mean"),
         (["--port", "65530", "--drivers", "9"], "ports end at 65535"),

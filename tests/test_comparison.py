@@ -171,6 +171,13 @@ def test_one_driver_alone_has_a_page_that_asks_for_another(oval):
     assert summary(comparison) == []
 
 
+def test_who_named_another_driver_is_not_asked_for_one(oval):
+    log = log_of(oval, ("ana", 25.0))
+    drive(log, oval, "cleo", laps=0, end=120.0)
+    comparison = compared(log, oval)
+    assert [told for told in missing(comparison) if "one lap" in told] == ["There is one lap only."]
+
+
 def test_the_summary_says_who_is_faster_and_where(oval):
     comparison = compared(log_of(oval, ("ana", 25.0), ("ben", 20.0)), oval)
     (sentence,) = summary(comparison)

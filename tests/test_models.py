@@ -1,6 +1,7 @@
 import base64
 import json
 import pickle
+import re
 import sys
 import types
 import zipfile
@@ -178,6 +179,17 @@ def test_a_missing_model_is_told_the_near_miss(saved):
     _, path = saved
     with pytest.raises(InvalidOption, match=r"there is no model .*did you mean 'TorcsLite-v0.zip'"):
         models.find_model(path.parent / "TorcsLite-v00.zip")
+
+
+@pytest.mark.parametrize("name", [None, 3, b"ddpg-roads", ["ddpg-roads"]])
+def test_what_is_no_name_of_a_model(name):
+    for find in (
+        models.find_model,
+        models.driver_record,
+        lambda name: models.load_driver(name, None),
+    ):
+        with pytest.raises(InvalidOption, match=f"{re.escape(repr(name))} names no model; give"):
+            find(name)
 
 
 @pytest.mark.parametrize("name", ["", " "])

@@ -81,13 +81,13 @@ def find_model(path: str | Path, *, prefer_last: bool = False) -> Path:
     :return: the file
     :raises InvalidOption: if there is none
     """
-    given = Path(os.path.expanduser(path))
     advice = (
         "give the .zip that a training saved, the folder of its run, or a shipped agent: "
         f"{', '.join(shipped_agents())}"
     )
-    if not str(path).strip():  # which would be the present folder
-        raise InvalidOption(f"{str(path)!r} names no model; {advice}")
+    if not isinstance(path, str | Path) or not str(path).strip():  # "" is the present folder
+        raise InvalidOption(f"{path!r} names no model; {advice}")
+    given = Path(os.path.expanduser(path))
     if given.is_file():
         return given
     if Path(f"{given}.zip").is_file():

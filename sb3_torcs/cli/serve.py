@@ -95,7 +95,8 @@ def run(args: argparse.Namespace) -> int:
             f"{LONGEST_DEADLINE:g}, or --wait"
         )
     game = find_game()
-    robots = [game.parse_robot(name) for name in args.robots.split(",")] if args.robots else []
+    names = [] if args.robots is None else args.robots.split(",")
+    robots = [game.parse_robot(name) for name in names]
     drivers = [(SCR_SERVER, number) for number in range(args.drivers)] + robots
     race = RaceSetup(args.track, drivers, args.laps, session_for(drivers), args.car)
     cars = race.cars(game)

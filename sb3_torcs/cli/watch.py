@@ -151,7 +151,7 @@ def _shows(game: Game, names: Sequence[str], args: argparse.Namespace) -> list[S
     ]
     trained = [r.env_kwargs["track"] for r in records if "track" in r.env_kwargs]
     track = one_of("track", args.track or next(iter(trained), "aalborg"))
-    words = args.robots.split(",") if args.robots else []
+    words = [] if args.robots is None else args.robots.split(",")
     opponents = [game.parse_robot(word) for word in words]
     own = {} if args.car is None else {"car": args.car}
     settings = [{**record.kept(("car", *DRIVEN_WITH)), **own} for record in records]

@@ -16,6 +16,7 @@ import gymnasium as gym
 from sb3_torcs.agents.model_record import DRIVEN_WITH
 from sb3_torcs.agents.rollout import Driver, Timestep, drive
 from sb3_torcs.car import CONTROL_TICK, check_count
+from sb3_torcs.errors import InvalidOption
 from sb3_torcs.torcs.track_names import RANDOM_TRACK, kind_without_game
 
 __all__ = [
@@ -168,9 +169,11 @@ def race_environment(
     :param hyperparameters: of the training, whose wrappers are put around the environment
     :param trust: as of :func:`~sb3_torcs.agents.wrapping.wrapped`
     :return: the environment, whose time limit never ends a race
+    :raises InvalidOption: if ``laps`` is no whole number of at least 1
     """
     from sb3_torcs.agents.wrapping import wrapped
 
+    check_count("laps", laps)
     kwargs = {name: env_kwargs[name] for name in KEPT if name in env_kwargs}
     kwargs.update({"laps": laps}, **({} if track is None else {"track": track}))
     env = gym.make(env_id, max_episode_steps=time_limit(kwargs), **kwargs)
@@ -191,6 +194,11 @@ def evaluate(
     :raises InvalidOption: if ``episodes`` is no whole number of at least 1
     """
     check_count("episodes", episodes)
+    if not isinstance(env, gym.Env):
+        raise InvalidOption(
+            f"{type(env).__name__} is no single environment; evaluate drives one that gym.make or "
+            "race_environment has made"
+        )
     results = []
     for number in range(episodes):
         lap_times, total = [], 0.0

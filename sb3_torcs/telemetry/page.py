@@ -138,7 +138,8 @@ def missing(comparison: Comparison) -> list[str]:
             told = ", ".join(f"{driver} in {value}" for driver, value in values.items())
             notes.append(f"The {what} differ: {told}.")
     if len(drivers) == 1:
-        notes.append("There is one lap only: name another driver to see time gained and lost.")
+        hint = "" if comparison.left_out else ": name another driver to see time gained and lost"
+        notes.append(f"There is one lap only{hint}.")
     standing = [one.drive.driver for one in drivers if one.lap.standing]
     if standing:
         notes.append(f"From the grid, not flying: the lap of {', '.join(standing)}.")

@@ -136,13 +136,13 @@ def train_run(options: TrainOptions) -> Run:
     with contextlib.closing(zoo.checked_env(changed, options.env, place)) as env:
         if resume is not None:
             _check_resumed(options, resume, entry, env, changed)
-    folder = writable_folder(options.folder)
-    tensorboard = _for_tensorboard(options.tensorboard or folder / "tensorboard")
     wanted = zoo.timesteps(changed) if options.timesteps is None else options.timesteps
     if any(word.endswith("subproc") for word in options.zoo_args):
         entry["env_wrapper"] = [*listed(entry.get("env_wrapper")), WORKER]
     if options.progress or options.pictures is not None:
         entry["callback"] = _with_display(options, entry.get("callback"))
+    folder = writable_folder(options.folder)
+    tensorboard = _for_tensorboard(options.tensorboard or folder / "tensorboard")
     words = _zoo_words(options, wanted, changed)
     words += ["--log-folder", str(folder), "--tensorboard-log", str(tensorboard)]
     words += ["--trained-agent", str(resume)] if resume else []
