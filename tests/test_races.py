@@ -286,10 +286,10 @@ def test_no_report_is_made_of_a_race_without_a_whole_lap(capsys, game, monkeypat
 
 
 def test_an_agent_that_learned_alone_may_get_aids(game):
-    """``ppo-racer-roads`` is ``ppo-any-road`` with all aids: the same race to the bit."""
+    """``ppo-racer-roads`` is ``ppo-self-play`` with all aids: the same race to the bit."""
     races = [
         run_race(find_entrants(["bt", "inferno", agent], game, aids), SHORT, laps=1)
-        for agent, aids in (("ppo-any-road", AIDS), ("ppo-racer-roads", ()), ("ppo-any-road", ()))
+        for agent, aids in (("ppo-self-play", AIDS), ("ppo-racer-roads", ()), ("ppo-self-play", ()))
     ]
     aided, shipped, alone = (
         [{**standing.as_dict(), "driver": None} for standing in race.standings] for race in races
