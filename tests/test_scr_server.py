@@ -726,7 +726,7 @@ class TestTheEnd:
         while not message.startswith(b"***"):
             message = client.receive()
         assert message == b"***shutdown***\0"
-        assert re.search(r"scr_server 0: Ann Other at 127.0.0.1:\d+: 5\d timesteps, ",
+        assert re.search(r"scr_server 0: Ann Other at 127.0.0.1:\d+: 5\d control ticks, ",
                          process.words())  # fmt: skip
         assert '<attstr name="name" val="Ann Other"/>' in self.results(process)
 
