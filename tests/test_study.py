@@ -460,5 +460,24 @@ def test_ctrl_c_keeps_everything_and_says_how_to_go_on(tmp_path, number):
     assert not (tmp_path / "out" / SESSION).exists()
 
 
+@pytest.mark.slow
+def test_a_signal_to_the_whole_group_ends_it_too(tmp_path, short_folder):
+    """As of `timeout`. Ray's processes have it, too, and Ray would wait for them without end."""
+    words = ["study", str(study_file(tmp_path)), "--folder", str(tmp_path / "out"), "--jobs", "1"]
+    command = [sys.executable, "-m", "sb3_torcs.cli", *words]
+    process = subprocess.Popen(
+        command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True,
+        start_new_session=True, env={**os.environ, "TMPDIR": short_folder},
+    )  # fmt: skip
+    while not seeds_so_far(tmp_path / "out"):
+        assert process.poll() is None, "it ended before it could be interrupted"
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGTERM)
+    _, err = process.communicate(timeout=90)
+    assert process.returncode in (130, 143), err
+    assert not (tmp_path / "out" / SESSION).exists()
+    assert list(Path(short_folder).glob("st-*")) == []
+
+
 def seeds_so_far(folder):
     return {row["seed"] for row in results(folder)} if (folder / "results.csv").is_file() else set()

@@ -11,7 +11,9 @@ import contextlib
 import os
 import shutil
 import signal
+import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -30,6 +32,7 @@ SESSION = ".session"  # where a killed run's temporary files are
 SCRATCH = "st-"  # prefix of folders for temporary files; short, since paths of sockets are limited
 MARK = ".of-a-study"  # a file that names the folder for temporary files
 PATIENCE = 5.0  # [s] until a folder for temporary files counts as one that cannot be removed
+GRACE = 20.0  # [s] that Ray has to end after SIGTERM
 PRIVATE = "sb3_torcs_study"  # a resource that marks a Ray that was started by a study
 FAILED = "failed"  # the phase of a row with an error instead of a race
 
@@ -189,6 +192,8 @@ def _ray(store: StudyFolder, jobs: int | None, address: str | None) -> Iterator[
 
     session = store.path / SESSION
     scratch = Path(tempfile.mkdtemp(prefix=SCRATCH))
+    enough = threading.Timer(GRACE, _end_by_force, (scratch, session))
+    enough.daemon = True
     options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
     if address is None:
         options.update(
@@ -216,12 +221,32 @@ def _ray(store: StudyFolder, jobs: int | None, address: str | None) -> Iterator[
                 "--address out, or start a cluster with `ray start --head`"
             )
         # Tune handles Ctrl-C; Ray would treat SIGTERM as a crash.
-        with answered(lambda *_: signal.raise_signal(signal.SIGINT), signal.SIGTERM):
+        with answered(lambda *_: _end(enough), signal.SIGTERM):
             yield scratch
     finally:
         ray.shutdown()
+        enough.cancel()
         _remove_folder(scratch)
         session.unlink(missing_ok=True)
+
+
+def _end(enough: threading.Timer) -> None:
+    """
+    End as at Ctrl-C. Ray cannot if its own processes have had the signal, too, as by `timeout`.
+
+    :param enough: what ends this process by force
+    """
+    with contextlib.suppress(RuntimeError):  # a second signal
+        enough.start()
+    signal.raise_signal(signal.SIGINT)
+
+
+def _end_by_force(scratch: Path, session: Path) -> None:
+    """End this process, with which Ray's own end, and leave nothing temporary."""
+    _remove_folder(scratch)
+    session.unlink(missing_ok=True)
+    sys.stderr.write("sb3-torcs: ended; the same command goes on with the study\n")
+    os._exit(128 + signal.SIGTERM)
 
 
 def _remove_scratch(session: Path) -> None:
