@@ -162,8 +162,7 @@ class _Reader:
         """Build the track once all lines are in."""
         if not self.segments:
             raise self.fail("the file ends without a segment")
-        self._check_grid()
-        return Track(
+        track = Track(
             self.texts.get("name", self.path.stem),
             self.texts.get("category", "road"),
             tuple(self.segments),
@@ -171,20 +170,22 @@ class _Reader:
             *self.start,
             self.grid,
         )
+        self._check_grid(track)
+        return track
 
-    def _check_grid(self) -> None:
-        """Make sure that the first grid slot is on the road, which ends at the start line."""
-        length = sum(segment.length for segment in self.segments)
-        if not 0.0 <= self.grid.distance <= length:
+    def _check_grid(self, track: Track) -> None:
+        """Make sure that the first grid slot is on the road where that is widest."""
+        distance, offset = track.grid
+        if not 0.0 <= distance <= track.length:
             raise TrackFileError(
-                f"{self.path}: the grid is {self.grid.distance:g} m before the line; expected 0 to "
-                f"{length:g} m"
+                f"{self.path}: the grid is {distance:g} m before the line; expected 0 to "
+                f"{track.length:g} m"
             )
-        half = 0.5 * max(segment.width_start for segment in self.segments)
-        if abs(self.grid.offset) > half:
+        half = 0.5 * max(segment.width_start for segment in track.segments)
+        if abs(offset) > half:
             raise TrackFileError(
-                f"{self.path}: the grid is {self.grid.offset:g} m from the axis, and the road ends "
-                f"at {half:g} m"
+                f"{self.path}: the grid is {offset:g} m from the axis, and the road ends at "
+                f"{half:g} m"
             )
 
 
