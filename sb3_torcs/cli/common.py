@@ -22,6 +22,7 @@ __all__ = [
     "TRUST_HELP",
     "lacks_cache",
     "natural",
+    "parsed_robots",
     "positive",
     "print_json",
     "quiet_output",
@@ -121,6 +122,17 @@ def seed(text: str) -> int:
     if number >= 2**32:
         raise argparse.ArgumentTypeError(f"{text!r}: expected a whole number below 2**32")
     return number
+
+
+def parsed_robots(names: str | None, game: Game) -> list[tuple[str, int]]:
+    """
+    Read the robots of an option.
+
+    :param names: with commas between them; ``None`` if the option was not given
+    :param game: the installation
+    :return: names and indices, as of ``Game.parse_robot``
+    """
+    return [] if names is None else [game.parse_robot(name) for name in names.split(",")]
 
 
 def setting(text: str) -> tuple[str, Any]:

@@ -8,7 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sb3_torcs.car import DEFAULT_CAR
-from sb3_torcs.cli.common import natural, positive, print_json, quiet_output, table
+from sb3_torcs.cli.common import (
+    natural,
+    parsed_robots,
+    positive,
+    print_json,
+    quiet_output,
+    table,
+)
 from sb3_torcs.cli.results import results_as_json, show_results
 from sb3_torcs.files import writable_file
 
@@ -85,8 +92,7 @@ def run(args: argparse.Namespace) -> int:
     if args.telemetry is not None:
         telemetry = writable_file(args.telemetry, (".parquet", ".csv"))
     name = args.name if args.index is None else f"{args.name}:{args.index}"
-    rivals = [] if args.rivals is None else args.rivals.split(",")
-    robots = [game.parse_robot(word) for word in (name, *rivals)]
+    robots = [game.parse_robot(name), *parsed_robots(args.rivals, game)]
     file = find_track(args.track, game)
     track = args.track if file.source == "file" else file.name
     with quiet_output(args.json):

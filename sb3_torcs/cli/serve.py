@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from sb3_torcs.car import DEFAULT_CAR
-from sb3_torcs.cli.common import positive
+from sb3_torcs.cli.common import parsed_robots, positive
 from sb3_torcs.cli.results import show_results
 
 if TYPE_CHECKING:
@@ -95,8 +95,7 @@ def run(args: argparse.Namespace) -> int:
             f"{LONGEST_DEADLINE:g}, or --wait"
         )
     game = find_game()
-    names = [] if args.robots is None else args.robots.split(",")
-    robots = [game.parse_robot(name) for name in names]
+    robots = parsed_robots(args.robots, game)
     drivers = [(SCR_SERVER, number) for number in range(args.drivers)] + robots
     race = RaceSetup(args.track, drivers, args.laps, session_for(drivers), args.car)
     cars = race.cars(game)

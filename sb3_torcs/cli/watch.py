@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from sb3_torcs.cli.common import MODEL_HELP, TRUST_HELP, positive, told_record
+from sb3_torcs.cli.common import MODEL_HELP, TRUST_HELP, parsed_robots, positive, told_record
 from sb3_torcs.cli.results import show_results
 from sb3_torcs.files import writable_file
 
@@ -151,8 +151,7 @@ def _shows(game: Game, names: Sequence[str], args: argparse.Namespace) -> list[S
     ]
     trained = [r.env_kwargs["track"] for r in records if "track" in r.env_kwargs]
     track = one_of("track", args.track or next(iter(trained), "aalborg"))
-    words = [] if args.robots is None else args.robots.split(",")
-    opponents = [game.parse_robot(word) for word in words]
+    opponents = parsed_robots(args.robots, game)
     own = {} if args.car is None else {"car": args.car}
     settings = [{**record.kept(("car", *DRIVEN_WITH)), **own} for record in records]
     for kept in settings:
