@@ -94,7 +94,7 @@ class Races:
     places: list[int | None]  # on the grid, of the first agent; None is behind all others
     limits: list[int]  # on the timesteps of an episode
     aids: tuple[str, ...]  # by which cars brake and steer by themselves
-    reward: dict[str, float]  # its terms for others
+    reward: dict[str, float]  # weights that differ between the two kinds of races
 
 
 BEHIND_ROBOTS = Races(
@@ -341,7 +341,8 @@ def has_raced(args: argparse.Namespace) -> bool:
 def main() -> None:
     args = parser.parse_args()
     several = len(args.track) > 1
-    # Pace counts most against an equal, and less grip and a dear racing line cost pace.
+    # Against an equal pace counts most. Less grip costs it, and so does a high price of leaving
+    # the racing line.
     settings = ALL_ROADS if several and not args.ancestor else ONE_TRACK
     races = against(args.ancestor) if args.ancestor else BEHIND_ROBOTS
     known = args.ancestor or args.racer or args.driver

@@ -36,11 +36,8 @@ def test_each_actuator_may_have_a_deviation_of_its_own():
     assert make(log_std_init=[-2.0, 0.0, 0.5]).policy.log_std.tolist() == [-2.0, 0.0, 0.5]
     with pytest.raises(InvalidOption, match="log_std_init has 2 numbers; expected one, or 3"):
         make(log_std_init=[-2.0, 0.0])
-    assert make(log_std_init=th.tensor([-2.0, 0.0, 0.5])).policy.log_std.tolist() == [
-        -2.0,
-        0.0,
-        0.5,
-    ]
+    own = th.tensor([-2.0, 0.0, 0.5])
+    assert make(log_std_init=own).policy.log_std.tolist() == own.tolist()
     for wrong in (np.nan, [0.0, 0.0, np.inf], 1000, "x", th.zeros(3) - 21.0):
         with pytest.raises(
             InvalidOption, match=r"log_std_init is .*; expected numbers from -20 to"

@@ -163,8 +163,8 @@ class AdaptiveLearningRateCallback(_WhileLearning):
     :param kl: target of the divergence per update [nats]
     :param last_kl: the same at the end of the training, to which it falls linearly [nats]; ``None``
         is ``kl``
-    :param first_factor: on the model's learning rate at the begin. One below 1 keeps what a policy
-        knows that drives well already, 0.01 to 4
+    :param first_factor: on the model's learning rate at the begin, 0.01 to 4. With one below 1 the
+        first updates take little of what a good policy knows
     :param verbose: as in ``BaseCallback``
     :raises InvalidOption: if a target is not above 0, the factor is out of its range, or the model
         is not PPO

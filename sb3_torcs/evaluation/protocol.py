@@ -191,7 +191,8 @@ def evaluate(
     :param episodes: how many
     :param seed: of the first reset; the next episodes go on from it
     :return: the results of each
-    :raises InvalidOption: if ``episodes`` is no whole number of at least 1
+    :raises InvalidOption: if ``episodes`` is no whole number of at least 1, or ``env`` is no single
+        environment
     """
     check_count("episodes", episodes)
     if not isinstance(env, gym.Env):
