@@ -51,6 +51,9 @@ parser.add_argument("--cars", type=int, default=4, help="on each track")
 parser.add_argument("--grip", type=float, default=1.0, help="least grip, of that of the game")
 parser.add_argument("--mirror", action="store_true", help="let every other car drive in the mirror")
 parser.add_argument("--width", type=int, default=256, help="of a new student's two layers")
+parser.add_argument(
+    "--actor-sensors", nargs="+", help="groups of sensors that a new student sees; default: all"
+)
 parser.add_argument("--seed", type=int, default=0)
 parser.add_argument("--threads", type=int, help="default: one per core")
 parser.add_argument("--folder", type=Path, default=Path("logs/distilled"))
@@ -154,6 +157,7 @@ def main() -> None:
         "net_arch": [args.width, args.width],
         "activation_fn": nn.ReLU,
         "log_std_init": [-2.0, -0.7],  # steering, pedal, for a training that goes on from it
+        "actor_sensors": args.actor_sensors,
     }
     file = find_model(args.student) if args.student else None
     known = PPO.load(file, device="cpu") if file else None

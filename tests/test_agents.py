@@ -75,8 +75,11 @@ def test_it_holds_only_what_drives_and_says_so(name, capsys):
     record = models.training_record(models.AGENTS / name / "best_model.zip")
     beside = model_record.record_beside(models.AGENTS / name / "best_model.zip")
     assert record.driver_only
-    for field in ("algo", "env_id", "env_kwargs", "hyperparameters"):
+    for field in ("algo", "env_id", "hyperparameters"):
         assert getattr(record, field) == getattr(beside, field)
+    actor_sensors = record.policy["kwargs"].get("actor_sensors")  # only the critic saw the others
+    sees = {} if actor_sensors is None else {"sensors": actor_sensors}
+    assert record.env_kwargs == {**beside.env_kwargs, **sees}
     assert main(["train", "--resume", name, "--timesteps", "1"]) == 2
     assert "holds what drives and not what learns" in capsys.readouterr().err
 

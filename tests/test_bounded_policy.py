@@ -11,6 +11,8 @@ from toy import ToyRace
 from sb3_torcs.callbacks import LeanUpdatesCallback
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.policies import BoundedPolicy
+from sb3_torcs.policies.ppo import is_for
+from sb3_torcs.sensors import GROUPS, feature_slices
 
 
 def make(**policy_kwargs):
@@ -105,3 +107,63 @@ def test_what_drives_follows_the_training(callbacks):
         np.testing.assert_allclose(drives[-1], mean, atol=1e-6)
     assert np.any(drives[0] != drives[1])
     assert np.any(drives[1] != drives[2])
+
+
+SEES = ["base", "preview", "motion"]
+
+
+def make_asymmetric(**policy_kwargs):
+    env = gym.make("TorcsLite-v0", sensors=SEES)
+    kwargs = {"activation_fn": nn.ReLU, "net_arch": [8], "actor_sensors": ["base"], **policy_kwargs}
+    with pytest.warns(UserWarning, match="truncated mini-batch"):
+        return PPO(BoundedPolicy, env, policy_kwargs=kwargs, n_steps=40, batch_size=16, seed=0)
+
+
+@pytest.mark.parametrize(
+    ("actor_sensors", "names"),
+    [(["base"], ["base"]), (("motion", "base"), ["base", "motion"]), (SEES, SEES)],
+)
+def test_an_actor_may_see_less_than_its_value_function(actor_sensors, names, tmp_path):
+    """Whatever the other numbers are, it does the same; and what it learned tells the values."""
+    model = make_asymmetric(actor_sensors=actor_sensors)
+    model.learn(40)
+    model.save(tmp_path / "model.zip")
+    model.policy.save(tmp_path / "policy.pth")
+    where = feature_slices(SEES)
+    chosen = {sensor.name for name in names for sensor in GROUPS[name]}
+    first, second = (model.observation_space.sample() for _ in range(2))
+    for name in chosen:
+        second[where[name]] = first[where[name]]
+    loaded = PPO.load(tmp_path / "model.zip").policy, BoundedPolicy.load(tmp_path / "policy.pth")
+    for policy in (model.policy, *loaded):
+        assert policy.actor_sensors == tuple(names)
+        actions = [policy.predict(seen, deterministic=True)[0] for seen in (first, second)]
+        np.testing.assert_array_equal(*actions)
+        both = th.as_tensor(np.stack((first, second)))
+        with th.no_grad():
+            means, values = policy.get_distribution(both).mode(), policy.predict_values(both)
+        assert means[0].allclose(means[1])  # rows of one product are added up in different orders
+        assert values[0].allclose(values[1]) is (names == SEES)
+
+
+@pytest.mark.parametrize("net_arch", [[8], {"pi": [6, 5], "vf": [8]}, []])
+def test_lean_updates_of_an_asymmetric_policy_learn_as_ppo_does(net_arch):
+    states = []
+    for callback in (None, LeanUpdatesCallback()):
+        model = make_asymmetric(net_arch=net_arch)
+        assert is_for(model) is (net_arch != [])
+        model.learn(80, callback=callback)
+        states.append(model.policy.state_dict())
+    th.testing.assert_close(*states, rtol=1e-4, atol=1e-5)
+
+
+def test_an_actor_cannot_see_what_the_environment_does_not_give():
+    with pytest.raises(
+        InvalidOption, match=r"the environment gives \['base', 'preview', 'motion'\]"
+    ):
+        make_asymmetric(actor_sensors=["base", "line"])
+    for wrong in ("base", ["line"], ["base", "base"], 3):
+        with pytest.raises(InvalidOption, match="expected a list with 'base'"):
+            make_asymmetric(actor_sensors=wrong)
+    with pytest.raises(InvalidOption, match="take out what changes their bounds or size"):
+        PPO(BoundedPolicy, gym.make("Pendulum-v1"), policy_kwargs={"actor_sensors": ["base"]})

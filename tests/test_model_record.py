@@ -24,7 +24,7 @@ import sb3_torcs  # noqa: F401  (registers the environments)
 from sb3_torcs.agents import model_file, model_policy, models
 from sb3_torcs.agents.model_writing import RecordCallback, recipe, write_driver
 from sb3_torcs.errors import InvalidAction, ModelMismatch, ModelNotTrusted
-from sb3_torcs.policies import SplitHeadPolicy
+from sb3_torcs.policies import BoundedPolicy, SplitHeadPolicy
 from sb3_torcs.tracks.catalogue import load_track
 
 OBSERVATIONS = np.linspace(-0.5, 0.5, 4 * 29, dtype=np.float32).reshape(4, 29)
@@ -365,3 +365,24 @@ def test_a_driver_of_ppo_keeps_its_value_function_if_asked(env, tmp_path, kept):
     expected_out = () if kept else model_file.VALUES
     assert left_out == {n for n in model.policy.state_dict() if n.startswith(expected_out)}
     assert stock._last_obs is None
+
+
+def test_a_driver_of_ppo_leaves_out_what_only_its_value_function_saw(tmp_path):
+    """In stock SB3, too, it then drives where there are no such sensors."""
+    with gym.make("TorcsLite-v0", sensors=["base", "line"]) as env:
+        kwargs = {"net_arch": [8], "actor_sensors": ["base"]}
+        model = trained(PPO, BoundedPolicy, env, n_steps=8, batch_size=8, policy_kwargs=kwargs)
+        seen = np.stack([env.observation_space.sample() for _ in range(4)])
+    model.save(tmp_path / "whole.zip")
+    expected, _ = model.predict(seen, deterministic=True)
+    for kept, sensors in ((True, ["base", "line"]), (False, ["base"])):
+        write_driver(tmp_path / "whole.zip", tmp_path / "driver.zip", value_function=kept)
+        record = models.training_record(tmp_path / "driver.zip")
+        assert record.env_kwargs["sensors"] == sensors
+        assert record.hyperparameters["env_kwargs"]["sensors"] == ["base", "line"]
+        with gym.make("TorcsLite-v0", **record.kept(["sensors"])) as env:
+            stock = PPO.load(tmp_path / "driver.zip", env, device="cpu")
+            own = seen[:, : env.observation_space.shape[0]]
+            for driver in (stock, models.load_driver(tmp_path / "driver.zip", env)):
+                found, _ = driver.predict(own, deterministic=True)
+                np.testing.assert_array_equal(found, expected)

@@ -14,8 +14,10 @@ import gymnasium as gym
 import numpy as np
 import stable_baselines3 as sb3
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.save_util import data_to_json
 
 from sb3_torcs import __version__
 from sb3_torcs.agents.model_file import IDLE, VALUES, saved_data, saved_weights
@@ -25,6 +27,7 @@ from sb3_torcs.agents.model_policy import (
     plain_space,
     readable_policy,
     readable_space,
+    restored_space,
 )
 from sb3_torcs.agents.model_record import (
     RECORD,
@@ -34,6 +37,7 @@ from sb3_torcs.agents.model_record import (
     record_within,
 )
 from sb3_torcs.errors import ModelNotTrusted
+from sb3_torcs.policies.asymmetric import columns_of
 from sb3_torcs.torcs.track_names import lasting_kwargs
 from sb3_torcs.tracks.catalogue import lasting_name
 from sb3_torcs.tracks.track import Track
@@ -123,11 +127,14 @@ def write_driver(model: Path, driver: Path, *, value_function: bool = True) -> N
 
     :param model: the complete file
     :param driver: the file to write
-    :param value_function: whether to keep that of PPO, from which another training may go on
+    :param value_function: whether to keep that of PPO, from which another training may go on.
+        Without it, sensors that only the value function saw (``actor_sensors``) are left out, too
     :raises ModelMismatch: if the model cannot be read
     """
     data, weights = saved_data(model), saved_weights(model)
     data[RECORD] = {**_record_in(model, data), "driver_only": True}
+    if not value_function:
+        _leave_out_sensors(data, weights)
     for name in SEEN_LAST:
         data.pop(name, None)
     left_out = tuple(name for name in IDLE if name not in VALUES or not value_function)
@@ -146,6 +153,23 @@ def write_driver(model: Path, driver: Path, *, value_function: bool = True) -> N
                 content = _torch_file({**state, "state": {}})
             # No date: the same model makes the same file.
             target.writestr(zipfile.ZipInfo(name), content, zipfile.ZIP_DEFLATED, 9)
+
+
+def _leave_out_sensors(data: dict[str, Any], weights: dict[str, th.Tensor]) -> None:
+    """Let a driver see only what its actor sees."""
+    record = data[RECORD]
+    sensors = record["policy"].get("kwargs", {}).get("actor_sensors")
+    if sensors is None:
+        return
+    seen = restored_space(record["observation_space"])
+    assert isinstance(seen, spaces.Box)
+    columns = columns_of(seen, sensors)
+    chosen = spaces.Box(seen.low[columns], seen.high[columns])
+    data.update(json.loads(data_to_json({"observation_space": chosen})))
+    record["observation_space"] = plain_space(chosen)
+    record["env_kwargs"] = {**record["env_kwargs"], "sensors": list(sensors)}
+    first = VALUES[1] + "0.weight"
+    weights[first] = weights[first][:, columns]
 
 
 def _torch_file(value: Any) -> bytes:

@@ -15,11 +15,14 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.preprocessing import get_action_dim
+from stable_baselines3.common.torch_layers import MlpExtractor
 from stable_baselines3.common.type_aliases import Schedule
 from torch import nn
 
 from sb3_torcs.errors import InvalidOption
+from sb3_torcs.policies.asymmetric import ActorSensors
 from sb3_torcs.policies.exact import ExactDriver, ExactPolicy
+from sb3_torcs.sensors import SensorsName, checked_sensors
 
 __all__ = ["BoundedHead", "BoundedPolicy"]
 
@@ -65,9 +68,11 @@ class BoundedPolicy(ExactPolicy, ActorCriticPolicy):
     :param action_space: a ``Box`` with finite bounds
     :param lr_schedule: as in ``ActorCriticPolicy``
     :param log_std_init: as in ``ActorCriticPolicy``, or one number per actuator, -20 to 20
+    :param actor_sensors: groups of sensors that the actor sees, ``"base"`` among them, while the
+        value function sees all that the environment gives; ``None`` is all for both
     :param kwargs: the other arguments of ``ActorCriticPolicy``, but for ``use_sde``
     :raises InvalidOption: if the action space has no bounds, if ``log_std_init`` has other numbers,
-        or with ``use_sde``
+        if observations lack one of ``actor_sensors``, or with ``use_sde``
     """
 
     action_net: BoundedHead
@@ -78,6 +83,7 @@ class BoundedPolicy(ExactPolicy, ActorCriticPolicy):
         action_space: spaces.Space[Any],
         lr_schedule: Schedule,
         log_std_init: float | Sequence[float] = 0.0,
+        actor_sensors: Sequence[SensorsName] | None = None,
         **kwargs: Any,
     ) -> None:
         if not isinstance(action_space, spaces.Box) or not action_space.is_bounded():
@@ -88,6 +94,9 @@ class BoundedPolicy(ExactPolicy, ActorCriticPolicy):
         if kwargs.get("use_sde"):
             raise InvalidOption("BoundedPolicy has no use_sde; leave it out, or use MlpPolicy")
         self._first_log_std = _log_std(log_std_init, get_action_dim(action_space))
+        self.actor_sensors = None if actor_sensors is None else checked_sensors(actor_sensors)
+        if actor_sensors is not None:
+            kwargs["share_features_extractor"] = False
         super().__init__(observation_space, action_space, lr_schedule, **kwargs)
         self.log_std_init = self._first_log_std  # type: ignore[assignment]  # for copies of it
 
@@ -98,6 +107,23 @@ class BoundedPolicy(ExactPolicy, ActorCriticPolicy):
             self.log_std.copy_(th.as_tensor(self._first_log_std))
         assert isinstance(self.action_space, spaces.Box)
         self.action_net = BoundedHead(self.action_net, self.action_space)  # type: ignore[arg-type]
+
+    def _build_mlp_extractor(self) -> None:
+        """Make the hidden layers as SB3 does, those of the actor for what it sees."""
+        super()._build_mlp_extractor()
+        if self.actor_sensors is not None:
+            self.pi_features_extractor = ActorSensors(self.observation_space, self.actor_sensors)
+            actor = MlpExtractor(
+                self.pi_features_extractor.features_dim,
+                self.net_arch,
+                self.activation_fn,
+                self.device,
+            )
+            self.mlp_extractor.policy_net = actor.policy_net
+            self.mlp_extractor.latent_dim_pi = actor.latent_dim_pi
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return {**super()._get_constructor_parameters(), "actor_sensors": self.actor_sensors}
 
     def exact_driver(self) -> ExactDriver:
         """Return a copy of what gives the mean action, which drives if it is deterministic."""

@@ -24,6 +24,7 @@ from stable_baselines3.common.utils import explained_variance
 from torch import nn
 
 from sb3_torcs.policies import kernels
+from sb3_torcs.policies.asymmetric import ActorSensors
 from sb3_torcs.policies.bounded import BoundedHead, BoundedPolicy
 from sb3_torcs.policies.flat import Slot
 from sb3_torcs.policies.fused import array
@@ -126,18 +127,25 @@ class LeanPPO:
         :param deterministic: as of the policy
         :return: actions, values of the observations, and logarithms of the actions' probabilities
         """
-        features, actor, critic = array(obs.float()), self.actor, self.critic
-        batch = len(features)
+        seen, actor, critic = self._seen(obs), self.actor, self.critic
+        batch = len(obs)
         noise = np.zeros((batch, len(self.log_std)), np.float32)
         if not deterministic:
             th.from_numpy(noise).normal_()
         actions, values, chances = np.empty_like(noise), *np.empty((2, batch), np.float32)
         decide(
             (self.weights[actor.part], self.log_std, self.weights[critic.part]), actor.sizes,
-            critic.sizes, self.bounds, (features, noise), (actor.room(batch), critic.room(batch)),
+            critic.sizes, self.bounds, (*seen, noise), (actor.room(batch), critic.room(batch)),
             actions, values.reshape(-1, 1), chances,
         )  # fmt: skip
         return th.from_numpy(actions), th.from_numpy(values)[:, None], th.from_numpy(chances)
+
+    def _seen(self, observations: th.Tensor) -> tuple[np.ndarray, np.ndarray]:
+        """Return what the policy and what the value function sees of observations."""
+        policy, found = self.policy, observations.float()
+        return array(policy.pi_features_extractor(found)), array(
+            policy.vf_features_extractor(found)
+        )
 
     # ------------------------------------------------------------------------- updates
 
@@ -168,7 +176,7 @@ class LeanPPO:
 
     def _find_gradient(self, batch: RolloutBufferSamples, other: Executor | None) -> Figures:
         """Find the gradient of the loss, that of the value function in another thread, if any."""
-        observations = array(batch.observations.float())
+        observations, all_of_them = self._seen(batch.observations)
         actions, _, chances, advantages, returns = map(array, batch[1:6])
         if self.model.normalize_advantage and len(advantages) > 1:
             deviation = advantages.std(ddof=1)
@@ -176,7 +184,7 @@ class LeanPPO:
         actor, model, gradient = self.actor, self.model, self.gradient
         entropy = float(self.log_std.sum()) + ENTROPY * len(self.log_std)
         clip = model.clip_range(model._current_progress_remaining)  # type: ignore[operator]
-        find_value = partial(self._find_value_gradient, observations, returns)
+        find_value = partial(self._find_value_gradient, all_of_them, returns)
         running = other.submit(find_value) if other else None
         policy_loss, clipped, kl = find_policy_gradient(
             self.weights[actor.part], self.log_std, actor.sizes, self.bounds, np.float32(clip),
@@ -294,16 +302,17 @@ def decide(
     :param actor_sizes: of the policy's layers
     :param critic_sizes: of the value function's layers
     :param bounds: of the means, as of ``bound``
-    :param given: observations, (batch, features_dim), and noise, (batch, actuators)
+    :param given: what the policy and what the value function sees, (batch, features), and noise,
+        (batch, actuators)
     :param rooms: as ``work`` of ``stack_forward``, of each network
     :param actions: (batch, actuators), written
     :param values: (batch, 1), written
     :param chances: (batch,) logarithms of the actions' probabilities, written
     """
     actor, log_std, critic = parameters
-    observations, noise = given
-    kernels.stack_forward(actor, actor_sizes, False, observations, rooms[0], actions)
-    kernels.stack_forward(critic, critic_sizes, False, observations, rooms[1], values)
+    for_actor, for_critic, noise = given
+    kernels.stack_forward(actor, actor_sizes, False, for_actor, rooms[0], actions)
+    kernels.stack_forward(critic, critic_sizes, False, for_critic, rooms[1], values)
     bound(actions, bounds)
     deviations, two = np.exp(log_std), actions.dtype.type(2)
     chances[:] = 0
@@ -412,7 +421,8 @@ def is_for(model: PPO) -> bool:
         and isinstance(model.observation_space, spaces.Box)
         and len(model.observation_space.shape) == 1
         and type(policy.action_dist) is DiagGaussianDistribution
-        and type(policy.features_extractor) is FlattenExtractor
+        and type(policy.pi_features_extractor) in (FlattenExtractor, ActorSensors)
+        and type(policy.vf_features_extractor) is FlattenExtractor
         and _is_known(policy.mlp_extractor.policy_net)
         and _is_known(policy.mlp_extractor.value_net)
         and model.clip_range_vf is None
