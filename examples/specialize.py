@@ -1,71 +1,133 @@
-"""Let an agent go on learning on one track at a time: it becomes a specialist for each.
+"""Let an agent go on learning on one track at a time, or on several at once.
 
 A specialist is faster on its track than an agent for many, and forgets other tracks. `distill.py`
 teaches one agent what several specialists know. This script learns one track after the other, on
-one core; run it several times at once to use more.
+one core; run it several times at once to use more. With --together it makes one agent better on all
+of the tracks, as a student that leaves some of them.
 """
 
 import argparse
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch as th
 from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_torcs.agents.model_algorithm import told_algorithm
 from sb3_torcs.agents.model_file import learned_weights, saved_data
 from sb3_torcs.agents.model_writing import RecordCallback, recipe
 from sb3_torcs.agents.models import driver_record, find_model
-from sb3_torcs.callbacks import AdaptiveLearningRateCallback, LeanUpdatesCallback
+from sb3_torcs.callbacks import (
+    AdaptiveLearningRateCallback,
+    LeanUpdatesCallback,
+    ValuesOnlyCallback,
+)
 from sb3_torcs.errors import ends_in_a_line
-from sb3_torcs.vec_env import TorcsVecEnv
+from sb3_torcs.vec_env import MirrorVecEnv, TorcsVecEnv
 
-CARS, TIMESTEPS = 64, 128  # at once, and of each between updates
-REWARD = {"progress": 1.0, "off_line": -1.0, "leaving": -0.5, "crash": -1.0, "scale": 0.1}
-NOISE = -1.7, -0.7  # logarithms of the standard deviations at first, steering and pedal
+TIMESTEPS = 128  # of each car between updates
 NOT_DRIVING = ("track", "reward", "max_episode_steps")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What differs between a specialist and an agent for several tracks."""
+
+    cars: int  # at once
+    mirror: bool  # whether every other car drives on the mirror image of its road
+    grip: float | list[float]  # of that of the game
+    episode: int  # timesteps
+    hard: float  # share of the episodes that begin where another left the road
+    off_line: float  # weight of wheels beside the road
+    crash: float  # weight of the end of an episode beside the road
+    batch_size: int
+    ent_coef: float
+    noise: tuple[float, float]  # logarithms of the standard deviations at first, steering and pedal
+    last_kl: float  # target of the divergence per update at the end [nats]
+    first_factor: float  # on the learning rate at the begin, from which it adapts
+    values: int  # timesteps in which only the value function learns
+
+
+SPECIALIST = Settings(
+    cars=64, mirror=False, grip=1.0, episode=600, hard=0.5, off_line=-1.0, crash=-1.0,
+    batch_size=2048, ent_coef=0.001, noise=(-1.7, -0.7), last_kl=0.003, first_factor=1.0, values=0,
+)  # fmt: skip
+TOGETHER = Settings(
+    cars=128, mirror=True, grip=[0.9, 1.0], episode=300, hard=0.7, off_line=-2.0, crash=-3.0,
+    batch_size=2048, ent_coef=0.002, noise=(-2.0, -1.0), last_kl=0.0024, first_factor=0.1,
+    values=400_000,
+)  # fmt: skip
 
 parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
 parser.add_argument("driver", help="a model of PPO to go on from, such as ppo-roads")
 parser.add_argument("--track", nargs="+", required=True, help="one, or several")
-parser.add_argument("--timesteps", type=int, default=1_048_576, help="on each track")
+parser.add_argument(
+    "--together", action="store_true", help="make one agent for all tracks, and none for each"
+)
+parser.add_argument("--timesteps", type=int, default=1_048_576, help="on each track, or together")
+parser.add_argument(
+    "--values", type=int, help="timesteps in which only the value function learns, with --together"
+)
 parser.add_argument("--damage", type=float, default=-0.02, help="weight of a point of damage")
 parser.add_argument("--seed", type=int, default=0)
 parser.add_argument("--folder", type=Path, default=Path("logs/specialists"))
 
 
-def specialize(args: argparse.Namespace, track: str) -> Path:
-    """Go on learning on one track, and return the model's file."""
+def make_cars(args: argparse.Namespace, env_kwargs: dict, settings: Settings) -> VecEnv:
+    """Make cars that begin anywhere on the road, many of them where others left it before."""
+    reward = {
+        "progress": 1.0, "off_line": settings.off_line, "leaving": -0.5, "crash": settings.crash,
+        "scale": 0.1, "damage": args.damage,
+    }  # fmt: skip
+    cars = TorcsVecEnv(
+        settings.cars, threads=1, start="random", reward=reward, grip=settings.grip,
+        max_episode_steps=settings.episode, **env_kwargs,
+    )  # fmt: skip
+    cars.env_method("set_random_speed", 80.0)
+    cars.env_method("set_hard_starts", settings.hard)
+    return MirrorVecEnv(cars) if settings.mirror else cars
+
+
+def go_on(args: argparse.Namespace, tracks: list[str], settings: Settings) -> Path:
+    """Go on learning, and return the model's file."""
     file = find_model(args.driver)
     if told_algorithm(saved_data(file)) != "ppo":
         raise SystemExit(f"{args.driver} is no model of PPO; give one, e.g. ppo-roads")
     trained = driver_record(args.driver).env_kwargs
     env_kwargs = {name: value for name, value in trained.items() if name not in NOT_DRIVING}
-    env_kwargs["track"] = track
-    reward = {**REWARD, "damage": args.damage}
-    cars = TorcsVecEnv(
-        CARS, threads=1, start="random", reward=reward, max_episode_steps=600, **env_kwargs
-    )
-    cars.env_method("set_random_speed", 80.0)
-    cars.env_method("set_hard_starts", 0.5)
+    env_kwargs["track"] = tracks if len(tracks) > 1 else tracks[0]
+    cars = make_cars(args, env_kwargs, settings)
     known = PPO.load(file, device="cpu")
+
     # A new learner, since shipped files hold no optimizer, and their learning rate has fallen.
-    model = PPO(
-        known.policy_class, cars, learning_rate=1e-3, n_steps=TIMESTEPS,
-        batch_size=TIMESTEPS * CARS // 4, gamma=0.985, ent_coef=0.001,
-        policy_kwargs=known.policy_kwargs, seed=args.seed, device="cpu",
-    )  # fmt: skip
+    def learner(weights: dict) -> PPO:
+        model = PPO(
+            known.policy_class, cars, learning_rate=1e-3, n_steps=TIMESTEPS,
+            batch_size=settings.batch_size, gamma=0.985, ent_coef=settings.ent_coef,
+            policy_kwargs=known.policy_kwargs, seed=args.seed, device="cpu",
+        )  # fmt: skip
+        model.policy.load_state_dict({**model.policy.state_dict(), **weights})
+        return model
+
     # The shipped file of a student has no value function: the new one stays.
-    model.policy.load_state_dict({**model.policy.state_dict(), **learned_weights(file)})
+    model = learner(learned_weights(file))
+    if settings.values:
+        alone = [ValuesOnlyCallback(), LeanUpdatesCallback(), AdaptiveLearningRateCallback(kl=0.03)]
+        model.learn(args.values or settings.values, callback=alone)
+        model = learner(model.policy.state_dict())
     with th.no_grad():
-        model.policy.log_std.copy_(th.tensor(NOISE))
+        model.policy.log_std.copy_(th.tensor(settings.noise))
     callbacks = [
         RecordCallback(recipe("ppo", "Torcs-v0", {"env_kwargs": env_kwargs})),
         LeanUpdatesCallback(),
-        AdaptiveLearningRateCallback(kl=0.012, last_kl=0.003),
+        AdaptiveLearningRateCallback(
+            kl=0.012, last_kl=settings.last_kl, first_factor=settings.first_factor
+        ),
     ]
     model.learn(args.timesteps, callback=callbacks)
     cars.close()
-    specialist = args.folder / f"{track}.zip"
+    specialist = args.folder / f"{tracks[0] if len(tracks) == 1 else 'together'}.zip"
     model.save(specialist)
     return specialist
 
@@ -74,8 +136,10 @@ def main() -> None:
     args = parser.parse_args()
     args.folder.mkdir(parents=True, exist_ok=True)
     th.set_num_threads(1)
-    for track in args.track:
-        file = specialize(args, track)
+    together = args.together
+    settings = TOGETHER if together else SPECIALIST
+    for tracks in [args.track] if together else [[track] for track in args.track]:
+        file = go_on(args, tracks, settings)
         print(f"saved {file}; drive it: sb3-torcs evaluate {file}")
 
 

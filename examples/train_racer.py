@@ -18,10 +18,14 @@ from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
-from sb3_torcs.agents.model_file import VALUES, learned_weights
+from sb3_torcs.agents.model_file import learned_weights
 from sb3_torcs.agents.model_writing import RecordCallback, recipe
 from sb3_torcs.agents.models import find_model, training_record
-from sb3_torcs.callbacks import AdaptiveLearningRateCallback, LeanUpdatesCallback
+from sb3_torcs.callbacks import (
+    AdaptiveLearningRateCallback,
+    LeanUpdatesCallback,
+    ValuesOnlyCallback,
+)
 from sb3_torcs.errors import ends_in_a_line
 from sb3_torcs.policies import BoundedPolicy
 from sb3_torcs.sensors import feature_slices
@@ -245,27 +249,6 @@ def learn_alone(args: argparse.Namespace, env_kwargs: dict, settings: Settings) 
     model.learn(timesteps, callback=callbacks(env_kwargs, args, "alone", ALONE))
     cars.close()
     return model.policy.state_dict()
-
-
-class ValuesOnlyCallback(BaseCallback):
-    """Put the policy back after each update, so that only its value function learns."""
-
-    def _on_training_start(self) -> None:
-        named = self.model.policy.named_parameters()
-        self._policy = [
-            (own, own.detach().clone()) for name, own in named if not name.startswith(VALUES)
-        ]
-
-    def _on_rollout_start(self) -> None:
-        with th.no_grad():
-            for own, before in self._policy:
-                own.copy_(before)
-
-    def _on_training_end(self) -> None:
-        self._on_rollout_start()
-
-    def _on_step(self) -> bool:
-        return True
 
 
 def with_values(

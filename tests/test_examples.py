@@ -148,6 +148,23 @@ def test_a_specialist_of_a_student_learns_its_value_function_anew(monkeypatch, t
     assert all(value.isfinite().all() for value in weights.values())
 
 
+def test_a_student_that_sees_less_goes_on_learning_on_its_tracks_together(
+    monkeypatch, capsys, tmp_path, game
+):
+    """Its teachers see the racing line, and so does its value function; it does not."""
+    budget = ["--rounds=1", "--lessons=1", "--cars=1", "--folder", str(tmp_path)]
+    teaching = ["--teach", "ppo-any-road", "forza", "aalborg", "--actor-sensors", "base"]
+    run(monkeypatch, "distill.py", *teaching, *budget)
+    student = str(tmp_path / "model.zip")
+    words = ["--track", "forza", "aalborg", "--timesteps=1", "--values=1"]
+    run(monkeypatch, "specialize.py", student, "--together", *words, "--folder", str(tmp_path))
+    assert f"sb3-torcs evaluate {tmp_path / 'together.zip'}" in capsys.readouterr().out
+    policy = PPO.load(tmp_path / "together.zip", device="cpu").policy
+    assert policy.actor_sensors == ("base",)
+    assert policy.mlp_extractor.policy_net[0].in_features == 29
+    assert policy.mlp_extractor.value_net[0].in_features > 29
+
+
 def test_everywhere_teaches_by_models_that_are_there_or_were_made_before(tmp_path):
     """With a Python that only writes down what it is asked."""
     python, asked = tmp_path / "python", tmp_path / "asked"

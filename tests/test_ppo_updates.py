@@ -5,12 +5,16 @@ import os
 import numpy as np
 import pytest
 import torch as th
-from stable_baselines3 import A2C, PPO
+from stable_baselines3 import A2C, PPO, SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from torch import nn
 from toy import ToyRace
 
-from sb3_torcs.callbacks import AdaptiveLearningRateCallback, LeanUpdatesCallback
+from sb3_torcs.callbacks import (
+    AdaptiveLearningRateCallback,
+    LeanUpdatesCallback,
+    ValuesOnlyCallback,
+)
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.policies import BoundedPolicy
 from sb3_torcs.policies.ppo import LeanPPO, is_for
@@ -207,3 +211,22 @@ def test_only_ppo_tells_a_divergence():
             AdaptiveLearningRateCallback(kl=kl)
         with pytest.raises(InvalidOption, match=r"last_kl is .* pass a divergence above 0"):
             AdaptiveLearningRateCallback(last_kl=kl)
+
+
+# --------------------------------------------------------------------------- values only
+
+
+@pytest.mark.parametrize("others", [[], [LeanUpdatesCallback()]])
+def test_only_the_value_function_learns(others):
+    """The actions of a rollout are those of the policy as it was."""
+    model = make()
+    before = {name: own.clone() for name, own in model.policy.state_dict().items()}
+    model.learn(80, callback=[ValuesOnlyCallback(), *others])
+    for name, own in model.policy.state_dict().items():
+        assert own.equal(before[name]) is ("value_net" not in name), name
+
+
+def test_an_algorithm_without_such_a_value_function_is_told():
+    model = SAC("MlpPolicy", ToyRace())
+    with pytest.raises(InvalidOption, match="is for PPO and A2C, but the model is a SAC"):
+        model.learn(1, callback=ValuesOnlyCallback())

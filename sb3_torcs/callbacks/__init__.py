@@ -13,6 +13,7 @@ from sb3_torcs.callbacks.learning import (
     GradientStepsCallback,
     LeanUpdatesCallback,
     MirrorCallback,
+    ValuesOnlyCallback,
 )
 from sb3_torcs.callbacks.lines import LinePicturesCallback
 from sb3_torcs.callbacks.metrics import MONITOR_KWARGS, DrivingMetricsCallback
@@ -34,4 +35,5 @@ __all__ = [
     "RandomStartCallback",
     "RewardCallback",
     "StochasticBrakeCallback",
+    "ValuesOnlyCallback",
 ]

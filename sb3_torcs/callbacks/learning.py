@@ -6,10 +6,12 @@ from abc import abstractmethod
 from functools import partial
 from typing import Any
 
+import torch as th
 from stable_baselines3 import PPO, TD3
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -28,6 +30,7 @@ __all__ = [
     "GradientStepsCallback",
     "LeanUpdatesCallback",
     "MirrorCallback",
+    "ValuesOnlyCallback",
 ]
 
 RATE_STEP = 1.5  # [-] by which the learning rate changes after an update
@@ -223,6 +226,45 @@ class AdaptiveLearningRateCallback(_WhileLearning):
 
     def _undo(self) -> None:
         self.model.lr_schedule = self._own
+
+
+class ValuesOnlyCallback(BaseCallback):
+    """
+    Put the policy of PPO or A2C back after each update, so that only its value function learns.
+
+    A policy that drives already, but comes without a value function, as a shipped agent or a
+    student does, would be spoiled by one that knows nothing yet. So it learns first, in a training
+    of its own; then a second one learns both.
+
+    :param verbose: as in ``BaseCallback``
+    :raises InvalidOption: if the algorithm is another
+    """
+
+    def __init__(self, *, verbose: int = 0) -> None:
+        super().__init__(verbose)
+
+    def _on_training_start(self) -> None:
+        policy = self.model.policy
+        if not isinstance(policy, ActorCriticPolicy):
+            raise InvalidOption(
+                f"{type(self).__name__} is for PPO and A2C, but the model is a "
+                f"{type(self.model).__name__}; take it out of the callbacks"
+            )
+        parts = policy.mlp_extractor.value_net, policy.value_net
+        values = {id(own) for part in parts for own in part.parameters()}
+        others = [own for own in policy.parameters() if id(own) not in values]
+        self._policy = [(own, own.detach().clone()) for own in others]
+
+    def _on_rollout_start(self) -> None:
+        with th.no_grad():
+            for own, before in self._policy:
+                own.copy_(before)
+
+    def _on_training_end(self) -> None:
+        self._on_rollout_start()
+
+    def _on_step(self) -> bool:
+        return True
 
 
 class MirrorCallback(_WhileLearning):
