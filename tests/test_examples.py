@@ -165,13 +165,20 @@ def test_a_student_that_sees_less_goes_on_learning_on_its_tracks_together(
     assert policy.mlp_extractor.value_net[0].in_features > 29
 
 
-def test_everywhere_teaches_by_models_that_are_there_or_were_made_before(tmp_path):
-    """With a Python that only writes down what it is asked."""
-    python, asked = tmp_path / "python", tmp_path / "asked"
-    python.write_text(f'#!/bin/sh\necho "$@" >> {asked}\n')
-    python.chmod(0o755)
-    path = {"PATH": f"{tmp_path}:/usr/bin:/bin"}
-    subprocess.run(["sh", EXAMPLES / "everywhere.sh"], env=path, check=True)
+@pytest.fixture
+def asked(tmp_path, monkeypatch):
+    """What the scripts ask of commands that only write it down."""
+    asked = tmp_path / "asked"
+    for name in ("python", "sb3-torcs"):
+        command = tmp_path / name
+        command.write_text(f'#!/bin/sh\necho "$@" >> {asked}\n')
+        command.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
+    return asked
+
+
+def test_everywhere_teaches_by_models_that_are_there_or_were_made_before(asked):
+    subprocess.run(["sh", EXAMPLES / "everywhere.sh"], check=True)
     made = set()
     for call in asked.read_text().splitlines():
         options = [option.split() for option in call.split(" --")]
@@ -184,15 +191,23 @@ def test_everywhere_teaches_by_models_that_are_there_or_were_made_before(tmp_pat
     assert "logs/everywhere/model.zip" in made
 
 
-def test_students_for_any_road_learn_from_the_models_of_the_study(tmp_path):
-    """With commands that only write down what they are asked."""
-    asked = tmp_path / "asked"
-    for name in ("python", "sb3-torcs"):
-        command = tmp_path / name
-        command.write_text(f'#!/bin/sh\necho "$@" >> {asked}\n')
-        command.chmod(0o755)
-    path = {"PATH": f"{tmp_path}:/usr/bin:/bin"}
-    subprocess.run(["sh", EXAMPLES / "any_road.sh"], env=path, check=True)
+def test_agents_of_the_29_numbers_go_on_from_a_student_and_teach_another(asked):
+    """Three of them, two at a time, before the last student, which drives all roads and ovals."""
+    subprocess.run(["sh", EXAMPLES / "post_roads.sh"], check=True)
+    first, *going_on, last, learned, unseen, ovals = asked.read_text().splitlines()
+    assert "distill.py --teach ppo-any-road aalborg " in first
+    assert first.endswith("--folder logs/post-roads/first")
+    assert len(going_on) == 3
+    for seed, call in enumerate(sorted(going_on, key=lambda call: call.split(" --seed ")[1])):
+        assert "specialize.py logs/post-roads/first/model.zip --together" in call
+        assert call.endswith(f"--seed {seed} --timesteps 6000000 --folder logs/post-roads/{seed}")
+        assert f"logs/post-roads/{seed}/together.zip" in last
+    for call in (learned, unseen, ovals):
+        assert "evaluate_tracks.py logs/post-roads/last/model.zip" in call
+
+
+def test_students_for_any_road_learn_from_the_models_of_the_study(asked):
+    subprocess.run(["sh", EXAMPLES / "any_road.sh"], check=True)
     study, *calls = asked.read_text().splitlines()
     folder = study.rpartition(" ")[2]
     trials = read_study(EXAMPLES / "studies" / "open_roads.yml").trials
