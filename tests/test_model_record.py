@@ -367,10 +367,11 @@ def test_a_driver_of_ppo_keeps_its_value_function_if_asked(env, tmp_path, kept):
     assert stock._last_obs is None
 
 
-def test_a_driver_of_ppo_leaves_out_what_only_its_value_function_saw(tmp_path):
+@pytest.mark.parametrize("net_arch", [[8], []])
+def test_a_driver_of_ppo_leaves_out_what_only_its_value_function_saw(tmp_path, net_arch):
     """In stock SB3, too, it then drives where there are no such sensors."""
     with gym.make("TorcsLite-v0", sensors=["base", "line"]) as env:
-        kwargs = {"net_arch": [8], "actor_sensors": ["base"]}
+        kwargs = {"net_arch": net_arch, "actor_sensors": ["base"]}
         model = trained(PPO, BoundedPolicy, env, n_steps=8, batch_size=8, policy_kwargs=kwargs)
         seen = np.stack([env.observation_space.sample() for _ in range(4)])
     model.save(tmp_path / "whole.zip")
@@ -386,3 +387,19 @@ def test_a_driver_of_ppo_leaves_out_what_only_its_value_function_saw(tmp_path):
             for driver in (stock, models.load_driver(tmp_path / "driver.zip", env)):
                 found, _ = driver.predict(own, deterministic=True)
                 np.testing.assert_array_equal(found, expected)
+
+
+def test_a_driver_keeps_the_statistics_of_what_it_sees(tmp_path):
+    """Those of the other sensors go with them."""
+    where = DummyVecEnv([lambda: gym.make("TorcsLite-v0", sensors=["base", "line"])])
+    env, kwargs = VecNormalize(where), {"net_arch": [8], "actor_sensors": ["base"]}
+    model = trained(PPO, BoundedPolicy, env, n_steps=8, batch_size=8, policy_kwargs=kwargs)
+    seen = np.stack([env.observation_space.sample() for _ in range(4)])
+    expected, _ = model.predict(env.normalize_obs(seen), deterministic=True)
+    env.close()
+    model.save(tmp_path / "whole.zip")
+    write_driver(tmp_path / "whole.zip", tmp_path / "driver.zip", value_function=False)
+    with gym.make("TorcsLite-v0") as env:
+        driver = models.load_driver(tmp_path / "driver.zip", env)
+        found, _ = driver.predict(seen[:, :29], deterministic=True)
+    np.testing.assert_array_equal(found, expected)

@@ -168,7 +168,11 @@ def _leave_out_sensors(data: dict[str, Any], weights: dict[str, th.Tensor]) -> N
     data.update(json.loads(data_to_json({"observation_space": chosen})))
     record["observation_space"] = plain_space(chosen)
     record["env_kwargs"] = {**record["env_kwargs"], "sensors": list(sensors)}
-    first = VALUES[1] + "0.weight"
+    if record["statistics"] is not None:
+        found = {name: np.take(record["statistics"][name], columns) for name in ("mean", "var")}
+        record["statistics"] |= {name: numbers.tolist() for name, numbers in found.items()}
+    layers = VALUES[1] + "0.weight", VALUES[0] + "weight"  # the latter, if there is no hidden one
+    first = next(name for name in layers if name in weights)
     weights[first] = weights[first][:, columns]
 
 
