@@ -259,15 +259,16 @@ def choices_of_size(size: int) -> tuple[View, ...]:
     return tuple(view for view in views if view.size == size)
 
 
-def choice_within(low: npt.ArrayLike, high: npt.ArrayLike) -> View | None:
+def view_of(space: Any) -> View | None:
     """
-    Find the choice of groups whose observations have these bounds.
+    Find the choice of groups whose observations have the bounds of a space.
 
-    :param low: of each number of an observation
-    :param high: of each
+    Several choices may have one size, and so may stacked frames: the bounds decide.
+
+    :param space: of the observations, a ``Box``; or a :class:`View`
     :return: the choice; ``None`` if there is none
     """
-    bounds = np.array((low, high), np.float32)
+    bounds = np.array((getattr(space, "low", ()), getattr(space, "high", ())), np.float32)
     views = choices_of_size(bounds.shape[1]) if bounds.ndim == 2 else ()
     return next((v for v in views if np.array_equal((v.low, v.high), bounds)), None)
 

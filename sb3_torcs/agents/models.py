@@ -41,7 +41,7 @@ from sb3_torcs.errors import (
     ModelNotTrusted,
     near_miss,
 )
-from sb3_torcs.sensors import choice_within
+from sb3_torcs.sensors import view_of
 from sb3_torcs.torcs.installation import INSTALL, find_game
 
 if TYPE_CHECKING:
@@ -311,7 +311,7 @@ def _option_of(space: spaces.Space[Any]) -> str | None:
         layout = action_layout(action)
         if np.array_equal((space.low, space.high), np.array((layout.low, layout.high), np.float32)):
             return f"action={action!r}"
-    view = choice_within(space.low, space.high)
+    view = view_of(space)
     return None if view is None else f"sensors={list(view.sensors)}".replace(" ", "")
 
 

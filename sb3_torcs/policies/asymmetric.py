@@ -15,7 +15,7 @@ from gymnasium import spaces
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 
 from sb3_torcs.errors import InvalidOption
-from sb3_torcs.sensors import GROUPS, SensorsName, checked_sensors, choice_within, feature_slices
+from sb3_torcs.sensors import GROUPS, SensorsName, checked_sensors, feature_slices, view_of
 
 __all__ = ["ActorSensors", "columns_of"]
 
@@ -58,9 +58,7 @@ def columns_of(observation_space: spaces.Space[Any], sensors: Sequence[SensorsNa
     :raises InvalidOption: if observations have no such groups
     """
     wanted = checked_sensors(sensors)
-    view = choice_within(
-        getattr(observation_space, "low", ()), getattr(observation_space, "high", ())
-    )
+    view = view_of(observation_space)
     if view is None:
         raise InvalidOption(
             f"actor_sensors={list(wanted)!r}: these observations, of shape "

@@ -16,7 +16,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_torcs.car import look_both_ways
 from sb3_torcs.errors import InvalidOption
-from sb3_torcs.sensors import GROUPS, Sensor, choice_within
+from sb3_torcs.sensors import GROUPS, Sensor, view_of
 
 __all__ = [
     "MirrorImage",
@@ -66,12 +66,10 @@ def sensors_of(space: Any) -> tuple[Sensor, ...]:
     """
     Find the sensors of observations by their space.
 
-    Several choices of groups may have one size, and so may stacked frames: the bounds decide.
-
     :param space: of the observations, a ``Box``; or a :class:`~sb3_torcs.sensors.View`
     :return: rows of the sensor table; empty if the space is of no choice of groups
     """
-    view = choice_within(getattr(space, "low", ()), getattr(space, "high", ()))
+    view = view_of(space)
     return () if view is None else tuple(chain(*(GROUPS[name] for name in view.sensors)))
 
 
