@@ -2,8 +2,8 @@
 
 A specialist is faster on its track than an agent for many, and forgets other tracks. `distill.py`
 teaches one agent what several specialists know. This script learns one track after the other, on
-one core; run it several times at once to use more. With --together it makes one agent better on all
-of the tracks, as a student that leaves some of them.
+one core; run it several times at once to use more. With --together one agent learns all tracks at
+once, such as a student that leaves some of them.
 """
 
 import argparse
@@ -26,7 +26,7 @@ from sb3_torcs.callbacks import (
 from sb3_torcs.errors import ends_in_a_line
 from sb3_torcs.vec_env import MirrorVecEnv, TorcsVecEnv
 
-TIMESTEPS = 128  # of each car between updates
+TIMESTEPS, BATCH = 128, 2048  # of each car between updates; of a step of Adam
 NOT_DRIVING = ("track", "reward", "max_episode_steps")
 
 
@@ -41,33 +41,33 @@ class Settings:
     hard: float  # share of the episodes that begin where another left the road
     off_line: float  # weight of wheels beside the road
     crash: float  # weight of the end of an episode beside the road
-    batch_size: int
     ent_coef: float
     noise: tuple[float, float]  # logarithms of the standard deviations at first, steering and pedal
     last_kl: float  # target of the divergence per update at the end [nats]
     first_factor: float  # on the learning rate at the begin, from which it adapts
-    values: int  # timesteps in which only the value function learns
 
 
 SPECIALIST = Settings(
     cars=64, mirror=False, grip=1.0, episode=600, hard=0.5, off_line=-1.0, crash=-1.0,
-    batch_size=2048, ent_coef=0.001, noise=(-1.7, -0.7), last_kl=0.003, first_factor=1.0, values=0,
+    ent_coef=0.001, noise=(-1.7, -0.7), last_kl=0.003, first_factor=1.0,
 )  # fmt: skip
 TOGETHER = Settings(
     cars=128, mirror=True, grip=[0.9, 1.0], episode=300, hard=0.7, off_line=-2.0, crash=-3.0,
-    batch_size=2048, ent_coef=0.002, noise=(-2.0, -1.0), last_kl=0.0024, first_factor=0.1,
-    values=400_000,
+    ent_coef=0.002, noise=(-2.0, -1.0), last_kl=0.0024, first_factor=0.1,
 )  # fmt: skip
 
 parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
 parser.add_argument("driver", help="a model of PPO to go on from, such as ppo-roads")
 parser.add_argument("--track", nargs="+", required=True, help="one, or several")
 parser.add_argument(
-    "--together", action="store_true", help="make one agent for all tracks, and none for each"
+    "--together", action="store_true", help="learn all tracks at once, and save one model"
 )
 parser.add_argument("--timesteps", type=int, default=1_048_576, help="on each track, or together")
 parser.add_argument(
-    "--values", type=int, help="timesteps in which only the value function learns, with --together"
+    "--values",
+    type=int,
+    default=400_000,
+    help="timesteps in which only the value function learns, with --together",
 )
 parser.add_argument("--damage", type=float, default=-0.02, help="weight of a point of damage")
 parser.add_argument("--seed", type=int, default=0)
@@ -89,6 +89,23 @@ def make_cars(args: argparse.Namespace, env_kwargs: dict, settings: Settings) ->
     return MirrorVecEnv(cars) if settings.mirror else cars
 
 
+def make_model(
+    known: PPO, weights: dict, cars: VecEnv, args: argparse.Namespace, settings: Settings
+) -> PPO:
+    """
+    Make a new learner, since shipped files hold no optimizer, and their learning rate has fallen.
+
+    Weights that are missing, as those of the value function of a student, stay new.
+    """
+    model = PPO(
+        known.policy_class, cars, learning_rate=1e-3, n_steps=TIMESTEPS, batch_size=BATCH,
+        gamma=0.985, ent_coef=settings.ent_coef, policy_kwargs=known.policy_kwargs,
+        seed=args.seed, device="cpu",
+    )  # fmt: skip
+    model.policy.load_state_dict({**model.policy.state_dict(), **weights})
+    return model
+
+
 def go_on(args: argparse.Namespace, tracks: list[str], settings: Settings) -> Path:
     """Go on learning, and return the model's file."""
     file = find_model(args.driver)
@@ -99,23 +116,11 @@ def go_on(args: argparse.Namespace, tracks: list[str], settings: Settings) -> Pa
     env_kwargs["track"] = tracks if len(tracks) > 1 else tracks[0]
     cars = make_cars(args, env_kwargs, settings)
     known = PPO.load(file, device="cpu")
-
-    # A new learner, since shipped files hold no optimizer, and their learning rate has fallen.
-    def learner(weights: dict) -> PPO:
-        model = PPO(
-            known.policy_class, cars, learning_rate=1e-3, n_steps=TIMESTEPS,
-            batch_size=settings.batch_size, gamma=0.985, ent_coef=settings.ent_coef,
-            policy_kwargs=known.policy_kwargs, seed=args.seed, device="cpu",
-        )  # fmt: skip
-        model.policy.load_state_dict({**model.policy.state_dict(), **weights})
-        return model
-
-    # The shipped file of a student has no value function: the new one stays.
-    model = learner(learned_weights(file))
-    if settings.values:
+    model = make_model(known, learned_weights(file), cars, args, settings)
+    if args.together:
         alone = [ValuesOnlyCallback(), LeanUpdatesCallback(), AdaptiveLearningRateCallback(kl=0.03)]
-        model.learn(args.values or settings.values, callback=alone)
-        model = learner(model.policy.state_dict())
+        model.learn(args.values, callback=alone)
+        model = make_model(known, model.policy.state_dict(), cars, args, settings)
     with th.no_grad():
         model.policy.log_std.copy_(th.tensor(settings.noise))
     callbacks = [

@@ -169,8 +169,9 @@ def _leave_out_sensors(data: dict[str, Any], weights: dict[str, th.Tensor]) -> N
     record["observation_space"] = plain_space(chosen)
     record["env_kwargs"] = {**record["env_kwargs"], "sensors": list(sensors)}
     if record["statistics"] is not None:
-        found = {name: np.take(record["statistics"][name], columns) for name in ("mean", "var")}
-        record["statistics"] |= {name: numbers.tolist() for name, numbers in found.items()}
+        known = record["statistics"]
+        own = {name: np.take(known[name], columns).tolist() for name in ("mean", "var")}
+        record["statistics"] = {**known, **own}
     layers = VALUES[1] + "0.weight", VALUES[0] + "weight"  # the latter, if there is no hidden one
     first = next(name for name in layers if name in weights)
     weights[first] = weights[first][:, columns]

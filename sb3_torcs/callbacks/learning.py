@@ -232,9 +232,9 @@ class ValuesOnlyCallback(BaseCallback):
     """
     Put the policy of PPO or A2C back after each update, so that only its value function learns.
 
-    A policy that drives already, but comes without a value function, as a shipped agent or a
-    student does, would be spoiled by one that knows nothing yet. So it learns first, in a training
-    of its own; then a second one learns both.
+    A shipped agent or a student drives, but comes without a value function, and a new one would
+    spoil it. So let the value function learn first, in a training of its own; in a second training,
+    without this callback, both learn.
 
     :param verbose: as in ``BaseCallback``
     :raises InvalidOption: if the algorithm is another

@@ -142,10 +142,10 @@ class LeanPPO:
 
     def _seen(self, observations: th.Tensor) -> tuple[np.ndarray, np.ndarray]:
         """Return what the policy and what the value function sees of observations."""
-        policy, found = self.policy, observations.float()
-        return array(policy.pi_features_extractor(found)), array(
-            policy.vf_features_extractor(found)
-        )
+        given, policy = observations.float(), self.policy
+        for_actor = policy.pi_features_extractor(given)
+        for_critic = policy.vf_features_extractor(given)
+        return array(for_actor), array(for_critic)
 
     # ------------------------------------------------------------------------- updates
 
@@ -176,7 +176,7 @@ class LeanPPO:
 
     def _find_gradient(self, batch: RolloutBufferSamples, other: Executor | None) -> Figures:
         """Find the gradient of the loss, that of the value function in another thread, if any."""
-        observations, all_of_them = self._seen(batch.observations)
+        for_actor, for_critic = self._seen(batch.observations)
         actions, _, chances, advantages, returns = map(array, batch[1:6])
         if self.model.normalize_advantage and len(advantages) > 1:
             deviation = advantages.std(ddof=1)
@@ -184,11 +184,11 @@ class LeanPPO:
         actor, model, gradient = self.actor, self.model, self.gradient
         entropy = float(self.log_std.sum()) + ENTROPY * len(self.log_std)
         clip = model.clip_range(model._current_progress_remaining)  # type: ignore[operator]
-        find_value = partial(self._find_value_gradient, all_of_them, returns)
+        find_value = partial(self._find_value_gradient, for_critic, returns)
         running = other.submit(find_value) if other else None
         policy_loss, clipped, kl = find_policy_gradient(
             self.weights[actor.part], self.log_std, actor.sizes, self.bounds, np.float32(clip),
-            (observations, actions), (chances, advantages), actor.room(len(actions)),
+            (for_actor, actions), (chances, advantages), actor.room(len(actions)),
             gradient[actor.part], gradient[: len(self.log_std)],
         )  # fmt: skip
         gradient[: len(self.log_std)] -= np.float32(model.ent_coef)
