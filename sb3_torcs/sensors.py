@@ -41,6 +41,7 @@ __all__ = [
     "GROUPS",
     "NEEDS_CAR",
     "NEEDS_RACE",
+    "NEEDS_ROAD",
     "OBSERVATION_HIGH",
     "OBSERVATION_LOW",
     "OBSERVATION_SIZE",
@@ -182,6 +183,9 @@ it is than at rest, which tells that it is light over a crest, or flies."""
 
 NEEDS_CAR = frozenset({"car", "car_line"})
 """Groups that only a world that knows its car's file can tell."""
+
+NEEDS_ROAD = frozenset({"preview", "limits", "line", "car_line", "motion"})
+"""Groups that only a world that knows its track can tell; the SCR protocol has no yaw rate."""
 
 GROUPS: Mapping[SensorsName, tuple[Sensor, ...]] = {
     "base": SENSORS,

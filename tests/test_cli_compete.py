@@ -49,8 +49,9 @@ def test_an_agent_drives_to_the_end_and_says_how_long_it_took(race, capsys):
 
 
 def test_for_people_it_prints_three_lines(race, capsys):
+    """Whoever sees nothing of the road ahead drives any, and has to be told no track."""
     port, process = race
-    words = ["compete", "scripted", "--port", str(port), "--track", "a-speedway"]
+    words = ["compete", "scripted", "--port", str(port)]
     assert main([*words, "--name", "Ann Other"]) == 0
     ready, awaiting, first, second, third = capsys.readouterr().out.splitlines()
     assert ready == f"scripted is being loaded for the race at 127.0.0.1, UDP port {port}"

@@ -40,7 +40,7 @@ from sb3_torcs.errors import (
     UnknownCar,
     UnknownRobot,
 )
-from sb3_torcs.scr.car_reader import CarReader
+from sb3_torcs.scr.car_reader import UNKNOWN_ROAD, CarReader
 from sb3_torcs.scr.gearbox import read_gearbox
 from sb3_torcs.scr.protocol import RESTART, SHUTDOWN, ScrState
 from sb3_torcs.scr.server import open_ports, start_server
@@ -256,6 +256,39 @@ def test_a_car_beyond_the_end_of_the_lap_is_on_another_track(monkeypatch):
         with pytest.raises(InvalidOption, match="give the server's track"):
             world.step(STRAIGHT_ON, 2)
         world.close()
+
+
+def test_without_a_track_the_car_has_the_place_on_the_road_that_the_server_tells():
+    """And laps, of any length, by the two distances that it tells."""
+    lap = 3000.0
+    states = [
+        ScrState(
+            lap_time=0.1 * (step % 150), last_lap_time=15.0 * (step >= 150), track_position=0.37,
+            distance_from_start=(lap - 20.0 + 20.0 * step) % lap, distance_raced=20.0 * step,
+            heading_error=0.05, speed_x=50.0,
+        )
+        for step in range(300)
+    ]  # fmt: skip
+    reader = CarReader(UNKNOWN_ROAD)
+    cars = [reader.begin(states[0]), *(reader.read(state, 5) for state in states[1:])]
+    assert [car.track_position for car in cars] == pytest.approx([0.37] * 300)
+    assert {car.heading_error for car in cars} == {0.05}
+    assert [car.distance_raced for car in cars] == [20.0 * step for step in range(300)]
+    assert cars[-1].laps == 1
+    assert cars[-1].best_lap_time == 15.0
+
+
+def test_without_a_track_nothing_of_the_road_is_told():
+    with pytest.raises(InvalidOption, match="add host='localhost'"):
+        ScrBackend(None)
+    with Loopback() as server:
+        settings = {"backend": "scr", "track": None, "host": server.host, "port": server.port}
+        with pytest.raises(InvalidOption, match="'line' and 'motion' need the track of the race"):
+            gym.make("sb3_torcs:Torcs-v0", sensors=["base", "line", "motion"], **settings)
+        env = gym.make("sb3_torcs:Torcs-v0", **settings)
+        with pytest.raises(InvalidOption, match="give the track of the race"):
+            _ = env.unwrapped.backend.profile
+        env.close()
 
 
 def test_no_server_is_told(monkeypatch):

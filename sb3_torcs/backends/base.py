@@ -22,6 +22,7 @@ OPTIONAL: dict[str, Any] = {
     "gears": GEARS,  # forward ones of the car
     "profile": None,  # the road's :class:`~sb3_torcs.tracks.profile.RoadProfile`, if it has hills
     "facts": None,  # :class:`~sb3_torcs.torcs.car_file.CarFacts` of the present episode's car
+    "knows_road": True,  # whether ``track`` is the one that is driven, not a stand-in
     "tells_race": False,  # whether it fills ``CarState.race``
     "shares_race": False,  # whether the cars of other agents move whenever this one does
     "conditions": (),  # names of those that ``set_conditions(grip, mass)`` changes

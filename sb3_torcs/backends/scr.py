@@ -25,7 +25,7 @@ from sb3_torcs.car import (
     range_finder_angles,
 )
 from sb3_torcs.errors import EngineForked, GameFailed, GameTimeout, InvalidOption, ServerLost
-from sb3_torcs.scr.car_reader import CarReader
+from sb3_torcs.scr.car_reader import UNKNOWN_ROAD, CarReader
 from sb3_torcs.scr.client import ScrClient
 from sb3_torcs.scr.gearbox import read_gearbox
 from sb3_torcs.scr.protocol import ScrAction, format_action, parse_motor, parse_state
@@ -65,7 +65,8 @@ class ScrBackend:
     wall included.
 
     :param track: ``"aalborg"``, ``"road/aalborg"``, or the path of a TORCS XML file; that of the
-        server, if one is named
+        server, if one is named, or ``None`` if nobody knows it: positions are those on a straight
+        then, and nothing is told of the road ahead
     :param car: any of the game's; that of the server, if one is named
     :param range_finders: see :func:`sb3_torcs.car.range_finder_angles`
     :param opponents: robots, e.g. ``("inferno", "berniw:3")``
@@ -78,7 +79,7 @@ class ScrBackend:
 
     def __init__(
         self,
-        track: str | Path = "aalborg",
+        track: str | Path | None = "aalborg",
         *,
         car: str = DEFAULT_CAR,
         range_finders: RangeFinderName | Sequence[float] = "scr",
@@ -107,7 +108,13 @@ class ScrBackend:
         self.range_finder_angles = range_finder_angles(range_finders)
         self._gearbox = read_gearbox(game.find_car(car), checked_gearbox(gearbox))
         self.gears = len(self._gearbox.ratios)
-        self.track: Track = load_track(find_track(track, game))
+        if self._own and track is None:
+            raise InvalidOption(
+                "track is None, which is for a race at a host of its own; name a track, such as "
+                "'aalborg', or add host='localhost'"
+            )
+        self.knows_road = track is not None
+        self.track: Track = UNKNOWN_ROAD if track is None else load_track(find_track(track, game))
         entries = starting_list(game, opponents, grid_place)
         if self._own:
             compiled_library(
@@ -123,7 +130,7 @@ class ScrBackend:
         if not is_count(self._address[1]) or self._address[1] > MAX_PORT:
             raise InvalidOption(f"port is {port!r}; expected 1 to {MAX_PORT}")
         self._race = RaceSetup(
-            self._settings["track"],
+            self._settings["track"] or "",
             [DRIVER if entry == AGENT else entry for entry in entries],
             laps=laps if len(entries) > 1 and laps else MANY_LAPS,
             session="race" if len(entries) > 1 else "practice",
@@ -192,6 +199,10 @@ class ScrBackend:
     @cached_property
     def profile(self) -> RoadProfile:
         """The road with its hills as the engine loads it, since the server does not send them."""
+        if not self.knows_road:
+            raise InvalidOption(
+                "track is None, and this needs the road ahead; give the track of the race"
+            )
         path = find_track(self._settings["track"], self._game).path
         race = engine_arguments(
             self._game, path, [AGENT], cars=[self.car], session="practice", laps=0

@@ -25,8 +25,9 @@ Drive a saved model in a race of an SCR server: `sb3-torcs serve`, a patched gam
 server. The agent chooses an action as often as in its training, and repeats it at every control
 tick in between. It drives to the end of the race, even beside the road.
 
-The protocol does not tell the client which track and which car it drives: give them with --track
-and --car. The track is used to compute the car's position, the car for its gearbox.
+The protocol does not tell the client which track and which car it drives. Give the car with --car:
+the gearbox is made for it. An agent that sees the road ahead, and a ghost, need the track, too:
+--track. Others drive any road.
 """
 
 
@@ -45,7 +46,9 @@ def add_parser(subparsers: Any) -> None:
     add("--host", default="127.0.0.1", metavar="H", help="default: 127.0.0.1")
     add("--port", type=positive, default=3001, metavar="P", help="default: 3001")
     add(
-        "--track", metavar="T", help="track of that race; default: that of the training, or aalborg"
+        "--track",
+        metavar="T",
+        help="track of that race; default: that of the training, for those who need it",
     )
     add("--car", metavar="C", help="car of that race; default: that of the training")
     add("--name", metavar="N", help="name of the driver, which `serve` shows; default: the model's")
@@ -64,14 +67,19 @@ def run(args: argparse.Namespace) -> int:
     with quiet_output(args.json):  # said first, because loading takes seconds
         print(f"{args.model} is being loaded for the race at {where}", flush=True)
 
+    from sb3_torcs.agents.ghosts import is_ghost
     from sb3_torcs.agents.model_record import DRIVEN_WITH
     from sb3_torcs.agents.models import driver_name, one_of
     from sb3_torcs.agents.remote import Agent
+    from sb3_torcs.sensors import NEEDS_ROAD
 
     record = told_record(args.model)
     settings = record.kept(("track", "car", *DRIVEN_WITH))
     given = {"track": args.track, "car": args.car, "host": args.host, "port": args.port}
     settings |= {name: value for name, value in given.items() if value is not None}
+    sees_road = NEEDS_ROAD.intersection(settings.get("sensors", ()))
+    if args.track is None and not sees_road and not is_ghost(args.model):
+        settings["track"] = None  # it drives on any, this one may be another than it learned
     one_of("track", settings.get("track"))
     one_of("car", settings.get("car"))
     with quiet_output(args.json):

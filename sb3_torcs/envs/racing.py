@@ -35,7 +35,7 @@ from sb3_torcs.envs.ends import ENDS, GRACE_TICKS, STUCK_TICKS, TRUNCATING, end_
 from sb3_torcs.envs.starts import Starts, read_start
 from sb3_torcs.errors import CarLost, EnvClosed, InvalidOption
 from sb3_torcs.rewards import CRASHES, Reward, RewardChoice
-from sb3_torcs.sensors import NEEDS_CAR, NEEDS_RACE, SensorsName, View
+from sb3_torcs.sensors import NEEDS_CAR, NEEDS_RACE, NEEDS_ROAD, SensorsName, View
 from sb3_torcs.tracks.track import Track
 
 __all__ = ["RacingEnv", "RacingInfo", "RenderMode"]
@@ -86,7 +86,7 @@ def racing_info(
 
 
 def _check_tells(world: Backend, view: View, aids: Aids) -> None:
-    """Refuse what needs a race, or a car's file, in a world that does not know of it."""
+    """Refuse what needs a race, a road or a car's file, in a world that does not know of it."""
     lacking = sorted(NEEDS_RACE.intersection(view.sensors))
     lacking += [name for name in NEED_RIVALS if getattr(aids, name)]
     if lacking and not optional(world, "tells_race"):
@@ -100,6 +100,12 @@ def _check_tells(world: Backend, view: View, aids: Aids) -> None:
         raise InvalidOption(
             f"sensors {' and '.join(map(repr, untold))} are of the car's file in the game, which "
             "this world does not read; leave them out, or use backend 'native' of Torcs-v0"
+        )
+    unseen = sorted(NEEDS_ROAD.intersection(view.sensors))
+    if unseen and not optional(world, "knows_road"):
+        raise InvalidOption(
+            f"sensors {' and '.join(map(repr, unseen))} need the track of the race, and track is "
+            "None; name it"
         )
 
 

@@ -62,7 +62,8 @@ class TorcsEnv(RacingEnv):
     Units are SI and radians; left is positive.
 
     :param track: ``"aalborg"``, ``"road/aalborg"``, or the path of a TORCS XML file; or a list of
-        them: each episode is on one, drawn from the seed
+        them: each episode is on one, drawn from the seed; with ``host`` that of its race, or
+        ``None`` if nobody knows it
     :param car: any of the game's, e.g. ``"car1-trb1"``; or a list of them, as for the track
     :param reward: ``"progress"``, ``"blog"``, ``"apex"``, or a dict of weights
     :param action_repeat: control ticks of 0.02 s per timestep
@@ -124,7 +125,7 @@ class TorcsEnv(RacingEnv):
     def __init__(
         self,
         *,
-        track: str | Path | Sequence[str | Path] = "aalborg",
+        track: str | Path | Sequence[str | Path] | None = "aalborg",
         car: str | Sequence[str] = DEFAULT_CAR,
         reward: RewardChoice = "progress",
         action_repeat: int = 5,
