@@ -105,16 +105,19 @@ def is_count(value: Any) -> bool:
     return not isinstance(value, bool) and isinstance(value, Integral) and int(value) >= 1
 
 
-def check_count(name: str, value: Any) -> None:
+def check_count(name: str, value: Any, most: int | None = None) -> None:
     """
     Make sure that an option is a whole number of at least 1.
 
     :param name: of the option
     :param value: what was given
+    :param most: that it may be; ``None`` is any number
     :raises InvalidOption: if it is not
     """
     if not is_count(value):
         raise InvalidOption(f"{name} is {value!r}; expected a whole number >= 1")
+    if most is not None and value > most:
+        raise InvalidOption(f"{name} is {value!r}; expected at most {most}")
 
 
 class Controls(NamedTuple):

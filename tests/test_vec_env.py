@@ -418,6 +418,7 @@ class Own(TorcsLiteEnv):
     [
         ({"races": 0}, "races is 0; expected a whole number >= 1"),
         ({"races": "two"}, "races is 'two'"),
+        ({"races": 10**9}, "races is 1000000000; expected at most 10000"),
         ({"agents": 0}, "agents is 0; expected a whole number >= 1"),
         ({"threads": 0}, "threads is 0; expected a whole number >= 1, or None"),
         ({"races": [partial(gym.make, LITE)], "laps": 1}, "laps is for races made here"),

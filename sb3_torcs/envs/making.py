@@ -17,11 +17,12 @@ from sb3_torcs.errors import InvalidOption
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.starting_list import guests_of
 
-__all__ = ["NO_LIMIT", "EnvMaker", "checked_time_limit", "env_makers"]
+__all__ = ["MANY_RACES", "NO_LIMIT", "EnvMaker", "checked_time_limit", "env_makers"]
 
 EnvMaker = Callable[[], gym.Env[Any, Any]]
 
 NO_LIMIT = -1  # as in gym.make
+MANY_RACES = 10_000  # [-] at once: a mistyped number shall not fill the memory
 
 
 def checked_time_limit(steps: Any, env_id: str) -> int:

@@ -18,7 +18,7 @@ from sb3_torcs.backends.native import Fleet
 from sb3_torcs.backends.several import present_world, shared_worlds
 from sb3_torcs.car import CarState, check_count, is_count
 from sb3_torcs.envs.conditions import Part
-from sb3_torcs.envs.making import NO_LIMIT, checked_time_limit
+from sb3_torcs.envs.making import MANY_RACES, NO_LIMIT, checked_time_limit
 from sb3_torcs.envs.racing import Observation
 from sb3_torcs.envs.torcs import TorcsEnv
 from sb3_torcs.errors import CarLost, EnvClosed, InvalidAction, InvalidOption
@@ -64,7 +64,7 @@ class TorcsVectorEnv(SyncVectorEnv):
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         **options: Any,
     ) -> None:
-        check_count("num_envs", num_envs)
+        check_count("num_envs", num_envs, MANY_RACES)
         if threads is not None and not is_count(threads):
             raise InvalidOption(f"threads is {threads!r}; expected a whole number >= 1, or None")
         if options.get("backend", "native") != "native":

@@ -18,7 +18,7 @@ from sb3_torcs.backends.seats import Seat, SharedRace
 from sb3_torcs.backends.several import shared_worlds
 from sb3_torcs.car import check_count, is_count
 from sb3_torcs.envs.batch import Batch, Outcome
-from sb3_torcs.envs.making import EnvMaker, env_makers
+from sb3_torcs.envs.making import MANY_RACES, EnvMaker, env_makers
 from sb3_torcs.envs.racing import RacingEnv, RacingInfo
 from sb3_torcs.errors import EnvClosed, InvalidOption
 
@@ -161,7 +161,7 @@ class TorcsVecEnv(DummyVecEnv):
                 )
             makers = list(races)
         else:
-            check_count("races", races)
+            check_count("races", races, MANY_RACES)
             made = env_makers(int(races), agents, env_id, env_kwargs)  # type: ignore[arg-type]
             makers = [partial(_monitored, make) for make in made]
         super().__init__(makers)
