@@ -175,15 +175,15 @@ def test_other_numbers_of_actions_take_other_heads():
     ({"head_bias": "abc"}, "pass one finite number per action"),
     ({"net_arch": {"pi": [8], "qf": [8, 8], "x": [1]}}, "the critic has two layer sizes"),
     ({"n_critics": 0}, "n_critics is 0; expected a whole number >= 1"),
-    ({"layer_norm": "x"}, "layer_norm='x': pass True or False"),
-    ({"fast_matmul": 1}, "fast_matmul=1: pass True or False"),
+    ({"layer_norm": "x"}, "layer_norm is 'x'; expected True or False"),
+    ({"fast_matmul": 1}, "fast_matmul is 1; expected True or False"),
     ({"ema_decay": "x"}, "pass a share in"),
     ({"init_std": "x"}, "pass a number above 0"),
     ({"net_arch": [300]}, "the critic has two layer sizes"),
     ({"net_arch": {"pi": [8]}}, "the critic has two layer sizes"),
     ({"critic_lr_scale": 0.0}, "pass a number above 0"),
     ({"ema_decay": 1.0}, "pass a share in"),
-    ({"symmetric": "no"}, "pass True or False"),
+    ({"symmetric": "no"}, "symmetric is 'no'; expected True or False"),
     ({"init_std": -1.0}, "pass a number above 0"),
 ])  # fmt: skip
 def test_a_wrong_option_is_named_with_what_is_allowed(kwargs, message):

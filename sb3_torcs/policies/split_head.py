@@ -24,7 +24,7 @@ from stable_baselines3.td3.policies import Actor, TD3Policy
 from torch import nn
 
 from sb3_torcs.actions import layout_of_width
-from sb3_torcs.car import check_count, is_number
+from sb3_torcs.car import check_count, checked_flag, is_number
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.policies import fast_matmul as matmul
 from sb3_torcs.policies.exact import ExactDriver, ExactPolicy
@@ -109,7 +109,9 @@ class SplitHeadPolicy(ExactPolicy, TD3Policy):
         bias = _bias(head_bias, len(heads))
         _check_heads(heads, bias, action_space)
         _check_net_arch(net_arch)
-        _check_flags(layer_norm=layer_norm, fast_matmul=fast_matmul)
+        layer_norm = checked_flag("layer_norm", layer_norm)
+        fast_matmul = checked_flag("fast_matmul", fast_matmul)
+        symmetric = checked_flag("symmetric", symmetric)
         check_count("n_critics", kwargs.get("n_critics", 2))
         _check_symmetric(symmetric, observation_space, action_space)
         self.own_kwargs: dict[str, Any] = {
@@ -259,12 +261,6 @@ def _bias(given: Any, number: int) -> tuple[float, ...]:
     return tuple(map(float, values))
 
 
-def _check_flags(**flags: Any) -> None:
-    for name, value in flags.items():
-        if not isinstance(value, bool):
-            raise InvalidOption(f"{name}={value!r}: pass True or False")
-
-
 def _check_net_arch(net_arch: Any) -> None:
     critic = net_arch.get("qf") if isinstance(net_arch, dict) else net_arch
     actor = net_arch.get("pi") if isinstance(net_arch, dict) else net_arch
@@ -278,9 +274,8 @@ def _check_net_arch(net_arch: Any) -> None:
 
 
 def _check_symmetric(
-    symmetric: Any, observation_space: spaces.Space, action_space: spaces.Space
+    symmetric: bool, observation_space: spaces.Space, action_space: spaces.Space
 ) -> None:
-    _check_flags(symmetric=symmetric)
     ours = sensors_of(observation_space) and layout_of_width(get_action_dim(action_space))
     if symmetric and not ours:
         raise InvalidOption(
