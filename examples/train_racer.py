@@ -32,7 +32,7 @@ from sb3_torcs.sensors import feature_slices
 from sb3_torcs.vec_env import JoinedVecEnv, MirrorVecEnv, TorcsVecEnv
 
 FROM_NOTHING = {
-    "sensors": ["base", "line", "rivals"], "range_finders": "narrow", "action": "pedal",
+    "sensors": ["base", "line", "motion", "rivals"], "range_finders": "narrow", "action": "pedal",
     "gearbox": "road_speed", "action_repeat": 5,
 }  # fmt: skip
 """How a racer drives that learns from nothing."""
