@@ -14,7 +14,6 @@ import numpy as np
 
 from sb3_torcs.actions import checked_gearbox, controls_from_action
 from sb3_torcs.car import (
-    CONTROL_TICK,
     DEFAULT_CAR,
     MANY_LAPS,
     CarState,
@@ -25,7 +24,7 @@ from sb3_torcs.car import (
     range_finder_angles,
 )
 from sb3_torcs.errors import EngineForked, GameFailed, GameTimeout, InvalidOption, ServerLost
-from sb3_torcs.scr.car_reader import UNKNOWN_ROAD, CarReader
+from sb3_torcs.scr.car_reader import UNKNOWN_ROAD, CarReader, standing
 from sb3_torcs.scr.client import ScrClient
 from sb3_torcs.scr.gearbox import read_gearbox
 from sb3_torcs.scr.protocol import ScrAction, format_action, parse_motor, parse_state
@@ -186,7 +185,7 @@ class ScrBackend:
             if driven:
                 self._state = self._reader.read(parse_state(self._message), driven)
             if driven < ticks:
-                self._state = _standing(self._state, ticks - driven)
+                self._state = standing(self._state, ticks - driven)
         except ServerLost as error:
             failure = self._failure(error)
             self._hang_up()
@@ -394,19 +393,3 @@ def _action(controls: Controls, lap_time: float) -> bytes:
     assert gear is not None, "the gearbox has chosen one"
     action = ScrAction(steering, throttle, brake, gear, clutch, focus=None, lap_time=lap_time)
     return format_action(action)
-
-
-def _standing(state: CarState, ticks: int) -> CarState:
-    """
-    Let a car stand that has been taken out of the race.
-
-    :param state: the last one that was told
-    :param ticks: that pass
-    """
-    return state._replace(
-        time=state.time + ticks * CONTROL_TICK,
-        yaw_rate=0.0,
-        speed_x=0.0,
-        speed_y=0.0,
-        speed_z=0.0,
-    )

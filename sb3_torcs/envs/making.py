@@ -22,7 +22,7 @@ __all__ = ["MANY_RACES", "NO_LIMIT", "EnvMaker", "checked_time_limit", "env_make
 EnvMaker = Callable[[], gym.Env[Any, Any]]
 
 NO_LIMIT = -1  # as in gym.make
-MANY_RACES = 10_000  # [-] at once: a mistyped number shall not fill the memory
+MANY_RACES = 10_000  # [-] at once: a greater number is mistyped
 
 
 def checked_time_limit(steps: Any, env_id: str) -> int:

@@ -12,7 +12,7 @@ from sb3_torcs.scr.protocol import ScrState
 from sb3_torcs.tracks.generator import ASPHALT, BARRIER, GRASS
 from sb3_torcs.tracks.track import WIDTH_END, WIDTH_START, Segment, Track
 
-__all__ = ["UNKNOWN_ROAD", "CarReader"]
+__all__ = ["UNKNOWN_ROAD", "CarReader", "standing"]
 
 MARGIN = 1.0  # [m] tolerance between two sums of a track's length
 JUMP = 100.0  # [m] between two ways to measure the distance: one of them has begun a lap
@@ -122,6 +122,22 @@ class CarReader:
             _read_only(state.opponents), _read_only(NO_RACE),
         )  # fmt: skip
         return CarState._make(values)
+
+
+def standing(state: CarState, ticks: int) -> CarState:
+    """
+    Let a car stand that has been taken out of the race.
+
+    :param state: the last one that was told
+    :param ticks: that pass
+    """
+    return state._replace(
+        time=state.time + ticks * CONTROL_TICK,
+        yaw_rate=0.0,
+        speed_x=0.0,
+        speed_y=0.0,
+        speed_z=0.0,
+    )
 
 
 def _read_only(numbers: tuple[float, ...] | FloatArray) -> FloatArray:
