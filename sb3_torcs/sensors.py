@@ -185,7 +185,8 @@ NEEDS_CAR = frozenset({"car", "car_line"})
 """Groups that only a world that knows its car's file can tell."""
 
 NEEDS_ROAD = frozenset({"preview", "limits", "line", "car_line", "motion"})
-"""Groups that only a world that knows its track can tell; the SCR protocol has no yaw rate."""
+"""Groups that only a world that knows its track can tell: the yaw rate of ``"motion"`` is the turn
+of the road and of the car on it, where the SCR protocol tells the latter alone."""
 
 GROUPS: Mapping[SensorsName, tuple[Sensor, ...]] = {
     "base": SENSORS,

@@ -129,7 +129,7 @@ class ScrBackend:
         if not is_count(self._address[1]) or self._address[1] > MAX_PORT:
             raise InvalidOption(f"port is {port!r}; expected 1 to {MAX_PORT}")
         self._race = RaceSetup(
-            self._settings["track"] or "",
+            self._settings["track"] or "",  # a race elsewhere is not set up here
             [DRIVER if entry == AGENT else entry for entry in entries],
             laps=laps if len(entries) > 1 and laps else MANY_LAPS,
             session="race" if len(entries) > 1 else "practice",

@@ -48,7 +48,7 @@ def add_parser(subparsers: Any) -> None:
     add(
         "--track",
         metavar="T",
-        help="track of that race; default: that of the training, for those who need it",
+        help="track of that race, for who needs it; default: that of the training",
     )
     add("--car", metavar="C", help="car of that race; default: that of the training")
     add("--name", metavar="N", help="name of the driver, which `serve` shows; default: the model's")
@@ -79,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
     settings |= {name: value for name, value in given.items() if value is not None}
     sees_road = NEEDS_ROAD.intersection(settings.get("sensors", ()))
     if args.track is None and not sees_road and not is_ghost(args.model):
-        settings["track"] = None  # it drives on any, this one may be another than it learned
+        settings["track"] = None  # the race may be on another track than the training was
     one_of("track", settings.get("track"))
     one_of("car", settings.get("car"))
     with quiet_output(args.json):

@@ -9,26 +9,17 @@ import numpy as np
 from sb3_torcs.car import CONTROL_TICK, NO_RACE, CarState, FloatArray
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.scr.protocol import ScrState
-from sb3_torcs.tracks.generator import ASPHALT, BARRIER, GRASS
-from sb3_torcs.tracks.track import WIDTH_END, WIDTH_START, Segment, Track
+from sb3_torcs.tracks.generator import plain_segment
+from sb3_torcs.tracks.track import WIDTH_END, WIDTH_START, Track
 
 __all__ = ["UNKNOWN_ROAD", "CarReader", "standing"]
 
 MARGIN = 1.0  # [m] tolerance between two sums of a track's length
-JUMP = 100.0  # [m] between two ways to measure the distance: one of them has begun a lap
+JUMP = 100.0  # [m] between two ways to measure the distance, from which on one has begun a lap
 WIDTH = 12.0  # [m] of a road that is not known; the game's have 10 to 16
 VERGE = 5.0  # [m] beside it
 
-UNKNOWN_ROAD = Track(
-    "unknown",
-    "road",
-    (
-        Segment(
-            1e6, 0.0, WIDTH, WIDTH, VERGE, VERGE, VERGE, VERGE,
-            ASPHALT, GRASS, GRASS, BARRIER, BARRIER,
-        ),
-    ),
-)  # fmt: skip
+UNKNOWN_ROAD = Track("unknown", "road", (plain_segment(1e6, 0.0, WIDTH, VERGE),))
 """What stands in for a road that is not known: a straight that is longer than any lap. On it a car
 has the place across the road that the server tells, and the angle to it."""
 
@@ -42,6 +33,7 @@ class CarReader:
 
     def __init__(self, track: Track) -> None:
         self._track = track
+        self._jump = min(0.5 * track.length, JUMP)
 
     def begin(self, state: ScrState) -> CarState:
         """
@@ -84,7 +76,7 @@ class CarReader:
         self._tick = duration / ticks
         self._time += duration
         raced = self._lap_began + state.distance_from_start
-        if abs(state.distance_raced - raced) > JUMP:
+        if abs(state.distance_raced - raced) > self._jump:
             self._lap_began = state.distance_raced - state.distance_from_start
         return self._car(state, duration)
 

@@ -16,7 +16,7 @@ import numpy as np
 from sb3_torcs.car import FloatArray
 from sb3_torcs.tracks.track import Grid, Segment, Surface, Track, closed, closing_gap
 
-__all__ = ["random_track"]
+__all__ = ["plain_segment", "random_track"]
 
 LENGTHS = (1500.0, 4000.0)  # [m] of a lap
 WIDTHS = (10.0, 15.0)  # [m] of the road
@@ -52,7 +52,7 @@ def random_track(rng: np.random.Generator) -> Track:
         shape = _rounded(_polygon(rng), rng)
         if shape is None:
             continue
-        segments = [_segment(length, curvature, width, verge) for length, curvature in shape]
+        segments = [plain_segment(length, curvature, width, verge) for length, curvature in shape]
         length = math.fsum(segment.length for segment in segments)
         if not LENGTHS[0] <= length <= LENGTHS[1]:
             continue
@@ -124,7 +124,7 @@ def _rounded(corners: FloatArray, rng: np.random.Generator) -> list[tuple[float,
     return shape
 
 
-def _segment(length: float, curvature: float, width: float, verge: float) -> Segment:
+def plain_segment(length: float, curvature: float, width: float, verge: float) -> Segment:
     """
     Lay asphalt and grass along a stretch of the axis.
 
