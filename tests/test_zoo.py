@@ -150,6 +150,13 @@ def test_an_unknown_policy_is_told_the_near_miss(tmp_path):
     assert said.startswith("unknown policy ['MlpPolicy']")
 
 
+def test_a_policy_of_ppo_is_none_for_an_algorithm_with_critics(tmp_path):
+    said = complaint(tmp_path, {"policy": "sb3_torcs.policies.BoundedPolicy"})
+    assert said.startswith(
+        "sb3_torcs.policies.BoundedPolicy is a policy for PPO and A2C; allowed: "
+    )
+
+
 def test_an_argument_of_the_policy_that_it_does_not_have_is_unknown(tmp_path):
     """Also where the policy hands what it does not know to its base class."""
     said = complaint(tmp_path, {"policy_kwargs": {"net_arc": [1]}})

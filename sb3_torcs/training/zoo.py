@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 import yaml
+from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_torcs.agents.model_algorithm import SBX, algorithm_class
 from sb3_torcs.agents.wrapping import normalizes, unrebuilt, wrapped
@@ -362,18 +363,21 @@ def _env_class(env_id: str) -> Callable[..., Any]:
 
 def _policy(name: Any, algorithm: Any, place: Place) -> Callable[..., Any]:
     """Find the class that a policy's alias or dotted path stands for."""
+    known = algorithm.policy_aliases
+    advice = f"allowed: {', '.join(known)}"
     if isinstance(name, str) and "." in name:
-        return _imported(name, "policy", place)
-    if not isinstance(name, str) or name not in algorithm.policy_aliases:
-        known = algorithm.policy_aliases
-        advice = (
-            f"allowed: {', '.join(known)}, or a dotted path such as "
-            "sb3_torcs.policies.SplitHeadPolicy"
-        )
+        policy = _imported(name, "policy", place)
+        classes = (getattr(each, "__mro__", ()) for each in (policy, *known.values()))
+        for_ppo = (ActorCriticPolicy in each for each in classes)
+        if next(for_ppo) and not any(for_ppo):
+            raise ZooConfigError(f"{place}: {name} is a policy for PPO and A2C; {advice}")
+        return policy
+    if not isinstance(name, str) or name not in known:
+        advice += ", or a dotted path such as sb3_torcs.policies.SplitHeadPolicy"
         raise ZooConfigError(
             f"{place}: unknown policy {name!r}{near_miss(str(name), known, advice)}"
         )
-    return algorithm.policy_aliases[name]
+    return known[name]
 
 
 def _items(value: Any, key: str, place: Place) -> list[tuple[str, Mapping[str, Any]]]:
