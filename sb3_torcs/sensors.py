@@ -25,7 +25,7 @@ import numpy.typing as npt
 from numba import literal_unroll, njit, types
 from numba.extending import overload
 
-from sb3_torcs.car import REST_HEIGHT, RIVALS, CarState, FloatArray
+from sb3_torcs.car import FIRST_RIVAL, REST_HEIGHT, RIVALS, CarState, FloatArray
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.rivals import see_rivals
 from sb3_torcs.tracks.profile import INTERVALS, QUANTITIES, RoadProfile, look_ahead, speed_margins
@@ -434,7 +434,7 @@ def _write_opponents(_world: Any, car: CarState, numbers: npt.NDArray[np.float32
 
 
 def _write_rivals(_world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> None:
-    _scale_into(see_rivals(car.race[-len(numbers) :]), _PARTS["rivals"].start, numbers)
+    _scale_into(see_rivals(car.race[FIRST_RIVAL:]), _PARTS["rivals"].start, numbers)
 
 
 def _write_race(_world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> None:
