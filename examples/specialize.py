@@ -21,6 +21,8 @@ from sb3_torcs.agents.models import driver_record, find_model
 from sb3_torcs.callbacks import (
     AdaptiveLearningRateCallback,
     LeanUpdatesCallback,
+    RacingProgressCallback,
+    RewardCallback,
     ValuesOnlyCallback,
 )
 from sb3_torcs.errors import ends_in_a_line
@@ -41,6 +43,7 @@ class Settings:
     hard: float  # share of the episodes that begin where another left the road
     off_line: float  # weight of wheels beside the road
     crash: float  # weight of the end of an episode beside the road
+    last_crash: float  # the same in the last third of the training, when it tries little any more
     ent_coef: float
     noise: tuple[float, float]  # logarithms of the standard deviations at first, steering and pedal
     last_kl: float  # target of the divergence per update at the end [nats]
@@ -49,11 +52,11 @@ class Settings:
 
 SPECIALIST = Settings(
     cars=64, mirror=False, grip=1.0, episode=600, hard=0.5, off_line=-1.0, crash=-1.0,
-    ent_coef=0.001, noise=(-1.7, -0.7), last_kl=0.003, first_factor=1.0,
+    last_crash=-1.0, ent_coef=0.001, noise=(-1.7, -0.7), last_kl=0.003, first_factor=1.0,
 )  # fmt: skip
 TOGETHER = Settings(
-    cars=128, mirror=True, grip=[0.9, 1.0], episode=300, hard=0.7, off_line=-2.0, crash=-3.0,
-    ent_coef=0.002, noise=(-2.0, -1.0), last_kl=0.0024, first_factor=0.1,
+    cars=128, mirror=True, grip=[0.9, 1.1], episode=300, hard=0.7, off_line=-2.0, crash=-3.0,
+    last_crash=-10.0, ent_coef=0.002, noise=(-2.0, -1.0), last_kl=0.0024, first_factor=0.1,
 )  # fmt: skip
 
 parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -74,15 +77,19 @@ parser.add_argument("--seed", type=int, default=0)
 parser.add_argument("--folder", type=Path, default=Path("logs/specialists"))
 
 
-def make_cars(args: argparse.Namespace, env_kwargs: dict, settings: Settings) -> VecEnv:
-    """Make cars that begin anywhere on the road, many of them where others left it before."""
-    reward = {
-        "progress": 1.0, "off_line": settings.off_line, "leaving": -0.5, "crash": settings.crash,
+def reward(args: argparse.Namespace, settings: Settings, crash: float) -> dict[str, float]:
+    """Return the weights of the reward's terms."""
+    return {
+        "progress": 1.0, "off_line": settings.off_line, "leaving": -0.5, "crash": crash,
         "scale": 0.1, "damage": args.damage,
     }  # fmt: skip
+
+
+def make_cars(args: argparse.Namespace, env_kwargs: dict, settings: Settings) -> VecEnv:
+    """Make cars that begin anywhere on the road, many of them where others left it before."""
     cars = TorcsVecEnv(
-        settings.cars, threads=1, start="random", reward=reward, grip=settings.grip,
-        max_episode_steps=settings.episode, **env_kwargs,
+        settings.cars, threads=1, start="random", reward=reward(args, settings, settings.crash),
+        grip=settings.grip, max_episode_steps=settings.episode, **env_kwargs,
     )  # fmt: skip
     cars.env_method("set_random_speed", 80.0)
     cars.env_method("set_hard_starts", settings.hard)
@@ -118,16 +125,27 @@ def go_on(args: argparse.Namespace, tracks: list[str], settings: Settings) -> Pa
     known = PPO.load(file, device="cpu")
     model = make_model(known, learned_weights(file), cars, args, settings)
     if args.together:
-        alone = [ValuesOnlyCallback(), LeanUpdatesCallback(), AdaptiveLearningRateCallback(kl=0.03)]
-        model.learn(args.values, callback=alone)
+        model.learn(
+            args.values,
+            callback=[
+                ValuesOnlyCallback(),
+                RacingProgressCallback(),
+                LeanUpdatesCallback(),
+                AdaptiveLearningRateCallback(kl=0.03),
+            ],
+        )
         model = make_model(known, model.policy.state_dict(), cars, args, settings)
     with th.no_grad():
         model.policy.log_std.copy_(th.tensor(settings.noise))
     callbacks = [
         RecordCallback(recipe("ppo", "Torcs-v0", {"env_kwargs": env_kwargs})),
+        RacingProgressCallback(),
         LeanUpdatesCallback(),
         AdaptiveLearningRateCallback(
             kl=0.012, last_kl=settings.last_kl, first_factor=settings.first_factor
+        ),
+        RewardCallback(
+            timesteps=2 * args.timesteps // 3, reward=reward(args, settings, settings.last_crash)
         ),
     ]
     model.learn(args.timesteps, callback=callbacks)

@@ -24,6 +24,7 @@ from sb3_torcs.agents.models import find_model, training_record
 from sb3_torcs.callbacks import (
     AdaptiveLearningRateCallback,
     LeanUpdatesCallback,
+    RacingProgressCallback,
     ValuesOnlyCallback,
 )
 from sb3_torcs.errors import ends_in_a_line
@@ -192,7 +193,7 @@ def callbacks(
     adaptive = AdaptiveLearningRateCallback(
         kl=steps.kl, last_kl=steps.last_kl, first_factor=steps.rate
     )
-    return [RecordCallback(asked), LeanUpdatesCallback(), adaptive, every]
+    return [RecordCallback(asked), RacingProgressCallback(), LeanUpdatesCallback(), adaptive, every]
 
 
 def cars_alone(
@@ -264,7 +265,8 @@ def with_values(
     model = make_model(cars, args.seed, 256, 0.99, settings, units)
     model.policy.load_state_dict({**model.policy.state_dict(), **weights})
     learning = [LeanUpdatesCallback(), AdaptiveLearningRateCallback(kl=0.03)]
-    model.learn(args.values, callback=[ValuesOnlyCallback(), *learning])
+    shown = RacingProgressCallback()
+    model.learn(args.values, callback=[ValuesOnlyCallback(), shown, *learning])
     return model.policy.state_dict()
 
 
