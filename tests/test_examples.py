@@ -200,7 +200,7 @@ def test_agents_of_the_29_numbers_go_on_from_a_student(asked):
     assert len(going_on) == 3
     for seed, call in enumerate(sorted(going_on, key=lambda call: call.split(" --seed ")[1])):
         assert "specialize.py logs/post-roads/student/model.zip --together" in call
-        assert call.endswith(f"--seed {seed} --timesteps 6000000 --folder logs/post-roads/{seed}")
+        assert call.endswith(f"--seed {seed} --timesteps 8000000 --folder logs/post-roads/{seed}")
     for call in (learned, unseen, ovals):
         assert "evaluate_tracks.py logs/post-roads/[012]/together.zip" in call
 
