@@ -264,9 +264,15 @@ def with_values(
         return weights
     model = make_model(cars, args.seed, 256, 0.99, settings, units)
     model.policy.load_state_dict({**model.policy.state_dict(), **weights})
-    learning = [LeanUpdatesCallback(), AdaptiveLearningRateCallback(kl=0.03)]
-    shown = RacingProgressCallback()
-    model.learn(args.values, callback=[ValuesOnlyCallback(), shown, *learning])
+    model.learn(
+        args.values,
+        callback=[
+            ValuesOnlyCallback(),
+            RacingProgressCallback(),
+            LeanUpdatesCallback(),
+            AdaptiveLearningRateCallback(kl=0.03),
+        ],
+    )
     return model.policy.state_dict()
 
 

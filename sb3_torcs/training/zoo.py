@@ -367,9 +367,8 @@ def _policy(name: Any, algorithm: Any, place: Place) -> Callable[..., Any]:
     advice = f"allowed: {', '.join(known)}"
     if isinstance(name, str) and "." in name:
         policy = _imported(name, "policy", place)
-        classes = (getattr(each, "__mro__", ()) for each in (policy, *known.values()))
-        for_ppo = (ActorCriticPolicy in each for each in classes)
-        if next(for_ppo) and not any(for_ppo):
+        fits = any(issubclass(each, ActorCriticPolicy) for each in known.values())
+        if not fits and isinstance(policy, type) and issubclass(policy, ActorCriticPolicy):
             raise ZooConfigError(f"{place}: {name} is a policy for PPO and A2C; {advice}")
         return policy
     if not isinstance(name, str) or name not in known:
