@@ -42,6 +42,7 @@ __all__ = [
     "SceneryMissing",
     "ServerLost",
     "ServerNotFound",
+    "StartBlocked",
     "StudyError",
     "TrackFileError",
     "TrackNotFound",
@@ -78,6 +79,10 @@ class SceneryMissing(Sb3TorcsError, LookupError):
 
 class InvalidOption(Sb3TorcsError, ValueError):
     """A keyword argument or reset option has a value outside what is allowed."""
+
+
+class StartBlocked(InvalidOption):
+    """A car would begin in a wall or in another car."""
 
 
 class InvalidAction(Sb3TorcsError, ValueError):

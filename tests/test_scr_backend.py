@@ -244,6 +244,9 @@ def test_a_server_that_runs_already_is_driven():
             env.reset(options={"distance": 10.0})
         with pytest.raises(InvalidOption, match="cannot be driven twice"):
             pickle.dumps(env.unwrapped)
+        env.unwrapped.set_start("random")
+        with pytest.raises(InvalidOption, match="begins on the grid"):
+            env.reset()
         env.close()
     assert len(server.inits) == 2
 

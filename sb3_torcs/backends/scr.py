@@ -23,7 +23,14 @@ from sb3_torcs.car import (
     is_count,
     range_finder_angles,
 )
-from sb3_torcs.errors import EngineForked, GameFailed, GameTimeout, InvalidOption, ServerLost
+from sb3_torcs.errors import (
+    EngineForked,
+    GameFailed,
+    GameTimeout,
+    InvalidOption,
+    ServerLost,
+    StartBlocked,
+)
 from sb3_torcs.scr.car_reader import UNKNOWN_ROAD, CarReader, standing
 from sb3_torcs.scr.client import ScrClient
 from sb3_torcs.scr.gearbox import read_gearbox
@@ -335,7 +342,7 @@ class ScrBackend:
             if lap_time >= 0.0:
                 return message
             if start is not None:
-                raise InvalidOption(
+                raise StartBlocked(
                     f"the game begins on the grid instead of at {start}: a car would stand in a "
                     "wall or in another car there; start elsewhere, or nearer to the middle of the "
                     "road"

@@ -33,7 +33,7 @@ from sb3_torcs.envs.aids import NEED_RIVALS, Aids
 from sb3_torcs.envs.conditions import Conditions, Delay, Part
 from sb3_torcs.envs.ends import ENDS, GRACE_TICKS, STUCK_TICKS, TRUNCATING, end_of, stands
 from sb3_torcs.envs.starts import Starts, read_start
-from sb3_torcs.errors import CarLost, EnvClosed, InvalidOption
+from sb3_torcs.errors import CarLost, EnvClosed, InvalidOption, StartBlocked
 from sb3_torcs.rewards import CRASHES, Reward, RewardChoice
 from sb3_torcs.sensors import NEEDS_CAR, NEEDS_RACE, NEEDS_ROAD, SensorsName, View
 from sb3_torcs.tracks.track import Track
@@ -308,7 +308,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         self.delay = self.conditions.draw(self.np_random, self.backend, self.action_repeat)
         try:
             self.car = self.backend.reset(self.np_random, start)
-        except InvalidOption:
+        except StartBlocked:
             if options or start is None:
                 raise
             # A wall stands where a start was drawn: rare, but a training draws thousands.
@@ -353,9 +353,9 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
             arrive during the timestep
         """
         self.check_ready()
-        self._controls = controls_from_action(action, self.layout)
-        if self.car is not None:
-            self._controls = self.aids.change(self._controls, self.car)
+        assert self.car is not None, "check_ready raises before the first reset"
+        asked = controls_from_action(action, self.layout)
+        self._controls = self.aids.change(asked, self.car)
         at_once = (self._controls, self.action_repeat)
         return self.delay.hold(self._controls) if self.delay.ticks else [at_once]
 

@@ -100,9 +100,9 @@ void Race::start_elsewhere(const Start& start) {
     }
     come_to_rest(field(), situation);
     if (const CarElement* car = stuck_car(field()))
-        throw Error("InvalidOption", std::string(car->info.name) +
-                                         " would stand in a wall or in another car; start "
-                                         "elsewhere, or nearer to the middle of the road");
+        throw Error("StartBlocked", std::string(car->info.name) +
+                                        " would stand in a wall or in another car; start "
+                                        "elsewhere, or nearer to the middle of the road");
     situation.state = RUNNING;
     situation.time = 0.0;
     situation.delta_time = ROBOT_STEP;
