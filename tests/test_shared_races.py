@@ -287,6 +287,10 @@ class TestMistakes:
     def test_worlds_with_one_car(self):
         with pytest.raises(InvalidOption, match=r"TorcsLite-v0 has one car in each race"):
             TorcsVecEnv(1, 2, env_id="TorcsLite-v0")
+        with pytest.raises(
+            InvalidOption, match=r"flagged is True, .* race by sb3_torcs\.parallel_env"
+        ):
+            TorcsVecEnv(agents=2, laps=1, flagged=True)
         with pytest.raises(InvalidOption, match="environments of one; give the number of races"):
             TorcsVecEnv([lambda: gym.make("Torcs-v0")], 2)
 

@@ -214,6 +214,15 @@ def test_a_wrong_action_is_told_and_leaves_the_races_usable(make):
     envs.step(np.stack([GAS, GAS]))
 
 
+def test_a_wrong_action_does_not_arrive_late(make):
+    envs = make(num_envs=2, delay=6)
+    envs.reset(seed=0)
+    waiting = [env.delay.waiting for env in envs.envs]
+    with pytest.raises(InvalidAction, match="throttle is nan"):
+        envs.step(np.array([GAS, [0.0, np.nan, 0.0]], np.float32))
+    assert [env.delay.waiting for env in envs.envs] == waiting
+
+
 @pytest.mark.parametrize("threads", [1, 2])
 def test_a_fault_of_one_engine_is_raised_with_its_class(make, threads):
     envs = make(num_envs=3, threads=threads)

@@ -207,8 +207,8 @@ def test_infos_are_made_when_somebody_asks(make, monkeypatch):
     envs = make(2, env_id=LITE)
     envs.reset()
     *_, infos = envs.step(np.stack([GAS, GAS]))
-    asked = [infos[0].get(name, "none") for name in ("episode", "TimeLimit.truncated")]
-    assert (asked, made) == (["none", False], [])
+    asked = [infos[0].get(name, "none") for name in ("episode", "TimeLimit.truncated", "lap_time")]
+    assert (asked, made) == (["none", False, 0.0], [])
     assert infos[0]["distance"] == infos[0]["car"].distance_raced
     assert made == [1]
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import astuple
 from typing import Any, NamedTuple
@@ -113,15 +112,15 @@ class Batch:
     the environment is used alone: it gives the state back. :meth:`enter` takes it over again.
 
     :param envs: of one kind and with the same layout of actions
-    :param threads: that drive, at least 1; ``None`` is one per core, and one per race at most
+    :param threads: that drive, at least 1; those beyond one per race are left out
     :raises InvalidOption: if they cannot be driven together
     """
 
-    def __init__(self, envs: Sequence[RacingEnv], threads: int | None = None) -> None:
+    def __init__(self, envs: Sequence[RacingEnv], threads: int = 1) -> None:
         self.envs = list(envs)
         number = len(self.envs)
         races = {id(getattr(env.backend, "race", env)) for env in self.envs}
-        self.threads = min(threads or len(os.sched_getaffinity(0)), len(races))
+        self.threads = min(threads, len(races))
         layouts = {(env.layout.names, env.layout.high) for env in self.envs}
         if len(layouts) > 1:
             raise InvalidOption(
@@ -193,12 +192,12 @@ class Batch:
         if not self._driven[race]:
             return
         env, car = self.envs[race], car_from_record(self._cars[race])
-        steps = [
+        steps = (
             (_controls(controls[race]), int(ticks[race]))
             for parts in self._driven[race]
             for controls, ticks in parts
             if ticks[race]
-        ]
+        )
         self._fleet.arrive(race, steps, car)
         env.arrive(
             car, _controls(self._controls[race]), int(self._standing[race]),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -10,14 +11,21 @@ from typing import Any
 import gymnasium as gym
 from gymnasium.wrappers import TimeLimit
 
-from sb3_torcs.car import is_count
+from sb3_torcs.car import checked_flag, is_count
 from sb3_torcs.envs.racing import RacingEnv
 from sb3_torcs.envs.torcs_race import make_race
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.starting_list import guests_of
 
-__all__ = ["MANY_RACES", "NO_LIMIT", "EnvMaker", "checked_time_limit", "env_makers"]
+__all__ = [
+    "MANY_RACES",
+    "NO_LIMIT",
+    "EnvMaker",
+    "checked_threads",
+    "checked_time_limit",
+    "env_makers",
+]
 
 EnvMaker = Callable[[], gym.Env[Any, Any]]
 
@@ -41,6 +49,21 @@ def checked_time_limit(steps: Any, env_id: str) -> int:
             f"max_episode_steps is {steps!r}; expected a whole number >= 1, or -1 for no limit"
         )
     return int(steps)
+
+
+def checked_threads(threads: Any) -> int:
+    """
+    Check how many threads are to drive.
+
+    :param threads: their number; ``None`` is one per core
+    :return: their number
+    :raises InvalidOption: if it is no such number
+    """
+    if threads is None:
+        return len(os.sched_getaffinity(0))
+    if not is_count(threads):
+        raise InvalidOption(f"threads is {threads!r}; expected a whole number >= 1, or None")
+    return int(threads)
 
 
 def env_makers(races: int, agents: int, env_id: str, env_kwargs: dict[str, Any]) -> list[EnvMaker]:
@@ -76,6 +99,11 @@ def _shared(races: int, agents: int, env_id: str, env_kwargs: dict[str, Any]) ->
             f"agents is {agents}, and {env_id} has one car in each race; races are of Torcs-v0"
         )
     options = dict(env_kwargs)
+    if checked_flag("flagged", options.pop("flagged", False)):
+        raise InvalidOption(
+            "flagged is True, but a car that is flagged off leaves its race, and here it rejoins; "
+            "leave it out, or race by sb3_torcs.parallel_env"
+        )
     limits = _limits(options.pop("max_episode_steps", None), env_id, races)
     envs = [(env, limit) for limit in limits for env in make_race(agents, **options)]
     for env, _ in envs:  # RecordCallback reads it, as gym.make writes it

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from functools import partial
@@ -16,9 +15,14 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from sb3_torcs.backends.native import Fleet
 from sb3_torcs.backends.several import present_world, shared_worlds
-from sb3_torcs.car import CarState, check_count, is_count
+from sb3_torcs.car import CarState, check_count
 from sb3_torcs.envs.conditions import Part
-from sb3_torcs.envs.making import MANY_RACES, NO_LIMIT, checked_time_limit
+from sb3_torcs.envs.making import (
+    MANY_RACES,
+    NO_LIMIT,
+    checked_threads,
+    checked_time_limit,
+)
 from sb3_torcs.envs.racing import Observation
 from sb3_torcs.envs.torcs import TorcsEnv
 from sb3_torcs.errors import CarLost, EnvClosed, InvalidAction, InvalidOption
@@ -65,8 +69,7 @@ class TorcsVectorEnv(SyncVectorEnv):
         **options: Any,
     ) -> None:
         check_count("num_envs", num_envs, MANY_RACES)
-        if threads is not None and not is_count(threads):
-            raise InvalidOption(f"threads is {threads!r}; expected a whole number >= 1, or None")
+        most = checked_threads(threads)
         if options.get("backend", "native") != "native":
             raise InvalidOption(
                 f"backend is {options['backend']!r}; races on threads are for backend 'native', "
@@ -85,7 +88,7 @@ class TorcsVectorEnv(SyncVectorEnv):
         super().__init__(
             [lambda: _Race(timesteps, **options)] * int(num_envs), autoreset_mode=autoreset_mode
         )
-        self.threads = min(threads or len(os.sched_getaffinity(0)), self.num_envs)
+        self.threads = min(most, self.num_envs)
         worlds: list[Any] = [present_world(env.backend) for env in self.envs]
         self._fleet: Any = Fleet(worlds, self.threads)
 
@@ -107,11 +110,17 @@ class TorcsVectorEnv(SyncVectorEnv):
             )
         anew = self._begin_anew()
         # All before any drives: a wrong one leaves all races where they are.
-        parts = {
-            index: env.begin_step(rows[index])
-            for index, env in enumerate(self.envs)
-            if not anew[index]
-        }
+        waiting = [env.delay.waiting for env in self.envs]
+        try:
+            parts = {
+                index: env.begin_step(rows[index])
+                for index, env in enumerate(self.envs)
+                if not anew[index]
+            }
+        except InvalidAction:
+            for env, before in zip(self.envs, waiting, strict=True):
+                env.delay.waiting = before
+            raise
         try:
             for index, (held, *_) in parts.items():
                 self._fleet.put(index, present_world(self.envs[index].backend))

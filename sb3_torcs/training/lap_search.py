@@ -9,7 +9,6 @@ and its rest is where the next candidates begin. What comes out is the line of t
 from __future__ import annotations
 
 import math
-import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -20,6 +19,7 @@ import numpy as np
 from sb3_torcs.agents.ghosts import Ghost
 from sb3_torcs.backends.native import make_engine, make_rollouts
 from sb3_torcs.car import CONTROL_TICK, DEFAULT_CAR, Controls, FloatArray
+from sb3_torcs.envs.making import checked_threads
 from sb3_torcs.evaluation.protocol import RACE_LAPS
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.starting_list import AGENT
@@ -41,7 +41,7 @@ CAREFUL = 8  # strides that are then driven with caution
 MOST_DEAD_ENDS = 30  # per race
 SPREAD = np.array([0.15, 0.8, 1.5])  # of steering [-], pedal [-] and place [m]
 SHORTEST, LONGEST = 0.2, 2.0  # [s] of one change
-SMALLEST = 0.1  # of the spread: how far the smallest changes are smaller
+SMALLEST = 0.1  # of the spread: how small changes can be
 STANDING = Controls(0.0, 0.0, 0.0)  # of a car that has just arrived
 FAILED = -100.0  # [s] that a candidate has won that leaves the road
 
@@ -103,8 +103,7 @@ class LapSearch:
         self._rng = np.random.default_rng(seed)
         self._ticks = int(env_kwargs["action_repeat"])
         self._begun = time.monotonic()
-        useful = min(len(os.sched_getaffinity(0)), CANDIDATES)
-        self._engines = [self._engine() for _ in range(threads or useful)]
+        self._engines = [self._engine() for _ in range(min(checked_threads(threads), CANDIDATES))]
         for engine in self._engines:
             engine.start()
         self._rollouts = make_rollouts(self._engines)

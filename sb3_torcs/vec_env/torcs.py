@@ -16,9 +16,9 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepR
 
 from sb3_torcs.backends.seats import Seat, SharedRace
 from sb3_torcs.backends.several import shared_worlds
-from sb3_torcs.car import check_count, is_count
+from sb3_torcs.car import check_count
 from sb3_torcs.envs.batch import Batch, Outcome
-from sb3_torcs.envs.making import MANY_RACES, EnvMaker, env_makers
+from sb3_torcs.envs.making import MANY_RACES, EnvMaker, checked_threads, env_makers
 from sb3_torcs.envs.racing import RacingEnv, RacingInfo
 from sb3_torcs.errors import EnvClosed, InvalidOption
 
@@ -44,8 +44,11 @@ class RaceInfo(MutableMapping[str, Any]):
 
     def get(self, name: str, default: Any = None) -> Any:
         """Look a value up; see :class:`dict`."""
-        if self._values is None and name not in RacingInfo.__annotations__:
-            return False if name == TRUNCATED else default
+        if self._values is None:
+            if name == "lap_time":  # asked of each race in each timestep, to show progress
+                return self.glance()[1]
+            if name not in RacingInfo.__annotations__:
+                return False if name == TRUNCATED else default
         return self._made().get(name, default)
 
     def glance(self) -> tuple[float, float, dict[str, float]]:
@@ -115,7 +118,7 @@ class TorcsVecEnv(DummyVecEnv):
     Several races, driven at once by threads of this process.
 
     It returns what ``DummyVecEnv`` over the same environments in ``Monitor`` returns, to the bit,
-    in less time. ``make_vec_env`` and the RL Zoo can use it in the place of ``DummyVecEnv``.
+    in less time. ``make_vec_env`` and the RL Zoo can use it instead of ``DummyVecEnv``.
 
     With several ``agents`` each car of each race is an environment: those of the first race come
     first. When the episode of a car ends, the car rejoins its race: it is put down in the middle of
@@ -148,8 +151,7 @@ class TorcsVecEnv(DummyVecEnv):
     ) -> None:
         self._batch: Batch | None = None
         check_count("agents", agents)
-        if threads is not None and not is_count(threads):
-            raise InvalidOption(f"threads is {threads!r}; expected a whole number >= 1, or None")
+        most = checked_threads(threads)
         if isinstance(races, (list, tuple)) and races:
             if env_kwargs:
                 names = ", ".join(env_kwargs)
@@ -167,7 +169,7 @@ class TorcsVecEnv(DummyVecEnv):
         super().__init__(makers)
         try:
             self._races = [_Race(env) for env in self._envs]
-            self._batch = Batch([race.racing for race in self._races], threads)
+            self._batch = Batch([race.racing for race in self._races], most)
         except BaseException:
             self.close()
             raise
@@ -324,11 +326,13 @@ class _Race:
                 "use DummyVecEnv for others"
             )
         self.racing = env.unwrapped
-        if type(self.racing).step is not RacingEnv.step:
-            raise InvalidOption(
-                f"{type(self.racing).__name__} has a step of its own, which TorcsVecEnv would not "
-                "call; use DummyVecEnv"
-            )
+        kind = type(self.racing)
+        for name in ("step", "begin_step", "finish_step"):
+            if getattr(kind, name) is not getattr(RacingEnv, name):
+                raise InvalidOption(
+                    f"{kind.__name__} has a {name} of its own, which TorcsVecEnv would not call in "
+                    "each timestep; use DummyVecEnv"
+                )
         while isinstance(env, gym.Wrapper):
             names = {
                 kind.__name__ for kind in type(env).__mro__
