@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from types import FrameType
 
-__all__ = ["answered", "handlers_kept"]
+__all__ = ["answered", "counted_interrupts", "handlers_kept"]
 
 
 @contextlib.contextmanager
@@ -30,6 +31,28 @@ def answered(by: Callable[[int, FrameType | None], None], *numbers: int) -> Iter
 
 
 @contextlib.contextmanager
+def counted_interrupts(passed: int, message: str) -> Iterator[list[int]]:
+    """
+    Count Ctrl-C and SIGTERM. All but one raise ``KeyboardInterrupt``, as usual.
+
+    :param passed: which of them does nothing but print a message, from 1
+    :param message: for standard error
+    :return: the signals so far
+    """
+    seen: list[int] = []
+
+    def note(number: int, frame: FrameType | None) -> None:
+        del frame
+        seen.append(number)
+        if len(seen) != passed:
+            raise KeyboardInterrupt
+        sys.stderr.write(message)
+
+    with answered(note, signal.SIGINT, signal.SIGTERM):
+        yield seen
+
+
+@contextlib.contextmanager
 def handlers_kept(*numbers: int) -> Iterator[None]:
     """
     Put back the handlers of signals that a library replaces and leaves replaced. Python allows that
@@ -45,7 +68,5 @@ def handlers_kept(*numbers: int) -> Iterator[None]:
         yield
     finally:
         for number, handler in before.items():
-            if (
-                handler is not None
-            ):  # None: the handler was not set by Python, which cannot restore it
+            if handler is not None:  # else Python has not set it, and cannot restore it
                 signal.signal(number, handler)

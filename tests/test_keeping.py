@@ -19,7 +19,7 @@ import pytest
 import yaml
 from rl_zoo3.exp_manager import ExperimentManager
 from stable_baselines3 import DDPG, PPO
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.save_util import load_from_pkl
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from toy import ToyRace
@@ -115,6 +115,16 @@ def test_the_model_is_kept_with_its_replay_buffer(tmp_path):
     np.testing.assert_array_equal(kept.actions[:9], model.replay_buffer.actions[:9])
 
 
+def test_files_of_others_are_at_their_place_after_the_call_that_wrote_them(tmp_path):
+    callback = KeepCallback(WholeFiles(tmp_path), "last", 50, others=[3])
+    checkpoints = CheckpointCallback(3, str(callback.files.aside))
+    tiny(buffer_size=50).learn(7, callback=[checkpoints, callback])
+    assert {file.name for file in tmp_path.glob("*.zip")} == {
+        "rl_model_3_steps.zip",
+        "rl_model_6_steps.zip",
+    }
+
+
 def test_statistics_are_kept_where_the_zoo_looks_for_them(tmp_path):
     env = VecNormalize(DummyVecEnv([ToyRace]))
     tiny(env, PPO, n_steps=8, batch_size=8).learn(8, callback=keeper(tmp_path))
@@ -179,7 +189,7 @@ def test_a_training_that_diverges_is_told(tmp_path, capfd):
 
 @pytest.mark.parametrize("every", [0, -1, 1.5, True])
 def test_the_interval_is_a_number_of_calls(tmp_path, every):
-    with pytest.raises(InvalidOption, match="a whole number of at least 1 call"):
+    with pytest.raises(InvalidOption, match="every is .*; expected a whole number >= 1"):
         keeper(tmp_path, every)
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +17,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_torcs.agents.model_record import STATISTICS
-from sb3_torcs.car import is_count
-from sb3_torcs.errors import InvalidOption, TrainingDiverged
+from sb3_torcs.car import check_count
+from sb3_torcs.errors import TrainingDiverged
 
 __all__ = ["REPLAY_BUFFER", "SAVING", "KeepCallback", "WholeFiles", "check_healthy"]
 
@@ -80,27 +81,37 @@ class KeepCallback(BaseCallback):
     Save the last model while it learns, with everything that a training resumes from.
 
     That is the replay buffer of an off-policy algorithm, and the statistics of ``VecNormalize``.
-    In each timestep it moves the files of the callbacks before it to their final paths.
+    It also moves the files of the callbacks before it to their final paths.
 
     :param files: folder of the run
     :param name: of the model's file, without ``.zip``; and of the folder of the statistics
     :param every: calls between two savings
+    :param others: calls between two files of each callback that writes aside, too
     :param verbose: as in ``BaseCallback``
     """
 
-    def __init__(self, files: WholeFiles, name: str, every: int, verbose: int = 0) -> None:
+    def __init__(
+        self,
+        files: WholeFiles,
+        name: str,
+        every: int,
+        others: Sequence[int] = (),
+        *,
+        verbose: int = 0,
+    ) -> None:
         super().__init__(verbose)
-        if not is_count(every):
-            raise InvalidOption(f"every is {every!r}; pass a whole number of at least 1 call")
+        check_count("every", every)
         self.files = files
         self.name = name
         self.every = every
+        self._others = others
 
     def _init_callback(self) -> None:
         (self.files.aside / self.name).mkdir(parents=True, exist_ok=True)
 
     def _on_step(self) -> bool:
-        self.files.settle()
+        if any(self.n_calls % other == 0 for other in self._others):
+            self.files.settle()
         if self.n_calls % self.every == 0:
             self.keep()
         return True

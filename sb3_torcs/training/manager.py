@@ -14,13 +14,11 @@ import io
 import locale
 import os
 import shutil
-import signal
 import sys
 import tempfile
 import types
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from types import FrameType
 from typing import Any, NamedTuple
 
 import rl_zoo3.train
@@ -45,7 +43,7 @@ from sb3_torcs.errors import (
     WorkerLost,
     ZooConfigError,
 )
-from sb3_torcs.signals import answered
+from sb3_torcs.signals import counted_interrupts
 from sb3_torcs.training.keeping import SAVING, KeepCallback, WholeFiles
 from sb3_torcs.training.resuming import restore_statistics
 from sb3_torcs.training.workers import WorkersVecEnv
@@ -275,25 +273,28 @@ class Manager(_Threaded):
         super().create_callbacks()
         if self.optimize_hyperparameters:
             return
+        writing = []
         for callback in self.callbacks:
             if isinstance(callback, CheckpointCallback) and callback.save_path == self.save_path:
                 callback.save_path = str(self.files.aside)
-            if isinstance(callback, EvalCallback):
-                self._write_aside(callback)
+                writing.append(callback.save_freq)
+            if isinstance(callback, EvalCallback) and self._write_aside(callback):
+                writing.append(callback.eval_freq)
         every = self.eval_freq
         if every <= 0:
             every = max(self.n_timesteps // SAVINGS // self.n_envs, 1)
-        self.keeper = KeepCallback(self.files, self.env_name, every)
+        self.keeper = KeepCallback(self.files, self.env_name, every, writing)
         self.callbacks.append(self.keeper)
 
-    def _write_aside(self, callback: EvalCallback) -> None:
-        """Let an evaluation of the run write to temporary names."""
+    def _write_aside(self, callback: EvalCallback) -> bool:
+        """Let an evaluation write to temporary names, and tell whether it is one of the run."""
         if callback.best_model_save_path != self.save_path:
-            return
+            return False
         callback.best_model_save_path = str(self.files.aside)
         callback.log_path = str(self.files.aside / "evaluations")
         if isinstance(callback.callback_on_new_best, SaveVecNormalizeCallback):
             callback.callback_on_new_best.save_path = str(self.files.aside / self.env_name)
+        return True
 
     def learn(self, model: BaseAlgorithm) -> None:
         """
@@ -328,17 +329,8 @@ class Manager(_Threaded):
         :param model: that was trained
         """
         del model  # which the callback knows
-        seen: list[int] = []
-
-        def note(number: int, frame: FrameType | None) -> None:
-            del frame
-            seen.append(number)
-            if len(seen) > 1:
-                raise KeyboardInterrupt
-            sys.stderr.write(SAVING)
-
         try:
-            with self._named_errors(), answered(note, signal.SIGINT, signal.SIGTERM):
+            with self._named_errors(), counted_interrupts(1, SAVING):
                 self.keeper.keep()
         finally:
             self.files.close()

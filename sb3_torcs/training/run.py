@@ -7,17 +7,15 @@ import contextlib
 import dataclasses
 import inspect
 import shlex
-import signal
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from sb3_torcs.car import check_count, is_count
 from sb3_torcs.errors import InvalidOption, OutputNotWritable, TrainingDiverged, WorkerLost
 from sb3_torcs.files import listed, writable_folder
-from sb3_torcs.signals import answered
+from sb3_torcs.signals import counted_interrupts
 from sb3_torcs.torcs.track_names import lasting_kwargs
 
 __all__ = ["Run", "TrainOptions", "going_on", "train", "train_run"]
@@ -154,7 +152,7 @@ def _check_numbers(options: TrainOptions) -> None:
     if options.timesteps is not None:
         check_count("timesteps", options.timesteps)
     check_count("eval_episodes", options.eval_episodes)
-    if not is_count(options.seed) and options.seed != 0:
+    if not is_count(options.seed) and (options.seed != 0 or isinstance(options.seed, bool)):
         raise InvalidOption(f"seed is {options.seed!r}; expected a whole number >= 0")
 
 
@@ -341,13 +339,14 @@ def _run_zoo(
     """
     from sb3_torcs.callbacks.progress import Unbroken
     from sb3_torcs.training import manager as zoo_training
+    from sb3_torcs.training.keeping import SAVING
 
     managers: list[Manager] = []
     # `tee` may end at Ctrl-C, before the zoo prints that it saves the model.
     out, err = Unbroken(sys.stdout), Unbroken(sys.stderr)
     redirected = contextlib.redirect_stdout(out), contextlib.redirect_stderr(err)
     try:
-        with redirected[0], redirected[1], _noted_interrupts() as seen:
+        with redirected[0], redirected[1], counted_interrupts(2, SAVING) as seen:
             zoo_training.train(options.algo, options.env, entry, words, managers)
     except (OSError, WorkerLost, TrainingDiverged) as error:
         if not managers:
@@ -387,29 +386,6 @@ def _told(
         kept = f"kept: '{result.last_model}', {result.timesteps} of {result.wanted} timesteps"
         return kind(f"{why}; {kept}; {remedy}, and go on with: {going_on(options, result)}")
     return kind(f"{why}; nothing was kept yet; {remedy}, and start again")
-
-
-@contextlib.contextmanager
-def _noted_interrupts() -> Iterator[list[int]]:
-    """
-    Note Ctrl-C and SIGTERM. The zoo ends the training at Ctrl-C, but does not report it.
-
-    A second Ctrl-C is ignored, so that the model can be saved; only a third one aborts that.
-    """
-    from sb3_torcs.training.keeping import SAVING
-
-    seen: list[int] = []
-
-    def note(number: int, frame: FrameType | None) -> None:
-        del frame
-        seen.append(number)
-        if len(seen) == 2:
-            sys.stderr.write(SAVING)
-            return
-        raise KeyboardInterrupt
-
-    with answered(note, signal.SIGINT, signal.SIGTERM):
-        yield seen
 
 
 def going_on(options: TrainOptions, result: Run) -> str:
