@@ -47,7 +47,7 @@ class Settings:
     ent_coef: float
     noise: tuple[float, float]  # logarithms of the standard deviations at first, steering and pedal
     last_kl: float  # target of the divergence per update at the end [nats]
-    first_factor: float  # on the learning rate at the begin, from which it adapts
+    first_factor: float  # on the learning rate at the beginning, from which it adapts
 
 
 SPECIALIST = Settings(

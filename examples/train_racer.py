@@ -55,7 +55,7 @@ class Settings:
     cars_alone: int  # at once, before they meet others
     beside_races: int  # cars alone per race
     episode: int  # timesteps of a car alone
-    speed: float  # of a car alone at the begin of an episode, at most [m/s]
+    speed: float  # of a car alone at the beginning of an episode, at most [m/s]
     hard: float  # share of the episodes alone that begin where another left the road
     off_line: tuple[float, float]  # what it costs to be off the racing line, alone and in races
     batch_size: int | None  # None is a quarter of a rollout
@@ -79,10 +79,12 @@ ALL_ROADS = Settings(
 class Steps:
     """How far a policy may go from what it knows."""
 
-    rate: float  # factor on the learning rate at the begin, from which it adapts
-    kl: float  # target of the divergence per update, at the begin [nats]
+    rate: float  # factor on the learning rate at the beginning, from which it adapts
+    kl: float  # target of the divergence per update, at the beginning [nats]
     last_kl: float  # at the end [nats]
-    log_std: tuple[float, float]  # of steering and pedal, with which it tries things at the begin
+    log_std: tuple[
+        float, float
+    ]  # of steering and pedal, with which it tries things at the beginning
 
 
 ALONE = Steps(1.0, 0.012, 0.003, (-1.0, -0.3))  # of who does not know how to drive

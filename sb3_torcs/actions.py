@@ -17,6 +17,7 @@ __all__ = [
     "ACTIONS",
     "ACTION_HIGH",
     "ACTION_LOW",
+    "BRAKING",
     "GEARBOXES",
     "GEARS",
     "PEDALS",
@@ -43,7 +44,7 @@ ACTIONS: tuple[str, ...] = get_args(ActionName)
 GearboxName = Literal["automatic", "road_speed"]
 GEARBOXES: tuple[str, ...] = get_args(GearboxName)
 """
-What chooses the gears of an agent that does not. Both shift up when the motor would turn faster
+What shifts where the action has no gear. Both shift up when the motor would turn faster
 than 93 % of its limit, and down when it would turn slower than 82 % in the lower gear.
 
 ``"automatic"`` goes by the motor's own speed, which jumps while the wheels spin: then it hunts
@@ -54,6 +55,9 @@ car is, so that the motor has its power from the start.
 
 GEARS = 6
 """Forward gears of a car that says nothing else."""
+
+BRAKING = 0.05
+"""[-] Brake from which a car counts as braking; networks seldom give exactly 0."""
 
 _DIVERGED = (
     "a network that gives nan has diverged: lower learning_rate or check the rewards and "

@@ -24,6 +24,7 @@ __all__ = [
     "CONTROL_TICK",
     "DEFAULT_CAR",
     "FIRST_RIVAL",
+    "KMH",
     "LIMITER_RPM",
     "MANY_LAPS",
     "MAX_DAMAGE",
@@ -74,6 +75,8 @@ LIMITER_RPM = 9152.0
 """[rpm] at which its motor is limited."""
 RPM = math.tau / 60.0
 """[rad/s] One revolution per minute."""
+KMH = 3.6
+"""[km/h] One metre per second."""
 
 CONTROL_TICK = 0.02
 """[s] The interval at which TORCS calls its robots; one timestep lasts a whole number of them."""

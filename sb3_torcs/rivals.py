@@ -88,7 +88,7 @@ def needed_brake(car: CarState) -> float:
     Scalable Self-driving Cars", arXiv:1708.06374). The less room is left, the harder it brakes.
     Cars beside the way, and those that draw away, count for nothing. Compiled code calls it, too.
 
-    :param car: at the begin of a timestep
+    :param car: at the beginning of a timestep
     """
     most = 0.0
     speed = max(car.speed_x, 0.0)
@@ -118,7 +118,7 @@ def needed_turn(car: CarState) -> float:
     nearer that is, the more it turns; at the edge of the road it does not turn. The game's robots
     make room, too ("filterSColl" of `bt`). Compiled code calls this function, too.
 
-    :param car: at the begin of a timestep
+    :param car: at the beginning of a timestep
     """
     turn = 0.0
     rivals = car.race[FIRST_RIVAL:]

@@ -25,7 +25,7 @@ import numpy.typing as npt
 from numba import literal_unroll, njit, types
 from numba.extending import overload
 
-from sb3_torcs.car import FIRST_RIVAL, REST_HEIGHT, RIVALS, CarState, FloatArray
+from sb3_torcs.car import FIRST_RIVAL, KMH, REST_HEIGHT, RIVALS, CarState, FloatArray
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.rivals import see_rivals
 from sb3_torcs.tracks.profile import INTERVALS, QUANTITIES, RoadProfile, look_ahead, speed_margins
@@ -75,7 +75,6 @@ class Sensor(NamedTuple):
     mirror: Mirror = "same"  # what becomes of its numbers if left and right change places
 
 
-KMH = 3.6  # km/h per m/s
 SCR_RPM = 10.0  # the SCR server reports ten times rad/s as "rpm"
 
 SENSORS = (

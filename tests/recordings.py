@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from sb3_torcs.rendering.encoder import PHOTOGRAPHIC, write_video
 from sb3_torcs.rendering.game_video import GameVideo
 from sb3_torcs.torcs.process import GameProcess
 from sb3_torcs.torcs.race_setup import RaceSetup
@@ -18,3 +19,8 @@ def recorded(game, race=LAP, size=SIZE, **options):
         return GameProcess(game, race, check=check_track, **window_arguments(game, window))
 
     return GameVideo(start, size=size, **{"fps": FPS, **options})
+
+
+def saved(video, path):
+    pictures = (frame.picture for frame in video.frames())
+    return write_video(path, pictures, video.fps, encoding=PHOTOGRAPHIC)

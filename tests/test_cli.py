@@ -629,7 +629,7 @@ def test_an_episode_is_driven_again_exactly(recorded):
 
 
 def test_a_video_shows_the_drive_with_its_aids_and_delay(monkeypatch):
-    """An aid steps in at the begin of a timestep, and not between."""
+    """An aid steps in at the beginning of a timestep, and not between."""
     kwargs = {"track": "g-track-1", "unstick": True, "recovery": 20.0, "runoff": 5.0, "delay": 3}
     recorder = recording.Recorder("TorcsLite-v0", kwargs, 100)
     recorder.reset(seed=0)

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from displays import left_behind, traces
 from processes import gone_within, runs
-from recordings import FPS, LAP, SIZE, recorded
+from recordings import FPS, LAP, SIZE, recorded, saved
 
 from sb3_torcs.agents.text_mode import run
 from sb3_torcs.errors import (
@@ -98,14 +98,14 @@ class TestFrames:
         pictures = []
         for driver in (None, "bt 3"):
             with recorded(game, race, driver=driver) as video:
-                pictures.append(next(video.pictures()))
+                pictures.append(next(video.frames()).picture)
         assert (pictures[0] != pictures[1]).any()
 
 
 class TestFiles:
     def test_a_video_plays_in_a_browser(self, game, tmp_path, lap):
         with recorded(game) as video:
-            path = video.save(tmp_path / "lap.mp4")
+            path = saved(video, tmp_path / "lap.mp4")
         call = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", str(path), "-f", "null", "-"]
         words = subprocess.run(call, capture_output=True, check=True).stderr.decode()
         assert "Video: h264" in words
@@ -122,7 +122,7 @@ class TestFiles:
             resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
             try:
                 with pytest.raises(OutputNotWritable, match="is there room on the disk"):
-                    video.save(target / "lap.mp4")
+                    saved(video, target / "lap.mp4")
             finally:
                 resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         assert list(target.iterdir()) == []

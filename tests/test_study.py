@@ -265,7 +265,7 @@ def test_a_damaged_checkpoint_is_told_once(begun, capsys):
     [
         (
             {"callback": [{"sb3_torcs.callbacks.NoiseDecayCallback": {"timesteps": -1}}]},
-            "pass a whole number of at least 1 timestep",
+            "timesteps is -1; expected a whole number >= 1",
         ),
         ({"learning_rate": "fast"}, "learning_rate is 'fast'"),
         ({"policy_kwargs": {"head_bias": [0.0]}}, "head_bias"),

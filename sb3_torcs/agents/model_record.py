@@ -88,9 +88,7 @@ class TrainingRecord:
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)
     hyperparameters: Mapping[str, Any] = field(default_factory=dict)  # the entry, as it was read
     spaces: Spaces | None = None  # of observations and actions
-    policy: Mapping[str, Any] | None = (
-        None  # as of :func:`~sb3_torcs.agents.model_policy.plain_policy`
-    )
+    policy: Mapping[str, Any] | None = None  # as of ``model_policy.plain_policy``
     statistics: Statistics | None = None  # of VecNormalize
     statistics_file: Path | None = None  # the same, pickled by the zoo
     driver_only: bool = False  # whether the parts that only learning needs were left out

@@ -8,7 +8,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_torcs.car import checked_choice, is_count, is_number
+from sb3_torcs.car import check_count, checked_choice, is_number
 from sb3_torcs.errors import InvalidOption, renamed
 from sb3_torcs.noise import (
     BLOG,
@@ -141,11 +141,9 @@ class NoiseDecayCallback(_NoiseUser):
     @renamed(frames="timesteps")
     def __init__(self, *, timesteps: int = 100_000, floor: float = 0.0, verbose: int = 0) -> None:
         super().__init__(verbose)
-        if not is_count(timesteps) or not is_number(floor) or not 0.0 <= floor <= 1.0:
-            raise InvalidOption(
-                f"timesteps={timesteps!r}, floor={floor!r}: pass a whole number of at least 1 "
-                "timestep, and a floor in [0, 1]"
-            )
+        check_count("timesteps", timesteps)
+        if not is_number(floor) or not 0.0 <= floor <= 1.0:
+            raise InvalidOption(f"floor is {floor!r}; expected a share from 0 to 1")
         self.timesteps = timesteps
         self.floor = floor
 

@@ -16,7 +16,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_torcs.callbacks.switches import require_method
-from sb3_torcs.car import is_count, is_number
+from sb3_torcs.car import check_count, is_number
 from sb3_torcs.errors import InvalidOption, renamed
 from sb3_torcs.policies import ppo, updates
 from sb3_torcs.policies.mirror import check_angles
@@ -74,11 +74,8 @@ class GradientStepsCallback(_WhileLearning):
     @renamed(frames="timesteps")
     def __init__(self, *, gradient_steps: int, timesteps: int, verbose: int = 0) -> None:
         super().__init__(verbose)
-        if not is_count(gradient_steps) or not is_count(timesteps):
-            raise InvalidOption(
-                f"gradient_steps={gradient_steps!r}, timesteps={timesteps!r}: pass whole "
-                "numbers of at least 1"
-            )
+        check_count("gradient_steps", gradient_steps)
+        check_count("timesteps", timesteps)
         self.gradient_steps = gradient_steps
         self.timesteps = timesteps
 
@@ -166,8 +163,8 @@ class AdaptiveLearningRateCallback(_WhileLearning):
     :param kl: target of the divergence per update [nats]
     :param last_kl: the same at the end of the training, to which it falls linearly [nats]; ``None``
         is ``kl``
-    :param first_factor: on the model's learning rate at the begin, 0.01 to 4. With one below 1 the
-        first updates take little of what a good policy knows
+    :param first_factor: on the model's learning rate at the beginning, 0.01 to 4. With one below 1
+        the first updates take little of what a good policy knows
     :param verbose: as in ``BaseCallback``
     :raises InvalidOption: if a target is not above 0, the factor is out of its range, or the model
         is not PPO

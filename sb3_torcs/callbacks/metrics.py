@@ -24,7 +24,7 @@ from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.logger import Image, Logger, TensorBoardOutputFormat
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_torcs.actions import ACTIONS, PEDALS, ActionLayout, layout_of_width
+from sb3_torcs.actions import ACTIONS, BRAKING, PEDALS, ActionLayout, layout_of_width
 from sb3_torcs.agents.rollout import drive
 from sb3_torcs.car import CarState, check_count
 from sb3_torcs.errors import InvalidOption, renamed
@@ -59,7 +59,6 @@ default for the first is a tuple: hence the empty list. A ``best_lap_time`` of 0
 
 ENDS = ("off_track", "backwards", "stuck", "damage", "lost", "laps", "race", "time_limit")
 
-BRAKING = 0.05  # [-] of the pedal's travel; networks seldom give exactly 0
 SATURATED = 0.01  # [-] of an actuator's range: an action so near to a limit counts as at it
 RECORD_EVERY = 100  # calls between two records of the means over timesteps
 TEXT_FORMATS = ("stdout", "log", "json", "csv")  # these formats refuse pictures
@@ -266,21 +265,21 @@ class DrivingMetricsCallback(BaseCallback):
     """
     Log how the car drives, for any algorithm, number of environments and kind of ``VecEnv``.
 
-    ========================================  ==========================================  ======
-    ``driving/…``                             what                                        unit
-    ========================================  ==========================================  ======
-    ``lap_time``                              mean of the laps completed                  s
-    ``best_lap_time``                         best lap of the training so far             s
-    ``laps``, ``distance``                    mean of the episodes that ended             -, m
-    ``end_off_track``, ``end_stuck``, …       share of the episodes that ended this way   -
-    ``speed``                                 mean along the car                          m/s
+    ========================================  ==============================================  ======
+    ``driving/…``                             what                                            unit
+    ========================================  ==============================================  ======
+    ``lap_time``                              mean of the laps completed                      s
+    ``best_lap_time``                         best lap of the training so far                 s
+    ``laps``, ``distance``                    mean of the episodes that ended                 -, m
+    ``end_off_track``, ``end_stuck``, …       share of the episodes that ended this way       -
+    ``speed``                                 mean along the car                              m/s
     ``brake_share``                           share of timesteps with the brake beyond 5 %    -
     ``saturation_steering`` (… ``_brake``)    share of timesteps within 1 % of a limit        -
-    ``q``                                     mean Q of the newest transitions            -
-    ``noise_scale``                           of the action noise, if it has one          -
-    ``evaluation_lap_time``                   of the driven line                          s
+    ``q``                                     mean Q of the newest transitions                -
+    ``noise_scale``                           of the action noise, if it has one              -
+    ``evaluation_lap_time``                   of the driven line                              s
     ``line``                                  the driven line (TensorBoard image)
-    ========================================  ==========================================  ======
+    ========================================  ==============================================  ======
 
     ``reward/TERM`` is the sum of a term of the reward over an episode, as the mean of the episodes
     that ended.
@@ -403,9 +402,8 @@ class DrivingMetricsCallback(BaseCallback):
 
     def _record_noise(self) -> None:
         noise = getattr(self.model, "action_noise", None)
-        noise = next(
-            iter(getattr(noise, "noises", ())), noise
-        )  # the same in all environments of a vector
+        # The same in all environments of a vector.
+        noise = next(iter(getattr(noise, "noises", ())), noise)
         scale = getattr(noise, "scale", None)
         if scale is not None:
             self.logger.record("driving/noise_scale", float(scale))

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sb3_torcs.car import KMH
 from sb3_torcs.cli.common import MODEL_HELP, TRUST_HELP, positive, print_json, quiet_output, table
 from sb3_torcs.files import writable_file
 
@@ -14,10 +15,9 @@ if TYPE_CHECKING:
 
 __all__ = ["add_parser", "run"]
 
-KMH = 3.6  # [km/h per m/s]
 LAP_HEADERS = ("driver", "lap s", "behind s")
-CORNER_HEADERS = ("corner", "m", "driver", "brakes m", "entry km/h", "slowest km/h", "exit km/h",
-                  "lost s")  # fmt: skip
+CORNER_HEADERS = ("corner", "m", "driver", "brakes m before", "entry km/h", "slowest km/h",
+                  "exit km/h", "lost s")  # fmt: skip
 
 DESCRIPTION = """\
 Compare the best laps of drivers on one track: agents, robots, ghosts, and files of saved drives
@@ -101,7 +101,7 @@ def _corner_row(number: int, driver: str, corner: dict[str, Any]) -> tuple[str, 
         str(number + 1),
         f"{corner['distance']:.0f}",
         driver,
-        "-" if brakes is None else f"{brakes:.0f}",
+        "-" if brakes is None else f"{corner['distance'] - brakes:.0f}",
         *(f"{KMH * speed:.0f}" for speed in speeds),
         f"{corner['time_lost']:.3f}",
     )

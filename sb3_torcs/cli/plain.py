@@ -13,10 +13,8 @@ __all__ = ["any_terminal", "open_streams"]
 
 HANDLER = "sb3_torcs.plain"
 PLAIN = {"→": "->", "–": "-", "—": "-", "−": "-", "×": "x", "·": "*", "°": " deg", "’": "'"}
-FIRST_BYTE, LAST_BYTE = (
-    "\udc80",
-    "\udcff",
-)  # surrogates that stand for bytes of a path that is not valid text
+# Surrogates that stand for bytes of a path that is not valid text.
+FIRST_BYTE, LAST_BYTE = "\udc80", "\udcff"
 
 
 def _plain(error: UnicodeError) -> tuple[str | bytes, int]:

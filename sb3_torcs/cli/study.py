@@ -66,9 +66,8 @@ def run(args: argparse.Namespace) -> int:
     study = read_study(args.file)
     folder = writable_folder(args.folder or Path("logs") / "studies" / study.name)
     board = Board(study)
-    interrupted = contextlib.suppress(
-        KeyboardInterrupt
-    )  # Ray Tune handles Ctrl-C itself while it runs
+    # Ray Tune handles Ctrl-C itself while it runs.
+    interrupted = contextlib.suppress(KeyboardInterrupt)
     with interrupted, quiet_output(args.json), board.shown():
         run_study(study, folder, jobs=args.jobs, address=args.address, progress=board.update)
     store = StudyFolder(folder, study)

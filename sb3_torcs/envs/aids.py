@@ -35,7 +35,7 @@ class Aids:
         Change what a car is asked to do, where an aid steps in.
 
         :param controls: that were asked for
-        :param car: at the begin of a timestep
+        :param car: at the beginning of a timestep
         """
         if self.unstick and needs_freeing(car):
             return Controls(*freeing_controls(car))
@@ -55,7 +55,7 @@ def aided(
     """
     Change steering, throttle and brake where an aid steps in. Compiled code calls it, too.
 
-    :param car: at the begin of a timestep
+    :param car: at the beginning of a timestep
     :param asked: steering, throttle and brake
     :param keep_distance: as of :class:`Aids`, and so on
     :return: the same three

@@ -49,16 +49,15 @@ def _derived(name: str) -> None:
 
 for _name in ("track_position", "off_track", "gap_ahead", "gap_behind", "contacts", "faults"):
     _derived(_name)
-_readers = (actions.action_layout(name).read for name in actions.ACTIONS)
+_readers = _read_pedals, _read_pedal, _read_manual = tuple(
+    actions.action_layout(name).read for name in ("pedals", "pedal", "manual")
+)
 _aids = (
     needed_brake, needed_turn, needs_freeing, freeing_controls, sideslip, slides, caught_steering,
     aided,
 )  # fmt: skip
 for _function in (end_of, stands, rewards.safe_speed, *_aids, *_readers):
     register_jitable(_function)
-_read_pedals, _read_pedal, _read_manual = (
-    actions.action_layout(name).read for name in ("pedals", "pedal", "manual")
-)
 
 
 @njit(cache=True)
@@ -104,7 +103,7 @@ def aid_cars(cars: Any, aids: npt.NDArray[np.bool_], controls: FloatArray) -> No
     """
     Change controls as :class:`~sb3_torcs.envs.aids.Aids` does.
 
-    :param cars: (n,) at the begin of a timestep
+    :param cars: (n,) at the beginning of a timestep
     :param aids: (n, 4) which cars have which, in the order of :data:`~sb3_torcs.envs.aids.AIDS`
     :param controls: (n, 5) that were asked for, changed
     """

@@ -69,7 +69,7 @@ class Conditions:
 
     def instead(self, choice: Mapping[str, Any]) -> Conditions:
         """
-        Make conditions in the place of these.
+        Make conditions instead of these.
 
         :param choice: those that change, by name
         :raises InvalidOption: if a name or a value is not allowed

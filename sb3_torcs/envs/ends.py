@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from sb3_torcs.car import MAX_DAMAGE, CarState
+from sb3_torcs.car import KMH, MAX_DAMAGE, CarState
 
 __all__ = [
     "ENDS",
@@ -16,7 +16,7 @@ __all__ = [
     "stands",
 ]
 
-STUCK_SPEED = 5.0 / 3.6  # [m/s] along the road; slower than walking counts as standing
+STUCK_SPEED = 5.0 / KMH  # [m/s] along the road; slower than walking counts as standing
 STUCK_TICKS = 75  # control ticks of standing that end an episode: 1.5 s
 GRACE_TICKS = 150  # 3 s to get going after a standing start
 BACKWARDS_ANGLE = 0.5 * math.pi  # [rad] to the road from which the car faces backwards

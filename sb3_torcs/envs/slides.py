@@ -18,7 +18,7 @@ def sideslip(car: CarState) -> float:
 
     Compiled code calls it, too.
 
-    :param car: at the begin of a timestep
+    :param car: at the beginning of a timestep
     """
     return math.atan2(car.speed_y, car.speed_x)
 
@@ -29,7 +29,7 @@ def slides(car: CarState) -> bool:
 
     Compiled code calls it, too.
 
-    :param car: at the begin of a timestep
+    :param car: at the beginning of a timestep
     """
     if car.gear < 0 or car.speed_x <= 0.0 or math.hypot(car.speed_x, car.speed_y) < SLOWEST:
         return False

@@ -230,9 +230,8 @@ class TorcsEnv(RacingEnv):
         backend: Any = self.backend  # a NativeBackend, perhaps in one that notes its drives
         appearance = backend.engine.appearance()
         if self._viewer is None:
-            from sb3_torcs.rendering.game_camera import (
-                GameView,
-            )  # imported here because graphics take long to load
+            # Imported here because graphics take long to load.
+            from sb3_torcs.rendering.game_camera import GameView
 
             self._viewer = GameView(find_game(), backend.race_setup(), self._window)
         try:

@@ -25,7 +25,7 @@ def needs_freeing(car: CarState) -> bool:
 
     Compiled code calls it, too.
 
-    :param car: at the begin of a timestep
+    :param car: at the beginning of a timestep
     """
     if abs(car.heading_error) < TURNED and abs(car.track_position) <= 1.0:
         return False

@@ -38,7 +38,7 @@ def empty(*size: int, dtype: Any) -> np.ndarray:
 
     :param size: of the array
     :param dtype: of its numbers
-    :return: the array, in which anything may stand
+    :return: the array, uninitialised
     """
     return th.empty(size, dtype=th.from_numpy(np.empty(0, dtype)).dtype).numpy()
 
@@ -52,7 +52,7 @@ def take(*size: int, dtype: Any) -> np.ndarray:
 
     :param size: of the array
     :param dtype: of its numbers
-    :return: the array, in which anything may stand
+    :return: the array, uninitialised
     """
     free = _spare.get((*size, dtype))
     return free.pop() if free else empty(*size, dtype=dtype)

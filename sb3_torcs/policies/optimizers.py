@@ -10,7 +10,7 @@ import torch as th
 
 from sb3_torcs.policies import kernels
 
-__all__ = ["LeanAdam", "is_usual", "with_lr_scale"]
+__all__ = ["LeanAdam", "adam_factors", "adam_state", "is_usual", "with_lr_scale"]
 
 
 class _LrScale:
@@ -90,22 +90,43 @@ class LeanAdam(_LrScale, th.optim.Adam):
         :return: what the kernel takes after the weights and their gradient
         """
         (group,) = (g for g in self.param_groups if any(param is own for own in g["params"]))
-        step, mean, square = self._state_arrays(param)
+        state = adam_state(self, param)
+        step, mean, square = (
+            state[name].numpy().reshape(-1) for name in ("step", "exp_avg", "exp_avg_sq")
+        )
         step += 1
-        count, (beta1, beta2), real = step.item(), group["betas"], mean.dtype.type
-        rate = group["lr"] * group.get("lr_scale", 1.0)
-        return (
-            mean, square, (real(beta1), real(beta2)), real(rate / (1 - beta1**count)),
-            real((1 - beta2**count) ** -0.5), real(group["eps"]),
-        )  # fmt: skip
+        return mean, square, *adam_factors(group, step.item(), mean.dtype.type)
 
-    def _state_arrays(self, param: th.Tensor) -> list[np.ndarray]:
-        """Look at the state of a parameter, which is that of PyTorch's Adam; begin it if needed."""
-        state = self.state[param]
-        if not state:
-            state["step"] = th.zeros((), dtype=th.float32)
-            state["exp_avg"], state["exp_avg_sq"] = th.zeros_like(param), th.zeros_like(param)
-        return [state[name].numpy().reshape(-1) for name in ("step", "exp_avg", "exp_avg_sq")]
+
+def adam_state(optimizer: th.optim.Optimizer, param: th.Tensor) -> dict[str, th.Tensor]:
+    """
+    Look at what PyTorch's Adam keeps of a parameter; begin it if needed.
+
+    :param optimizer: the parameter's
+    :param param: any of its parameters
+    """
+    state: dict[str, th.Tensor] = optimizer.state[param]
+    if not state:
+        state["step"] = th.zeros((), dtype=th.float32)
+        state["exp_avg"], state["exp_avg_sq"] = th.zeros_like(param), th.zeros_like(param)
+    return state
+
+
+def adam_factors(group: dict[str, Any], count: float, real: Any) -> tuple[Any, ...]:
+    """
+    Compute what the kernel of Adam takes after its averages.
+
+    :param group: of the optimizer's parameters
+    :param count: of updates, this one included
+    :param real: type of the numbers
+    :return: both betas, the rate, the factor on the root, and epsilon
+    """
+    beta1, beta2 = group["betas"]
+    rate = group["lr"] * group.get("lr_scale", 1.0)
+    return (
+        (real(beta1), real(beta2)), real(rate / (1 - beta1**count)),
+        real((1 - beta2**count) ** -0.5), real(group["eps"]),
+    )  # fmt: skip
 
 
 def is_usual(optimizer: th.optim.Optimizer) -> bool:

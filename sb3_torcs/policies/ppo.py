@@ -29,7 +29,7 @@ from sb3_torcs.policies.bounded import BoundedHead, BoundedPolicy
 from sb3_torcs.policies.flat import Slot
 from sb3_torcs.policies.fused import array
 from sb3_torcs.policies.layers import compiled
-from sb3_torcs.policies.optimizers import is_usual
+from sb3_torcs.policies.optimizers import adam_factors, adam_state, is_usual
 from sb3_torcs.policies.threads import one_thread
 
 __all__ = ["LeanPPO", "is_for"]
@@ -88,7 +88,7 @@ class _Stack:
 
 class LeanPPO:
     """
-    Decides and updates in the place of a model's policy and of its ``train``.
+    Decides and updates instead of a model's policy and of its ``train``.
 
     :param model: for which :func:`is_for` is true
     """
@@ -209,12 +209,8 @@ class LeanPPO:
         self.gradient *= np.float32(min(1.0, self.model.max_grad_norm / (norm + SPARE)))
         (group,) = self.policy.optimizer.param_groups
         self.count += 1
-        real, (beta1, beta2) = np.float32, group["betas"]
-        kernels.adam(
-            self.weights, self.gradient, self.mean, self.square, (real(beta1), real(beta2)),
-            real(group["lr"] / (1 - beta1**self.count)),
-            real((1 - beta2**self.count) ** -0.5), real(group["eps"]),
-        )  # fmt: skip
+        factors = adam_factors(group, self.count, np.float32)
+        kernels.adam(self.weights, self.gradient, self.mean, self.square, *factors)
 
     def _record(self, figures: list[list[Figures]]) -> None:
         """Log what ``PPO.train`` logs."""
@@ -247,12 +243,7 @@ class LeanPPO:
 
     def _states(self) -> list[dict[str, Any]]:
         """Look at what Adam keeps of each parameter; begin it if needed."""
-        states = [self.policy.optimizer.state[own] for own in self.parameters]
-        for own, state in zip(self.parameters, states, strict=True):
-            if not state:
-                state["step"] = th.zeros((), dtype=th.float32)
-                state["exp_avg"], state["exp_avg_sq"] = th.zeros_like(own), th.zeros_like(own)
-        return states
+        return [adam_state(self.policy.optimizer, own) for own in self.parameters]
 
     def _read_state(self) -> None:
         """Take over the parameters and what Adam keeps of them."""

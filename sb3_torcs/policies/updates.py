@@ -22,7 +22,7 @@ __all__ = ["LeanUpdates", "is_for"]
 
 class LeanUpdates:
     """
-    Updates a model in the place of its ``train``.
+    Updates a model instead of its ``train``.
 
     :param model: for which :func:`is_for` is true
     """

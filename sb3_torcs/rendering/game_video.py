@@ -14,13 +14,11 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from itertools import zip_longest
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from sb3_torcs.errors import GameFailed, GameTimeout, InvalidOption
-from sb3_torcs.rendering.encoder import PHOTOGRAPHIC, write_video
 from sb3_torcs.torcs.display import VirtualDisplay
 from sb3_torcs.torcs.process import GameProcess
 from sb3_torcs.torcs.window import ViewName, Window
@@ -119,30 +117,6 @@ class GameVideo:
         self.game.wait(GRACE)
         if frame is None:  # the game ends like that if it cannot load a driver
             raise GameFailed(self.game.epitaph())
-
-    def pictures(self) -> Iterator[npt.NDArray[np.uint8]]:
-        """
-        Yield every picture, for :func:`side_by_side` or
-        :func:`~sb3_torcs.rendering.encoder.write_video`.
-
-        :raises GameFailed: if the game ends too early
-        :raises GameTimeout: if it hangs
-        """
-        return (frame.picture for frame in self.frames())
-
-    def save(self, path: str | os.PathLike[str], total: int | None = None) -> Path:
-        """
-        Record the race from now to its end.
-
-        :param path: of the file, ending in ``.mp4``
-        :param total: number of frames, for the progress bar, if known
-        :return: the path
-        :raises InvalidOption: if the name does not end in ``.mp4``
-        :raises OutputNotWritable: if the file cannot be written; no part of it is left behind
-        :raises GameFailed: if the game ends too early; no part of the file is left behind
-        :raises GameTimeout: if it hangs; no part of the file is left behind
-        """
-        return write_video(path, self.pictures(), self.fps, total, PHOTOGRAPHIC)
 
 
 def side_by_side(*videos: Iterator[npt.NDArray[np.uint8]]) -> Iterator[npt.NDArray[np.uint8]]:

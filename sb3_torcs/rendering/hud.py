@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sb3_torcs.actions import SHIFT_UP_RPM
-from sb3_torcs.car import RPM, CarState, Controls, FloatArray
+from sb3_torcs.car import KMH, RPM, CarState, Controls, FloatArray
 from sb3_torcs.rendering.highway import pygame, to_highway
 from sb3_torcs.rendering.scenery import Colour
 from sb3_torcs.tracks.track import Track
@@ -28,7 +28,6 @@ AMBER: Colour = (242, 180, 58)
 BLUE: Colour = (92, 164, 236)
 CHARACTERS = string.ascii_letters + string.digits + string.punctuation + " "
 
-KMH = 3.6  # km/h per m/s
 REVS_SHOWN = 10000.0  # [rpm] at the bar's end
 NO_TIME = "-:--.--"  # shown before the first whole lap
 GEARS = {-1: "R", 0: "N"}

@@ -17,7 +17,7 @@ from contextlib import suppress
 from operator import itemgetter
 from typing import Any, NamedTuple
 
-from sb3_torcs.car import FloatArray, Start
+from sb3_torcs.car import KMH, FloatArray, Start
 from sb3_torcs.errors import MessageBroken
 
 __all__ = [
@@ -48,7 +48,6 @@ SHUTDOWN = b"***shutdown***"
 
 NO_FOCUS = 360.0  # [degrees] outside the range of any server
 CLIENT = b"SCR"  # beginning of a client's first message; servers check no more of it
-KMH = 3.6  # km/h per m/s
 RPM = 10.0  # the server's "rpm" per rad/s
 DIGITS = 6  # of the server's numbers
 EXACT_DIGITS = 17  # that identify a double

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from sb3_torcs.actions import BRAKING
 from sb3_torcs.car import FloatArray
 from sb3_torcs.errors import DriveFileError
 from sb3_torcs.telemetry.corners import Corner, corners_of, stretches
@@ -18,7 +19,6 @@ __all__ = ["Comparison", "CornerPass", "DriverLap", "compare_drives"]
 
 SECTORS = 3  # of one length each; the game's tracks have none
 NEAR_THE_LINE = 20.0  # [m] within which a lap is seen, unless its rows lie farther apart
-BRAKING = 0.05  # [-] of the pedal's travel; networks seldom give exactly 0
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_torcs.car import FloatArray
+from sb3_torcs.car import KMH, FloatArray
 from sb3_torcs.telemetry.comparison import Comparison, CornerPass, DriverLap
 from sb3_torcs.telemetry.document import (
     OKABE_ITO,
@@ -25,7 +25,6 @@ from sb3_torcs.tracks.track import Track
 
 __all__ = ["lap_report"]
 
-KMH = 3.6  # [km/h per m/s]
 MOST_SLIP = 0.5  # [-] that is shown; a car that turns round slips by any number
 EQUAL = 0.0005  # [s] less is no difference
 IN_TITLE = 3  # laps that the title names

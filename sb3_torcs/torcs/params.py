@@ -465,7 +465,7 @@ class Node:
 
     def number_sections(self, entries: int) -> list[Node]:
         """
-        Put numbered sections in the place of all that are inside this one.
+        Put numbered sections instead of all that are inside this one.
 
         :param entries: how many
         :return: the new sections

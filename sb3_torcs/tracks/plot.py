@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sb3_torcs.car import FloatArray
+from sb3_torcs.car import KMH, FloatArray
 from sb3_torcs.tracks.track import CURVATURE, LENGTH, Track
 
 if TYPE_CHECKING:
@@ -20,7 +20,6 @@ __all__ = ["plot_track"]
 SIZE = 8.0  # [in] of the longer side of the picture
 STEP = 5.0  # [m] between points of the drawn edges, at most
 TURN_STEP = math.radians(3.0)  # [rad] between them, at most
-KMH = 3.6  # [km/h per m/s]
 ROAD_COLOUR = "#c9ccd1"
 EDGE_COLOUR = "#4a4f57"
 START_COLOUR = "#c1272d"

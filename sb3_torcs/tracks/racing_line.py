@@ -98,7 +98,7 @@ def _relax(
     """
     Move the line's places across the road until the bends between them are least.
 
-    The integral of the squared curvature is the sum of |second difference of places|² / distance³,
+    The integral of the squared curvature is the sum of (second difference of places)² / distance³,
     whose distances count as constant in a move.
 
     :param axis: (n, 2) places on the road's axis [m]

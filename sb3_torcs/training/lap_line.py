@@ -110,7 +110,7 @@ def lap_of(rows: FloatArray, begin: float, length: float) -> FloatArray:
     :param rows: (n, 7)
     :param begin: distance raced at its begin [m]
     :param length: of the track [m]
-    :return: (m, 7), with a distance of 0 at the begin
+    :return: (m, 7), with a distance of 0 at the beginning
     """
     distance = np.maximum.accumulate(rows[:, DISTANCE])
     first, last = np.searchsorted(distance, [begin, begin + length])

@@ -19,12 +19,9 @@ from sb3_torcs.car import range_finder_angles
 from sb3_torcs.errors import ModelMismatch, ModelNotTrusted
 from sb3_torcs.files import listed, path_and_arguments
 from sb3_torcs.training.keeping import REPLAY_BUFFER
-from sb3_torcs.training.zoo_data import as_data
+from sb3_torcs.training.zoo_data import SCHEDULES, as_data
 
 __all__ = ["check_resumable", "recorded_entry", "restore_statistics"]
-
-SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf", "delta_std")
-"""What the zoo lets fall to 0 over a training if it is written as ``lin_…``."""
 
 
 def recorded_entry(

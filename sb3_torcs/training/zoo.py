@@ -303,9 +303,8 @@ def _check_wrappers(entry: Entry, place: Place) -> None:
     _check_call("monitor_kwargs", Monitor, keywords, place, ("self", "env", "filename"))
     if isinstance(keywords, Mapping):
         kinds = {type(keywords.get(key, ())) for key in ("info_keywords", "reset_keywords")}
-        if (
-            len(kinds) > 1
-        ):  # Monitor adds the two, which have to be of one type; its default is a tuple
+        # Monitor adds the two, which have to be of one type; its default is a tuple.
+        if len(kinds) > 1:
             raise ZooConfigError(
                 f"{place}: monitor_kwargs needs both info_keywords and reset_keywords as lists; "
                 "add the other one as []"

@@ -18,6 +18,7 @@ from sb3_torcs.errors import ZooConfigError
 
 __all__ = [
     "EVALUATED",
+    "SCHEDULES",
     "as_data",
     "check_class",
     "check_data",
@@ -164,10 +165,13 @@ def _is_share(value: Any) -> bool:
 
 NOISE_TYPES = ("normal", "ornstein-uhlenbeck")
 
+SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf", "delta_std")
+"""What the zoo lets fall to 0 over a training if it is written as ``lin_…``."""
+
 NUMBERS: tuple[tuple[tuple[str, ...], Callable[[Any], bool], str], ...] = (
     (("n_timesteps",), _is_budget, "a number >= 1"),
     (
-        ("learning_rate", "clip_range", "clip_range_vf", "delta_std"),
+        SCHEDULES,
         _is_schedule,
         "a number >= 0 (for YAML 1e-3 is text, and 1.0e-3 a number), or lin_NUMBER to fall to 0",
     ),
