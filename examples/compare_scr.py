@@ -19,12 +19,14 @@ from sb3_torcs.agents.models import driver_record, load_driver
 from sb3_torcs.agents.rollout import Driver, drive
 from sb3_torcs.car import Start
 from sb3_torcs.cli.common import table
+from sb3_torcs.envs.aids import AIDS
 from sb3_torcs.errors import ends_in_a_line
 
 ROUNDING = 1e-6  # [-] between observations, which are at most 3
 SAME = 1e-4  # [-] between two actions that count as equal
 MILLISECOND = 0.001  # [s]
-KEPT = ("car", "action_repeat", "range_finders", "action", "gearbox")  # of a model's training
+# Of a model's training.
+KEPT = ("car", "sensors", "action_repeat", "range_finders", "action", "gearbox", *AIDS)
 HEADERS = ("track", "equal", "same actions", "difference", "laps, engine", "laps, game")
 
 

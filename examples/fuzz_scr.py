@@ -32,6 +32,7 @@ STATE = (  # tag, how many, from SI
     ("opponents", 36, 1.0), ("racePos", 1, 1.0), ("rpm", 1, 10.0), ("speedX", 1, 3.6),
     ("speedY", 1, 3.6), ("speedZ", 1, 3.6), ("track", 19, 1.0), ("trackPos", 1, 1.0),
     ("wheelSpinVel", 4, 1.0), ("z", 1, 1.0), ("focus", 5, 1.0),
+    ("yawRate", 1, 1.0),
 )  # fmt: skip
 BITS = (b"(", b")", b" ", b"\0", b"-", b".", b"e", b"_", b"nan", b"inf", b"9" * 400, b"(gear 3)",
         b")(", b"0x1", b"+", b",", b"\xff", b"(rpm ", b"1e5", b"\t")  # fmt: skip
@@ -134,7 +135,8 @@ def random_state(chance: np.random.Generator) -> ScrState:
         return tuple(values.tolist())
 
     values = [some(size) if size > 1 else some(1)[0] for _, size, _ in STATE]
-    return ScrState._make(values)._replace(gear=int(chance.integers(-1, 8)), race_position=1)
+    state = ScrState._make(values)._replace(gear=int(chance.integers(-1, 8)), race_position=1)
+    return state if chance.random() < 0.5 else state._replace(yaw_rate=None)
 
 
 def mutated(chance: np.random.Generator, text: bytes) -> bytes:

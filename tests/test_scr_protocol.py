@@ -51,6 +51,7 @@ states = st.builds(
     gear=st.integers(-1, 8),
     race_position=st.integers(1, 40),
     **{name: st.tuples(*[numbers] * size) for name, size in SIZES.items()},
+    yaw_rate=st.none() | numbers,
 )
 units = st.floats(0.0, 1.0)
 actions = st.builds(
@@ -179,6 +180,14 @@ def test_a_broken_state_is_told(old, new, message):
         parse_state(LITERAL.replace(old, new))
 
 
+@pytest.mark.parametrize("text", [b"nan", b"inf", b"x", b"", b"1 2", b"0_1", b"(1"])
+def test_a_broken_yaw_rate_is_told(text):
+    whole = LITERAL.partition(b"\0")[0] + b"(yawRate 0.5)"
+    assert parse_state(whole) == parse_state(LITERAL)._replace(yaw_rate=0.5)
+    with pytest.raises(MessageBroken):
+        parse_state(whole.replace(b"0.5)", text + b")"))
+
+
 def test_a_broken_engine_reading_is_told():
     with pytest.raises(MessageBroken, match="rpm is no number"):
         parse_motor(LITERAL.replace(b"(rpm 942.478)", b"(rpm x)"))
@@ -192,8 +201,10 @@ def test_a_state_comes_back_with_six_digits(state):
     """And once written, it is written the same for ever."""
     text = format_state(state)
     once = parse_state(text)
+    assert (once.yaw_rate is None) == (state.yaw_rate is None)
     for value, expected in zip(once, state, strict=True):
-        np.testing.assert_allclose(value, expected, rtol=1e-5)
+        if expected is not None:
+            np.testing.assert_allclose(value, expected, rtol=1e-5)
     assert parse_motor(text) == (
         once.lap_time,
         once.gear,
@@ -212,13 +223,16 @@ def test_an_action_comes_back_with_all_digits(action):
         assert back.focus == pytest.approx(action.focus, rel=1e-11)
 
 
-@given(st.lists(numbers, min_size=79, max_size=79))
+@given(st.lists(numbers, min_size=80, max_size=80))
 def test_both_ends_write_the_same_state(numbers):
     numbers[6], numbers[44] = 3.0, 1.0
     parts = [*numbers[:6], 3, numbers[7], tuple(numbers[8:44]), 1, *numbers[45:49]]
     parts += [tuple(numbers[49:68]), numbers[68], tuple(numbers[69:73]), numbers[73]]
-    state = ScrState(*parts, tuple(numbers[74:]))
-    assert format_state(state) == _engine.scr_format_state(numbers)
+    state = ScrState(*parts, tuple(numbers[74:79]), numbers[79])
+    assert format_state(state._replace(yaw_rate=None)) == _engine.scr_format_state(numbers)
+    exact = parse_state(_engine.scr_format_state(numbers, exact=True))
+    for value, expected in zip(exact, state, strict=True):
+        assert value == pytest.approx(expected, rel=1e-15)
 
 
 @given(actions)

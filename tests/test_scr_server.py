@@ -159,9 +159,14 @@ class TestTexts:
         si += [200.0] * 35 + [7.5]
         si += [2.0, 915.2, 10.0, -1.0, 0.0]
         si += [-1.0] * 19
-        si += [-0.25, 1.0, 2.0, 3.0, 4e-7, 0.345, *[-1.0] * 5]
+        si += [-0.25, 1.0, 2.0, 3.0, 4e-7, 0.345, *[-1.0] * 5, 0.125]
         opponents = " ".join(["200"] * 35 + ["7.5"])
-        assert _engine.scr_format_state(si).decode() == (
+        text, exact = (
+            _engine.scr_format_state(si, exact=exact).decode() for exact in (False, True)
+        )
+        assert exact.startswith("(angle 0.1)(curLapTime 12.345678)(damage 3)")
+        assert exact.endswith("(focus -1 -1 -1 -1 -1)(yawRate 0.125)\0")
+        assert text == (
             "(angle 0.1)(curLapTime 12.3457)(damage 3)(distFromStart 100)(distRaced 1234.57)"
             f"(fuel 94)(gear -1)(lastLapTime 81.474)(opponents {opponents})(racePos 2)(rpm 9152)"
             f"(speedX 36)(speedY -3.6)(speedZ 0)(track {' '.join(['-1'] * 19)})(trackPos -0.25)"
@@ -171,16 +176,16 @@ class TestTexts:
     def test_every_number_as_c_prints_it(self):
         source = random.Random(1)
         for _ in range(300):
-            values = [source.uniform(-1, 1) * 10 ** source.uniform(-12, 12) for _ in range(79)]
+            values = [source.uniform(-1, 1) * 10 ** source.uniform(-12, 12) for _ in range(80)]
             scaled = list(values)
             scaled[45] *= 10.0
             for i in (46, 47, 48):
                 scaled[i] *= 3.6
             text = _engine.scr_format_state(values).decode()
-            assert re.findall(r" ([^ ()]+)", text) == [f"{value:g}" for value in scaled]
+            assert re.findall(r" ([^ ()]+)", text) == [f"{value:g}" for value in scaled[:79]]
 
     def test_it_takes_microseconds(self):
-        values = [math.pi * i for i in range(79)]
+        values = [math.pi * i for i in range(80)]
         began = time.process_time()
         for _ in range(10000):
             _engine.scr_format_state(values)

@@ -190,7 +190,9 @@ class ScrBackend:
         try:
             driven = self._hold(client, controls, ticks)
             if driven:
-                self._state = self._reader.read(parse_state(self._message), driven)
+                state = parse_state(self._message)
+                earlier = parse_state(self._earlier) if state.yaw_rate is None else None
+                self._state = self._reader.read(state, driven, earlier)
             if driven < ticks:
                 self._state = standing(self._state, ticks - driven)
         except ServerLost as error:
@@ -368,7 +370,7 @@ class ScrBackend:
             message = client.receive()
             if message is None:
                 return tick
-            self._message = message
+            self._earlier, self._message = self._message, message
         return ticks
 
     def _hang_up(self) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,6 +23,17 @@ VERGE = 5.0  # [m] beside it
 UNKNOWN_ROAD = Track("unknown", "road", (plain_segment(1e6, 0.0, WIDTH, VERGE),))
 """What stands in for a road that is not known: a straight that is longer than any lap. On it a car
 has the place across the road that the server tells, and the angle to it."""
+
+
+class _Place(NamedTuple):
+    """Where a car is on the track."""
+
+    x: float  # [m]
+    y: float  # [m]
+    yaw: float  # [rad]
+    offset: float  # [m] from the axis, left positive
+    width: float  # [m] of the road
+    distance: float  # [m] from the start line
 
 
 class CarReader:
@@ -48,19 +60,20 @@ class CarReader:
         self._laps = 0
         self._best = 0.0
         self._tick = CONTROL_TICK
-        self._yaw: float | None = None
         self._raced = state.distance_raced
         # The distance since the start grows but has six digits. The distance on the lap is more
         # precise, so the first only gives the number of laps to add.
         self._lap_began = state.distance_raced - state.distance_from_start
-        return self._car(state, 0.0)
+        return self._car(state, state.yaw_rate or 0.0)
 
-    def read(self, state: ScrState, ticks: int) -> CarState:
+    def read(self, state: ScrState, ticks: int, earlier: ScrState | None = None) -> CarState:
         """
         Take the state at the end of a step.
 
         :param state: the server's
         :param ticks: control ticks since the one before
+        :param earlier: the server's a tick before, by which the yaw rate is computed if the server
+            does not tell it
         :return: the car
         :raises InvalidOption: if the car is where the track is not
         """
@@ -78,15 +91,15 @@ class CarReader:
         raced = self._lap_began + state.distance_from_start
         if abs(state.distance_raced - raced) > self._jump:
             self._lap_began = state.distance_raced - state.distance_from_start
-        return self._car(state, duration)
+        yaw_rate = state.yaw_rate or 0.0
+        if state.yaw_rate is None and earlier is not None:
+            turned = math.remainder(self._place(state).yaw - self._place(earlier).yaw, math.tau)
+            lasted = state.lap_time - earlier.lap_time
+            yaw_rate = turned / (lasted if lasted > 0.0 else self._tick or CONTROL_TICK)
+        return self._car(state, yaw_rate)
 
-    def _car(self, state: ScrState, duration: float) -> CarState:
-        """
-        Put the car together.
-
-        :param state: the server's
-        :param duration: of the step [s]
-        """
+    def _place(self, state: ScrState) -> _Place:
+        """Find out where the server's car is on the track."""
         track = self._track
         distance = state.distance_from_start
         if distance >= track.length:
@@ -102,12 +115,16 @@ class CarReader:
         offset = 0.5 * width * state.track_position
         x, y, heading = track.pose_on(segment, along, offset)
         yaw = math.remainder(heading - state.heading_error, math.tau)
-        turned = 0.0 if self._yaw is None else math.remainder(yaw - self._yaw, math.tau)
-        self._yaw = yaw
+        return _Place(x, y, yaw, offset, width, distance)
+
+    def _car(self, state: ScrState, yaw_rate: float) -> CarState:
+        """Put the car together."""
+        place = self._place(state)
         values = (
-            self._time, x, y, yaw, turned / duration if duration > 0.0 else 0.0,
+            self._time, place.x, place.y, place.yaw, yaw_rate,
             state.speed_x, state.speed_y, state.speed_z, state.height, state.heading_error,
-            offset, width, distance, self._lap_began + state.distance_from_start - self._raced,
+            place.offset, place.width, place.distance,
+            self._lap_began + state.distance_from_start - self._raced,
             state.engine_speed, state.gear, state.fuel, state.damage,
             self._laps, state.lap_time, state.last_lap_time, self._best, state.race_position,
             _read_only(state.wheel_speeds), _read_only(state.range_finders),

@@ -77,6 +77,7 @@ class ScrState(NamedTuple):
     wheel_speeds: tuple[float, ...] = (0.0,) * 4  # [rad/s]
     height: float = 0.0  # [m] of the mass centre above the road
     focus: tuple[float, ...] = (-1.0,) * 5  # [m] range finders in the direction asked for
+    yaw_rate: float | None = None  # [rad/s] left positive; servers but ours do not tell it
 
 
 class ScrAction(NamedTuple):
@@ -97,7 +98,7 @@ class ScrInit(NamedTuple):
 
     angles: tuple[float, ...]  # (19,) [rad] of the range finders, left negative
     start: Start | None = None  # where to begin; servers but ours ignore it
-    exact: bool = False  # whether states shall have all digits; servers but ours ignore it
+    exact: bool = False  # whether states shall have all digits and the yaw rate; as above
     name: str = ""  # of the driver; servers but ours ignore it
 
 
@@ -140,7 +141,8 @@ _TAGS = (
     _Tag(b"z", 1),
     _Tag(b"focus", 5),
 )
-_BY_NAME = {tag.name: (place, tag) for place, tag in enumerate(_TAGS)}
+_YAW_RATE = _Tag(b"yawRate", 1)  # what our server adds for our client
+_BY_NAME = {tag.name: (place, tag) for place, tag in enumerate((*_TAGS, _YAW_RATE))}
 
 # Positions of the words in a message in the server's order, so that no search is needed.
 _BEGINS = [sum(1 + tag.size for tag in _TAGS[:place]) for place in range(len(_TAGS) + 1)]
@@ -149,6 +151,7 @@ _NAMES: tuple[bytes, ...] = tuple(b"(" + tag.name for tag in _TAGS)
 _pick_names = itemgetter(*_BEGINS)
 _pick_numbers = itemgetter(*(word for word in range(_WORDS) if word not in _BEGINS))
 
+_EXTENSION = b"(" + _YAW_RATE.name + b" "
 _GROUP = re.compile(rb"\s*\(([^()]*)\)")
 _STRANGE = re.compile(r"[^A-Za-z0-9_.:+@ -]")
 _SPACE = re.compile(rb"\s*")
@@ -208,7 +211,8 @@ def format_state(state: ScrState) -> bytes:
     :return: a datagram
     """
     groups = []
-    for tag, value in zip(_TAGS, state, strict=True):
+    tags = _TAGS if state.yaw_rate is None else (*_TAGS, _YAW_RATE)
+    for tag, value in zip(tags, state, strict=False):
         numbers = value if isinstance(value, tuple) else (value,)
         words = " ".join(f"{number * tag.scale:g}" for number in numbers)
         groups.append(f"({tag.name.decode()} {words})")
@@ -229,7 +233,7 @@ def format_init(
 
     :param angles: (19,) of the range finders [rad], left negative
     :param start: where to begin, if not on the grid; only our own server does that
-    :param exact: ask for all digits, not six; only our own server does that
+    :param exact: ask for all digits, not six, and for the yaw rate; only our own server does that
     :param name: of the driver, for boards and results; only our own server shows it
     :return: a datagram
     """
@@ -334,8 +338,11 @@ def _parse_ordered(text: bytes) -> ScrState | None:
     :param text: without what follows a zero byte
     :return: the state; ``None`` if the format differs, or the message is broken
     """
+    if b"_" in text:
+        return None
+    text, has_rate, rate = text.partition(_EXTENSION)
     words = text[:-1].replace(b")(", b" (").split(b" ")
-    if len(words) != _WORDS or _pick_names(words) != _NAMES or b"_" in text:
+    if len(words) != _WORDS or _pick_names(words) != _NAMES:
         return None
     tags = len(_TAGS)
     brackets = text.endswith(b")") and text.count(b")(") == tags - 1
@@ -343,14 +350,17 @@ def _parse_ordered(text: bytes) -> ScrState | None:
         return None
     try:
         n = tuple(map(float, _pick_numbers(words)))
+        yaw_rate = float(rate.removesuffix(b")")) if has_rate else None
     except ValueError:
+        return None
+    if has_rate and not (rate.endswith(b")") and math.isfinite(yaw_rate or 0.0)):
         return None
     gear, position = n[6], n[44]
     if not (math.isfinite(sum(n)) and gear.is_integer() and position.is_integer()):
         return None
     state = (
         *n[:6], int(gear), n[7], n[8:44], int(position), n[45] / RPM,
-        n[46] / KMH, n[47] / KMH, n[48] / KMH, n[49:68], n[68], n[69:73], n[73], n[74:],
+        n[46] / KMH, n[47] / KMH, n[48] / KMH, n[49:68], n[68], n[69:73], n[73], n[74:], yaw_rate,
     )  # fmt: skip
     return tuple.__new__(ScrState, state)
 

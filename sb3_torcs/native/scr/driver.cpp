@@ -118,6 +118,7 @@ State Driver::sense() {
     state.track_position = 2.0 * position.to_middle / position.segment->width;
     for (int i = 0; i < 4; i++) state.wheel_speeds[i] = car_->priv.wheel[i].spin;
     state.height = motion.pos.z - road_height(&position);
+    state.yaw_rate = motion.vel.az;
     sense_focus(state);
     if (noise_) add_noise(*noise_, state.range_finders, state.opponents);
     return state;

@@ -4,6 +4,7 @@
 #include <charconv>
 #include <cmath>
 #include <cstring>
+#include <iterator>
 
 namespace torcs::scr {
 namespace {
@@ -43,7 +44,10 @@ constexpr Tag STATE_TAGS[] = {
     {"wheelSpinVel", 4, 1.0},
     {"z", 1, 1.0},
     {"focus", FOCUS_BEAMS, 1.0},
+    {"yawRate", 1, 1.0},
 };
+constexpr std::size_t PROTOCOL_TAGS = 19;  // all but our extensions
+static_assert(std::size(STATE_TAGS) == PROTOCOL_TAGS + 1);
 
 bool is_space(char c) { return c == ' ' || (c >= '\t' && c <= '\r'); }
 
@@ -125,7 +129,8 @@ std::size_t format_state(const State& state, bool exact, char (&text)[LONGEST_ST
     char* end = text;
     const auto value = reinterpret_cast<const char*>(&state);
     std::size_t offset = 0;
-    for (const Tag& tag : STATE_TAGS) {
+    for (std::size_t place = 0; place < (exact ? std::size(STATE_TAGS) : PROTOCOL_TAGS); place++) {
+        const Tag& tag = STATE_TAGS[place];
         *end++ = '(';
         const std::size_t length = std::strlen(tag.name);
         end = std::copy_n(tag.name, length, end);

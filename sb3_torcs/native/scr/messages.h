@@ -15,8 +15,8 @@
 
 namespace torcs::scr {
 
-constexpr int STATE_NUMBERS = 79;
-constexpr std::size_t LONGEST_STATE = 4096;    // [bytes] 79 numbers of 25 characters, and 19 tags
+constexpr int STATE_NUMBERS = 80;
+constexpr std::size_t LONGEST_STATE = 4096;    // [bytes] 80 numbers of 25 characters, and 20 tags
 constexpr std::size_t LONGEST_MESSAGE = 4096;  // [bytes] that a client may send
 
 constexpr std::string_view IDENTIFIED = "***identified***";
@@ -42,6 +42,7 @@ struct State {
     double wheel_speeds[4];     // [rad/s]
     double height;              // [m]
     double focus[FOCUS_BEAMS];  // [m]
+    double yaw_rate;            // [rad/s] left positive (an extension)
 };
 static_assert(sizeof(State) == STATE_NUMBERS * sizeof(double));
 
@@ -63,12 +64,13 @@ struct Action {
 struct Init {
     std::array<double, 19> angles;  // [rad] of range finders, left negative
     std::optional<Start> start{};   // not on the grid (an extension)
-    bool exact = false;             // states shall have all digits (an extension)
+    bool exact = false;             // states shall have all digits, and all extensions
     std::string name{};             // of the driver (an extension): plain characters only
 };
 
 // Writes the state with its closing zero; returns the length with it. Six significant digits, as
-// C++ streams write them; or as many as it takes to read the very numbers.
+// C++ streams write them, and the tags of the protocol; or exactly: as many digits as it takes to
+// read the very numbers, and all tags.
 std::size_t format_state(const State& state, bool exact, char (&text)[LONGEST_STATE]);
 
 // What a client reads where a number is written.
