@@ -189,7 +189,7 @@ def test_a_training_that_diverges_is_told(tmp_path, capfd):
 
 @pytest.mark.parametrize("every", [0, -1, 1.5, True])
 def test_the_interval_is_a_number_of_calls(tmp_path, every):
-    with pytest.raises(InvalidOption, match="every is .*; expected a whole number >= 1"):
+    with pytest.raises(InvalidOption, match=r"every is .*; expected a whole number >= 1"):
         keeper(tmp_path, every)
 
 

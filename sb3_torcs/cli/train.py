@@ -134,9 +134,11 @@ def _closing_words(options: TrainOptions, result: Run) -> list[str]:
         lines += [f"before that, which may be better still: {options.resume}"]
     if result.timesteps < result.wanted:
         lines += ["go on with:", f"  {going_on(options, result)}"]
-    track = result.track[0] if isinstance(result.track, list) else result.track
     words = ["sb3-torcs", "evaluate", str(result.best_model), "--env", options.env]
-    words += ["--track", track] if track else []
+    track, car = (result.env_kwargs.get(name) for name in ("track", "car"))
+    if track:
+        words += ["--track", track[0] if isinstance(track, list) else track]
+    words += ["--car", car[0]] if isinstance(car, list) else []  # evaluate drives one of them
     words += ["--trust"] if options.algo.startswith(SBX) else []  # whose models are pickled
     lines += ["see what it learned:", f"  {shlex.join(words)}"]
     return lines

@@ -211,8 +211,9 @@ def format_state(state: ScrState) -> bytes:
     :return: a datagram
     """
     groups = []
+    values: tuple[Any, ...] = state
     tags = _TAGS if state.yaw_rate is None else (*_TAGS, _YAW_RATE)
-    for tag, value in zip(tags, state, strict=False):
+    for tag, value in zip(tags, values, strict=False):
         numbers = value if isinstance(value, tuple) else (value,)
         words = " ".join(f"{number * tag.scale:g}" for number in numbers)
         groups.append(f"({tag.name.decode()} {words})")

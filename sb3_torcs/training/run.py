@@ -93,7 +93,7 @@ class Run:
     wanted: int  # timesteps that were asked for
     interrupted: bool
     last_model: Path | None  # None after a search of hyperparameters
-    track: Any  # a name, or a list of them
+    env_kwargs: Mapping[str, Any]  # of its environments
 
     @property
     def best_model(self) -> Path | None:
@@ -144,8 +144,8 @@ def train_run(options: TrainOptions) -> Run:
     words = _zoo_words(options, wanted, changed)
     words += ["--log-folder", str(folder), "--tensorboard-log", str(tensorboard)]
     words += ["--trained-agent", str(resume)] if resume else []
-    track = changed["env_kwargs"].get("track")
-    return _run_zoo(options, [*words, *options.zoo_args], entry, wanted, track)
+    drives = changed["env_kwargs"]
+    return _run_zoo(options, [*words, *options.zoo_args], entry, wanted, drives)
 
 
 def _check_numbers(options: TrainOptions) -> None:
@@ -326,7 +326,11 @@ def _with_display(options: TrainOptions, callbacks: Any) -> list[Any]:
 
 
 def _run_zoo(
-    options: TrainOptions, words: list[str], entry: dict[str, Any], wanted: int, track: Any
+    options: TrainOptions,
+    words: list[str],
+    entry: dict[str, Any],
+    wanted: int,
+    env_kwargs: Mapping[str, Any],
 ) -> Run:
     """
     Run the zoo's own training in this process.
@@ -335,7 +339,7 @@ def _run_zoo(
     :param words: of the zoo's command line
     :param entry: of the hyperparameter file
     :param wanted: timesteps to learn from
-    :param track: a name, or a list of them
+    :param env_kwargs: of its environments
     """
     from sb3_torcs.callbacks.progress import Unbroken
     from sb3_torcs.training import manager as zoo_training
@@ -351,20 +355,22 @@ def _run_zoo(
     except (OSError, WorkerLost, TrainingDiverged) as error:
         if not managers:
             raise
-        raise _told(error, _result(managers[0], wanted, track, False), options) from error
-    return _result(managers[0], wanted, track, bool(seen))
+        raise _told(error, _result(managers[0], wanted, env_kwargs, False), options) from error
+    return _result(managers[0], wanted, env_kwargs, bool(seen))
 
 
-def _result(manager: Manager, wanted: int, track: Any, interrupted: bool) -> Run:
+def _result(
+    manager: Manager, wanted: int, env_kwargs: Mapping[str, Any], interrupted: bool
+) -> Run:
     """Read the result of a training from its folder."""
     from sb3_torcs.agents.models import saved_timesteps
 
     if manager.optimize_hyperparameters:
-        return Run(Path(manager.log_path), 0, wanted, interrupted, None, track)
+        return Run(Path(manager.log_path), 0, wanted, interrupted, None, env_kwargs)
     folder = Path(manager.save_path)
     last_model = folder / f"{manager.env_name}.zip"
     timesteps = saved_timesteps(last_model) if last_model.is_file() else 0
-    return Run(folder, timesteps, wanted, interrupted, last_model, track)
+    return Run(folder, timesteps, wanted, interrupted, last_model, env_kwargs)
 
 
 def _told(
