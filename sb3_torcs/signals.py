@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable, Iterator
 from types import FrameType
 
-__all__ = ["answered", "counted_interrupts", "handlers_kept"]
+__all__ = ["answered", "counted_interrupts", "handlers_kept", "held_back"]
 
 
 @contextlib.contextmanager
@@ -28,6 +28,19 @@ def answered(by: Callable[[int, FrameType | None], None], *numbers: int) -> Iter
         for number in numbers:
             signal.signal(number, by)
         yield
+
+
+@contextlib.contextmanager
+def held_back() -> Iterator[None]:
+    """Let Ctrl-C, SIGTERM and SIGHUP wait until something has been done whole."""
+    waiting: list[int] = []
+    signals = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
+    try:
+        with answered(lambda number, _: waiting.append(number), *signals):
+            yield
+    finally:
+        for number in waiting[:1]:
+            signal.raise_signal(number)
 
 
 @contextlib.contextmanager

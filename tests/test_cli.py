@@ -244,6 +244,12 @@ def test_an_interrupt_is_told_by_the_exit_status(capsys, monkeypatch):
     assert run(capsys, "doctor") == (130, "", "sb3-torcs: interrupted\n")
 
 
+def test_a_name_that_is_too_long_is_told(capsys):
+    status, _, err = run(capsys, "evaluate", "x" * 300)
+    assert status == 2
+    assert err.endswith("; type a shorter name\n")
+
+
 def test_only_train_passes_words_on(capsys):
     with pytest.raises(SystemExit) as caught:
         main(["tracks", "--", "--verbose"])

@@ -125,6 +125,16 @@ def test_files_of_others_are_at_their_place_after_the_call_that_wrote_them(tmp_p
     }
 
 
+def test_a_signal_whose_exception_was_lost_ends_the_training_with_the_next_timestep(tmp_path):
+    signals = []
+    callback = KeepCallback(WholeFiles(tmp_path), "last", 50, interrupts=signals)
+    model = tiny(buffer_size=50).learn(3, callback=callback)
+    signals.append(signal.SIGTERM)
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(3, callback=callback, reset_num_timesteps=False)
+    assert model.num_timesteps == 4
+
+
 def test_statistics_are_kept_where_the_zoo_looks_for_them(tmp_path):
     env = VecNormalize(DummyVecEnv([ToyRace]))
     tiny(env, PPO, n_steps=8, batch_size=8).learn(8, callback=keeper(tmp_path))

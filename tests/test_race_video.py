@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,7 +11,7 @@ from stadium import COASTING, stadium, state
 
 from sb3_torcs.cli import main
 from sb3_torcs.cli.race import _followed
-from sb3_torcs.races import protocol, video
+from sb3_torcs.races import protocol, standings, video
 from sb3_torcs.races.entrants import find_entrants
 from sb3_torcs.races.protocol import run_race
 from sb3_torcs.races.video import Footage, Moment, gaps
@@ -136,6 +137,24 @@ def test_ctrl_c_draws_what_is_over_and_sigterm_ends(
     assert main([*words, "--video", str(file)]) == 130
     assert said in capsys.readouterr().err
     assert drawn == ([file] if ends is KeyboardInterrupt else [])
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_while_the_figures_are_computed_loses_none(number, monkeypatch, capsys, game):
+    computed = standings.driver_figures
+
+    def figures(races):
+        signal.raise_signal(number)
+        return computed(races)
+
+    monkeypatch.setattr(standings, "driver_figures", figures)
+    words = ["race", "bt", "lliaw", "--track", "g-track-1", "--laps", "1", "--races", "1"]
+    if number == signal.SIGINT:
+        assert main(words) == 130
+    else:
+        with pytest.raises(SystemExit):
+            main(words)
+    assert "last race, seed 0" in capsys.readouterr().out
 
 
 def test_a_video_that_is_no_mp4_is_refused_before_any_race(capsys):

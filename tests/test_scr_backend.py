@@ -291,12 +291,9 @@ def test_a_yaw_rate_that_is_not_told_is_that_of_the_last_tick():
     reader.begin(parse_state(over_scr._message))
     for _ in range(30):
         car = over_scr.step(Controls(0.3, 0.5, 0.0), 5)
-        state, earlier = (
-            parse_state(message)._replace(yaw_rate=None)
-            for message in (over_scr._message, over_scr._earlier)
-        )
+        state = parse_state(over_scr._message)._replace(yaw_rate=None)
         told.append(car.yaw_rate)
-        found.append(reader.read(state, 5, earlier).yaw_rate)
+        found.append(reader.read(state, 5, over_scr._earlier).yaw_rate)
     assert max(told) > 0.2
     assert found == pytest.approx(told, abs=0.05)
     over_scr.close()

@@ -191,8 +191,7 @@ class ScrBackend:
             driven = self._hold(client, controls, ticks)
             if driven:
                 state = parse_state(self._message)
-                earlier = parse_state(self._earlier) if state.yaw_rate is None else None
-                self._state = self._reader.read(state, driven, earlier)
+                self._state = self._reader.read(state, driven, self._earlier)
             if driven < ticks:
                 self._state = standing(self._state, ticks - driven)
         except ServerLost as error:
@@ -294,26 +293,18 @@ class ScrBackend:
                 return
         self._hang_up()
         if self._own:
-            self._launch()
-        host, port = self._address
+            (bound,) = open_ports(1)  # any that is free
+            with bound:
+                self._process = start_server(self._game, self._race, [bound])
+                self._address = bound.getsockname()
         manners: dict[str, Any] = {
             "patience": self.patience, "silence": SILENCE, "latencies": self.latencies,
         }  # fmt: skip
         if self._own:
             manners = {"patience": PATIENCE, "pause": PAUSE}
         manners |= {"name": self.driver_name, "watch": self.watch}
-        self._client = ScrClient(host, port, self.range_finder_angles, **manners)
+        self._client = ScrClient(*self._address, self.range_finder_angles, **manners)
         self._client.identify(start)
-
-    def _launch(self) -> None:
-        """Start a game of our own, on any port that is free."""
-        sockets = open_ports(1)
-        try:
-            self._process = start_server(self._game, self._race, sockets)
-            self._address = sockets[0].getsockname()
-        finally:
-            for bound in sockets:
-                bound.close()
 
     def _watch(self) -> None:
         """Raise if the game of our own has ended."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import errno
 import os
 import signal
 import sys
@@ -101,7 +102,9 @@ def _run(args: argparse.Namespace) -> int:
         return USAGE_ERROR
     except OSError as error:
         where = error.filename or "the output"
-        said = f"{error.strerror or error}: {where}; make room, or choose another folder"
+        too_long = error.errno == errno.ENAMETOOLONG
+        remedy = "type a shorter name" if too_long else "make room, or choose another folder"
+        said = f"{error.strerror or error}: {where}; {remedy}"
         print(f"sb3-torcs: {said}", file=sys.stderr)
         _drop_output()
         return USAGE_ERROR

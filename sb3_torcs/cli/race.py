@@ -20,6 +20,7 @@ from sb3_torcs.cli.common import (
     warn_unless_known,
 )
 from sb3_torcs.files import writable_file
+from sb3_torcs.signals import held_back
 
 if TYPE_CHECKING:
     from sb3_torcs.races.entrants import Entrant
@@ -125,13 +126,8 @@ def run(args: argparse.Namespace) -> int:
         log = DriveLog() if "telemetry" in files or "report" in files else None
         footage = _footage(args)
         races, at_once = _held(args, entrants, log, footage)
-    for race in races:
-        for driver, why in race.failures.items():
-            print(f"sb3-torcs: race {race.seed}: {driver} is out: {why}", file=sys.stderr)
-    if args.json:
-        print_json(_as_json(args, races))
-    else:
-        _show(races)
+    with held_back():  # to compute the figures takes a while
+        _tell(args, races)
     stopped = len(races) < args.races
     if stopped:
         _drop(files, NEED_THE_LAST, "the last race was not held")
@@ -146,6 +142,18 @@ def run(args: argparse.Namespace) -> int:
         for what, path in files.items():
             print(f"{what}: {path}")
     return INTERRUPTED if stopped else 0
+
+
+def _tell(args: argparse.Namespace, races: list[Race]) -> None:
+    """Print what came of the races."""
+    for race in races:
+        for driver, why in race.failures.items():
+            print(f"sb3-torcs: race {race.seed}: {driver} is out: {why}", file=sys.stderr)
+    if args.json:
+        print_json(_as_json(args, races))
+    else:
+        _show(races)
+    sys.stdout.flush()
 
 
 def _entrants(args: argparse.Namespace) -> list[Entrant]:
@@ -310,7 +318,7 @@ def _show(races: list[Race]) -> None:
         )
         for f in driver_figures(races)
     ]))  # fmt: skip
-    print(f"\nrace {races[-1].seed}")
+    print(f"\nlast race, seed {races[-1].seed}")
     print(table(LAST_RACE, [
         (
             "out" if s.out else str(s.place), s.driver, str(s.grid_slot), str(s.laps),

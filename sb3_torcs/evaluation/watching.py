@@ -90,12 +90,10 @@ class Show:
         if self.robot is not None:
             arguments = window_arguments(self.game, window)
             return GameProcess(self.game, self.race, check=check_track, **arguments)
-        sockets = open_ports(1)
-        port = sockets[0].getsockname()[1]
-        try:
-            process = start_server(self.game, self.race, sockets, window=window)
-        finally:
-            sockets[0].close()
+        (bound,) = open_ports(1)
+        with bound:
+            port = bound.getsockname()[1]
+            process = start_server(self.game, self.race, [bound], window=window)
         try:
             settings = {"track": self.track, "host": "127.0.0.1", "port": port, **self.settings}
             self.agent = Agent(self.model, settings, trust=self.trust, name=self.driver_name)

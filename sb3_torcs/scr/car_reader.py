@@ -9,7 +9,7 @@ import numpy as np
 
 from sb3_torcs.car import CONTROL_TICK, NO_RACE, CarState, FloatArray
 from sb3_torcs.errors import InvalidOption
-from sb3_torcs.scr.protocol import ScrState
+from sb3_torcs.scr.protocol import ScrState, parse_state
 from sb3_torcs.tracks.generator import plain_segment
 from sb3_torcs.tracks.track import WIDTH_END, WIDTH_START, Track
 
@@ -66,14 +66,14 @@ class CarReader:
         self._lap_began = state.distance_raced - state.distance_from_start
         return self._car(state, state.yaw_rate or 0.0)
 
-    def read(self, state: ScrState, ticks: int, earlier: ScrState | None = None) -> CarState:
+    def read(self, state: ScrState, ticks: int, earlier: bytes | None = None) -> CarState:
         """
         Take the state at the end of a step.
 
         :param state: the server's
         :param ticks: control ticks since the one before
-        :param earlier: the server's a tick before, by which the yaw rate is computed if the server
-            does not tell it
+        :param earlier: the server's message of a tick before, by which the yaw rate is computed if
+            the server does not tell it
         :return: the car
         :raises InvalidOption: if the car is where the track is not
         """
@@ -93,8 +93,9 @@ class CarReader:
             self._lap_began = state.distance_raced - state.distance_from_start
         yaw_rate = state.yaw_rate or 0.0
         if state.yaw_rate is None and earlier is not None:
-            turned = math.remainder(self._place(state).yaw - self._place(earlier).yaw, math.tau)
-            lasted = state.lap_time - earlier.lap_time
+            then = parse_state(earlier)
+            turned = math.remainder(self._place(state).yaw - self._place(then).yaw, math.tau)
+            lasted = state.lap_time - then.lap_time
             yaw_rate = turned / (lasted if lasted > 0.0 else self._tick or CONTROL_TICK)
         return self._car(state, yaw_rate)
 

@@ -87,6 +87,8 @@ class KeepCallback(BaseCallback):
     :param name: of the model's file, without ``.zip``; and of the folder of the statistics
     :param every: calls between two savings
     :param others: calls between two files of each callback that writes aside, too
+    :param interrupts: signals so far: with one of them the training ends, also if Python has
+        ignored the ``KeyboardInterrupt`` that it raised, as it does in code that C calls
     :param verbose: as in ``BaseCallback``
     """
 
@@ -96,6 +98,7 @@ class KeepCallback(BaseCallback):
         name: str,
         every: int,
         others: Sequence[int] = (),
+        interrupts: Sequence[int] = (),
         *,
         verbose: int = 0,
     ) -> None:
@@ -105,11 +108,14 @@ class KeepCallback(BaseCallback):
         self.name = name
         self.every = every
         self._others = others
+        self._interrupts = interrupts
 
     def _init_callback(self) -> None:
         (self.files.aside / self.name).mkdir(parents=True, exist_ok=True)
 
     def _on_step(self) -> bool:
+        if self._interrupts:
+            raise KeyboardInterrupt
         if any(self.n_calls % other == 0 for other in self._others):
             self.files.settle()
         if self.n_calls % self.every == 0:

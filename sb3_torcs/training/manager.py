@@ -17,7 +17,7 @@ import shutil
 import sys
 import tempfile
 import types
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -91,7 +91,12 @@ def build(algo: str, env_id: str, entry: Mapping[str, Any], *, seed: int = 0) ->
 
 
 def train(
-    algo: str, env_id: str, entry: Mapping[str, Any], words: list[str], managers: list[Manager]
+    algo: str,
+    env_id: str,
+    entry: Mapping[str, Any],
+    words: list[str],
+    managers: list[Manager],
+    interrupts: Sequence[int] = (),
 ) -> None:
     """
     Run the zoo's own training in this process.
@@ -101,10 +106,12 @@ def train(
     :param entry: of a hyperparameter file
     :param words: further arguments of the zoo's command line
     :param managers: gets the manager of the training, once there is one
+    :param interrupts: gets the signals that are to end the training
     """
 
     def manager(*arguments: Any, **keywords: Any) -> Manager:
         managers.append(Manager(*arguments, **keywords))
+        managers[-1].interrupts = interrupts
         return managers[-1]
 
     ALGOS.setdefault(algo, algorithm_class(algo))  # those of SBX, as SBX's documentation does
@@ -208,6 +215,9 @@ class Manager(_Threaded):
     :raises InvalidOption: if the zoo cannot search the algorithm's hyperparameters, and is to
     """
 
+    interrupts: Sequence[int] = ()
+    """Signals so far; with one of them the training ends."""
+
     def __init__(self, *arguments: Any, **keywords: Any) -> None:
         log_folder = arguments[3]
         with _alone(Path(log_folder) / arguments[1]):
@@ -283,7 +293,7 @@ class Manager(_Threaded):
         every = self.eval_freq
         if every <= 0:
             every = max(self.n_timesteps // SAVINGS // self.n_envs, 1)
-        self.keeper = KeepCallback(self.files, self.env_name, every, writing)
+        self.keeper = KeepCallback(self.files, self.env_name, every, writing, self.interrupts)
         self.callbacks.append(self.keeper)
 
     def _write_aside(self, callback: EvalCallback) -> bool:

@@ -351,7 +351,7 @@ def _run_zoo(
     redirected = contextlib.redirect_stdout(out), contextlib.redirect_stderr(err)
     try:
         with redirected[0], redirected[1], counted_interrupts(2, SAVING) as seen:
-            zoo_training.train(options.algo, options.env, entry, words, managers)
+            zoo_training.train(options.algo, options.env, entry, words, managers, seen)
     except (OSError, WorkerLost, TrainingDiverged) as error:
         if not managers:
             raise
@@ -359,9 +359,7 @@ def _run_zoo(
     return _result(managers[0], wanted, env_kwargs, bool(seen))
 
 
-def _result(
-    manager: Manager, wanted: int, env_kwargs: Mapping[str, Any], interrupted: bool
-) -> Run:
+def _result(manager: Manager, wanted: int, env_kwargs: Mapping[str, Any], interrupted: bool) -> Run:
     """Read the result of a training from its folder."""
     from sb3_torcs.agents.models import saved_timesteps
 
