@@ -30,12 +30,12 @@ def speed_along(before: CarState, after: CarState, controls: Controls) -> float:
 
 
 def speed_across(before: CarState, after: CarState, controls: Controls) -> float:
-    """``|Vx sin θ|`` [m/s]: speed across the road, of the post's reward."""
+    """Vx sin θ, without its sign [m/s]: speed across the road, of the post's reward."""
     return abs(after.speed_x * math.sin(after.heading_error))
 
 
 def speed_off_axis(before: CarState, after: CarState, controls: Controls) -> float:
-    """``|Vx · trackPos|`` [m/s]: speed away from the middle of the road, of the post's reward."""
+    """Vx · trackPos, without its sign [m/s]: speed off the middle of the road, of the post's reward."""
     return abs(after.speed_x * after.track_position)
 
 
