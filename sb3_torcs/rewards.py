@@ -35,7 +35,7 @@ def speed_across(before: CarState, after: CarState, controls: Controls) -> float
 
 
 def speed_off_axis(before: CarState, after: CarState, controls: Controls) -> float:
-    """Vx · trackPos, without its sign [m/s]: speed off the middle of the road, of the post's reward."""
+    """Vx · trackPos, without its sign [m/s]: speed off the road's middle, of the post's reward."""
     return abs(after.speed_x * after.track_position)
 
 
