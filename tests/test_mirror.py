@@ -15,7 +15,7 @@ from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.utils import set_random_seed
-from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 from toy import ToyRace
 
 from sb3_torcs.callbacks import MirrorCallback
@@ -289,6 +289,11 @@ def test_stacked_frames_are_not_taken_for_other_sensors(sensors, frames):
     with pytest.raises(InvalidOption, match="take out what changes their bounds or size"):
         MirrorVecEnv(cars)
     MirrorVecEnv(cars.venv).close()
+
+
+def test_other_environments_have_no_mirror_image():
+    with pytest.raises(InvalidOption, match="have a known mirror image"):
+        MirrorVecEnv(DummyVecEnv([lambda: gym.make("CartPole-v1")]))
 
 
 def test_normalized_observations_have_no_mirror_image():

@@ -11,7 +11,7 @@ from conftest import ScriptedBackend
 from sb3_torcs.car import Controls, Start
 from sb3_torcs.envs.racing import RacingEnv
 from sb3_torcs.envs.starts import Starts
-from sb3_torcs.errors import CarLost, EnvClosed, InvalidAction, InvalidOption
+from sb3_torcs.errors import CarLost, EnvClosed, InvalidAction, InvalidOption, StartBlocked
 from sb3_torcs.rewards import TERMS, safe_speed
 
 GAS = np.array([0.0, 1.0, 0.0], np.float32)
@@ -215,7 +215,7 @@ def test_an_episode_whose_drawn_place_is_a_wall_begins_on_the_grid(oval):
     class Walled(ScriptedBackend):
         def reset(self, rng, start):
             if start is not None:
-                raise InvalidOption("agent would stand in a wall")
+                raise StartBlocked("agent would stand in a wall")
             return super().reset(rng, start)
 
     env = RacingEnv(Walled(oval), start="random")

@@ -322,7 +322,8 @@ def _show(races: list[Race]) -> None:
     print(table(LAST_RACE, [
         (
             "out" if s.out else str(s.place), s.driver, str(s.grid_slot), str(s.laps),
-            f"{s.time:.3f}", UNKNOWN if s.best_lap is None else f"{s.best_lap:.3f}",
+            f"{s.time:.3f}" if s.laps else UNKNOWN,
+            UNKNOWN if s.best_lap is None else f"{s.best_lap:.3f}",
             f"{s.damage:.0f}", UNKNOWN if s.contacts is None else str(s.contacts),
         )
         for s in races[-1].standings

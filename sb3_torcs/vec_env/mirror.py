@@ -39,9 +39,9 @@ class MirrorVecEnv(VecEnvWrapper):
                 "MirrorVecEnv is around VecNormalize, whose statistics differ between left and "
                 "right; put it inside: VecNormalize(MirrorVecEnv(venv))"
             )
+        order, signs = mirror_image(venv.observation_space)
         for angles in venv.get_attr("range_finder_angles"):
             check_angles(angles, "MirrorVecEnv")
-        order, signs = mirror_image(venv.observation_space)
         self._order, self._signs = order.numpy(), signs.numpy()
 
     def reset(self) -> VecEnvObs:
