@@ -82,9 +82,7 @@ class Steps:
     rate: float  # factor on the learning rate at the beginning, from which it adapts
     kl: float  # target of the divergence per update, at the beginning [nats]
     last_kl: float  # at the end [nats]
-    log_std: tuple[
-        float, float
-    ]  # of steering and pedal, with which it tries things at the beginning
+    log_std: tuple[float, float]  # of steering and pedal, with which it tries things at first
 
 
 ALONE = Steps(1.0, 0.012, 0.003, (-1.0, -0.3))  # of who does not know how to drive
