@@ -82,9 +82,10 @@ def summary(drives: list[Drive]) -> str:
     )
     before_all = sum(drive.gap < 0 for drive in whole)
     gap = statistics.median(drive.gap for drive in drives)  # without all laps it is infinite
+    told = f"{gap:+.1f} %" if gap < inf else "unknown, since half of the tracks are not completed"
     return (
         f"completes {len(whole)} of {len(drives)}, {clean} without damage; median gap to the best "
-        f"robot {gap:+.1f} %; faster than bt on {before_bt}, than every robot on {before_all}"
+        f"robot {told}; faster than bt on {before_bt}, than every robot on {before_all}"
     )
 
 
