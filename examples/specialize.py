@@ -23,8 +23,8 @@ from sb3_torcs.callbacks import (
     LeanUpdatesCallback,
     RacingProgressCallback,
     RewardCallback,
-    ValuesOnlyCallback,
 )
+from sb3_torcs.callbacks.learning import learn_values
 from sb3_torcs.errors import ends_in_a_line
 from sb3_torcs.vec_env import MirrorVecEnv, TorcsVecEnv
 
@@ -125,15 +125,7 @@ def go_on(args: argparse.Namespace, tracks: list[str], settings: Settings) -> Pa
     known = PPO.load(file, device="cpu")
     model = make_model(known, learned_weights(file), cars, args, settings)
     if args.together:
-        model.learn(
-            args.values,
-            callback=[
-                ValuesOnlyCallback(),
-                RacingProgressCallback(),
-                LeanUpdatesCallback(),
-                AdaptiveLearningRateCallback(kl=0.03),
-            ],
-        )
+        learn_values(model, args.values)
         model = make_model(known, model.policy.state_dict(), cars, args, settings)
     with th.no_grad():
         model.policy.log_std.copy_(th.tensor(settings.noise))

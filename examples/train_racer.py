@@ -25,8 +25,8 @@ from sb3_torcs.callbacks import (
     AdaptiveLearningRateCallback,
     LeanUpdatesCallback,
     RacingProgressCallback,
-    ValuesOnlyCallback,
 )
+from sb3_torcs.callbacks.learning import learn_values
 from sb3_torcs.errors import ends_in_a_line
 from sb3_torcs.policies import BoundedPolicy
 from sb3_torcs.sensors import feature_slices
@@ -264,15 +264,7 @@ def with_values(
         return weights
     model = make_model(cars, args.seed, 256, 0.99, settings, units)
     model.policy.load_state_dict({**model.policy.state_dict(), **weights})
-    model.learn(
-        args.values,
-        callback=[
-            ValuesOnlyCallback(),
-            RacingProgressCallback(),
-            LeanUpdatesCallback(),
-            AdaptiveLearningRateCallback(kl=0.03),
-        ],
-    )
+    learn_values(model, args.values)
     return model.policy.state_dict()
 
 

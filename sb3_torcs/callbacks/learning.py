@@ -15,6 +15,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_torcs.callbacks.progress import RacingProgressCallback
 from sb3_torcs.callbacks.switches import require_method
 from sb3_torcs.car import check_count, is_number
 from sb3_torcs.errors import InvalidOption, renamed
@@ -31,6 +32,7 @@ __all__ = [
     "LeanUpdatesCallback",
     "MirrorCallback",
     "ValuesOnlyCallback",
+    "learn_values",
 ]
 
 RATE_STEP = 1.5  # [-] by which the learning rate changes after an update
@@ -230,8 +232,8 @@ class ValuesOnlyCallback(BaseCallback):
     Put the policy of PPO or A2C back after each update, so that only its value function learns.
 
     A shipped agent or a student drives, but comes without a value function, and a new one would
-    spoil it. So let the value function learn first, in a training of its own; in a second training,
-    without this callback, both learn.
+    spoil it. So let the value function learn first, in a training of its own, as
+    :func:`learn_values` does; in a second training, without this callback, both learn.
 
     :param verbose: as in ``BaseCallback``
     :raises InvalidOption: if the algorithm is another
@@ -262,6 +264,24 @@ class ValuesOnlyCallback(BaseCallback):
 
     def _on_step(self) -> bool:
         return True
+
+
+def learn_values(model: PPO, timesteps: int) -> None:
+    """
+    Let the value function of a model learn, and leave its policy as it is; show the progress.
+
+    :param model: with a policy that drives already
+    :param timesteps: to learn from
+    """
+    model.learn(
+        timesteps,
+        callback=[
+            ValuesOnlyCallback(),
+            RacingProgressCallback(),
+            LeanUpdatesCallback(),
+            AdaptiveLearningRateCallback(kl=0.03),
+        ],
+    )
 
 
 class MirrorCallback(_WhileLearning):
