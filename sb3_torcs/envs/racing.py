@@ -352,10 +352,22 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         :return: the arguments of the calls of the backend's ``step``: one, or two if the controls
             arrive during the timestep
         """
+        self.read_action(action)
+        return self.held_parts()
+
+    def read_action(self, action: npt.NDArray[np.float32]) -> None:
+        """
+        Take note of an action, without letting it set out: the next one may come instead.
+
+        :param action: as of ``step``
+        """
         self.check_ready()
         assert self.car is not None, "check_ready raises before the first reset"
         asked = controls_from_action(action, self.layout)
         self._controls = self.aids.change(asked, self.car)
+
+    def held_parts(self) -> list[Part]:
+        """Let the controls set out that were asked for; return as ``begin_step``."""
         at_once = (self._controls, self.action_repeat)
         return self.delay.hold(self._controls) if self.delay.ticks else [at_once]
 

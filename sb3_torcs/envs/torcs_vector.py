@@ -109,18 +109,11 @@ class TorcsVectorEnv(SyncVectorEnv):
                 f"{self.action_space.shape}: take them from envs.action_space.sample()"
             )
         anew = self._begin_anew()
-        # All before any drives: a wrong one leaves all races where they are.
-        waiting = [env.delay.waiting for env in self.envs]
-        try:
-            parts = {
-                index: env.begin_step(rows[index])
-                for index, env in enumerate(self.envs)
-                if not anew[index]
-            }
-        except InvalidAction:
-            for env, before in zip(self.envs, waiting, strict=True):
-                env.delay.waiting = before
-            raise
+        going = [index for index in range(self.num_envs) if not anew[index]]
+        # All before any sets out: a wrong one leaves all races where they are.
+        for index in going:
+            self.envs[index].read_action(rows[index])
+        parts = {index: self.envs[index].held_parts() for index in going}
         try:
             for index, (held, *_) in parts.items():
                 self._fleet.put(index, present_world(self.envs[index].backend))

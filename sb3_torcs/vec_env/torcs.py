@@ -134,8 +134,9 @@ class TorcsVecEnv(DummyVecEnv):
         most
     :param env_id: ``"Torcs-v0"`` or ``"TorcsLite-v0"``
     :param env_kwargs: as of ``gym.make``, the same for all races; with several agents those of
-        :func:`~sb3_torcs.envs.torcs_race.make_race`. ``max_episode_steps`` may be a list, which
-        goes round the races: ``[450, 1400]`` lets every other race practise the start
+        :func:`~sb3_torcs.envs.torcs_race.make_race`, but for ``flagged``.
+        ``max_episode_steps`` may be a list, which goes round the races: ``[450, 1400]`` lets every
+        other race practise the start
     :raises InvalidOption: if an option has a value that is not allowed
     """
 
@@ -327,7 +328,7 @@ class _Race:
             )
         self.racing = env.unwrapped
         kind = type(self.racing)
-        for name in ("step", "begin_step", "finish_step"):
+        for name in ("step", "begin_step", "read_action", "held_parts", "finish_step"):
             if getattr(kind, name) is not getattr(RacingEnv, name):
                 raise InvalidOption(
                     f"{kind.__name__} has a {name} of its own, which TorcsVecEnv would not call in "
