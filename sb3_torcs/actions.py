@@ -17,7 +17,7 @@ __all__ = [
     "ACTIONS",
     "ACTION_HIGH",
     "ACTION_LOW",
-    "BRAKING",
+    "BRAKE_THRESHOLD",
     "GEARBOXES",
     "GEARS",
     "PEDALS",
@@ -56,8 +56,8 @@ car is, so that the motor has its power from the start.
 GEARS = 6
 """Forward gears of a car that says nothing else."""
 
-BRAKING = 0.05
-"""[-] Brake from which a car counts as braking; networks seldom give exactly 0."""
+BRAKE_THRESHOLD = 0.05
+"""[-] Brake above which a car counts as braking; networks seldom give exactly 0."""
 
 _DIVERGED = (
     "a network that gives nan has diverged: lower learning_rate or check the rewards and "

@@ -48,7 +48,7 @@ def counted_interrupts(passed: int, message: str) -> Iterator[list[int]]:
     """
     Count Ctrl-C and SIGTERM. All but one raise ``KeyboardInterrupt``, as usual.
 
-    :param passed: which of them does nothing but print a message, from 1
+    :param passed: the number, from 1, of the one that only prints a message
     :param message: for standard error
     :return: the signals so far
     """

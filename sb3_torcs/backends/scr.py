@@ -190,8 +190,7 @@ class ScrBackend:
         try:
             driven = self._hold(client, controls, ticks)
             if driven:
-                state = parse_state(self._message)
-                self._state = self._reader.read(state, driven, self._earlier)
+                self._state = self._reader.read(parse_state(self._message), driven, self._earlier)
             if driven < ticks:
                 self._state = standing(self._state, ticks - driven)
         except ServerLost as error:

@@ -24,7 +24,7 @@ from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.logger import Image, Logger, TensorBoardOutputFormat
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_torcs.actions import ACTIONS, BRAKING, PEDALS, ActionLayout, layout_of_width
+from sb3_torcs.actions import ACTIONS, BRAKE_THRESHOLD, PEDALS, ActionLayout, layout_of_width
 from sb3_torcs.agents.rollout import drive
 from sb3_torcs.car import CarState, check_count
 from sb3_torcs.errors import InvalidOption, renamed
@@ -232,7 +232,7 @@ class _Steps:
         low, high = limits
         free = ((low < actions) & (actions < high)).sum(axis=0).tolist()
         self.count += len(actions)
-        self.braking += sum(layout.read(row)[2] > BRAKING for row in actions.tolist())
+        self.braking += sum(layout.read(row)[2] > BRAKE_THRESHOLD for row in actions.tolist())
         self.saturated = [
             n + len(actions) - inside for n, inside in zip(self.saturated, free, strict=True)
         ]

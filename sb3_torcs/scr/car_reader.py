@@ -64,7 +64,7 @@ class CarReader:
         # The distance since the start grows but has six digits. The distance on the lap is more
         # precise, so the first only gives the number of laps to add.
         self._lap_began = state.distance_raced - state.distance_from_start
-        return self._car(state, state.yaw_rate or 0.0)
+        return self._car(state, self._place(state), state.yaw_rate or 0.0)
 
     def read(self, state: ScrState, ticks: int, earlier: bytes | None = None) -> CarState:
         """
@@ -91,13 +91,13 @@ class CarReader:
         raced = self._lap_began + state.distance_from_start
         if abs(state.distance_raced - raced) > self._jump:
             self._lap_began = state.distance_raced - state.distance_from_start
-        yaw_rate = state.yaw_rate or 0.0
+        place, yaw_rate = self._place(state), state.yaw_rate or 0.0
         if state.yaw_rate is None and earlier is not None:
             then = parse_state(earlier)
-            turned = math.remainder(self._place(state).yaw - self._place(then).yaw, math.tau)
+            turned = math.remainder(place.yaw - self._place(then).yaw, math.tau)
             lasted = state.lap_time - then.lap_time
             yaw_rate = turned / (lasted if lasted > 0.0 else self._tick or CONTROL_TICK)
-        return self._car(state, yaw_rate)
+        return self._car(state, place, yaw_rate)
 
     def _place(self, state: ScrState) -> _Place:
         """Find out where the server's car is on the track."""
@@ -118,9 +118,8 @@ class CarReader:
         yaw = math.remainder(heading - state.heading_error, math.tau)
         return _Place(x, y, yaw, offset, width, distance)
 
-    def _car(self, state: ScrState, yaw_rate: float) -> CarState:
+    def _car(self, state: ScrState, place: _Place, yaw_rate: float) -> CarState:
         """Put the car together."""
-        place = self._place(state)
         values = (
             self._time, place.x, place.y, place.yaw, yaw_rate,
             state.speed_x, state.speed_y, state.speed_z, state.height, state.heading_error,

@@ -142,7 +142,8 @@ _TAGS = (
     _Tag(b"focus", 5),
 )
 _YAW_RATE = _Tag(b"yawRate", 1)  # what our server adds for our client
-_BY_NAME = {tag.name: (place, tag) for place, tag in enumerate((*_TAGS, _YAW_RATE))}
+_ALL_TAGS = (*_TAGS, _YAW_RATE)
+_BY_NAME = {tag.name: (place, tag) for place, tag in enumerate(_ALL_TAGS)}
 
 # Positions of the words in a message in the server's order, so that no search is needed.
 _BEGINS = [sum(1 + tag.size for tag in _TAGS[:place]) for place in range(len(_TAGS) + 1)]
@@ -151,7 +152,7 @@ _NAMES: tuple[bytes, ...] = tuple(b"(" + tag.name for tag in _TAGS)
 _pick_names = itemgetter(*_BEGINS)
 _pick_numbers = itemgetter(*(word for word in range(_WORDS) if word not in _BEGINS))
 
-_EXTENSION = b"(" + _YAW_RATE.name + b" "
+_YAW_RATE_BEGINS = b"(" + _YAW_RATE.name + b" "
 _GROUP = re.compile(rb"\s*\(([^()]*)\)")
 _STRANGE = re.compile(r"[^A-Za-z0-9_.:+@ -]")
 _SPACE = re.compile(rb"\s*")
@@ -211,9 +212,9 @@ def format_state(state: ScrState) -> bytes:
     :return: a datagram
     """
     groups = []
-    values: tuple[Any, ...] = state
-    tags = _TAGS if state.yaw_rate is None else (*_TAGS, _YAW_RATE)
-    for tag, value in zip(tags, values, strict=False):
+    for tag, value in zip(_ALL_TAGS, state, strict=True):
+        if value is None:  # the yaw rate
+            continue
         numbers = value if isinstance(value, tuple) else (value,)
         words = " ".join(f"{number * tag.scale:g}" for number in numbers)
         groups.append(f"({tag.name.decode()} {words})")
@@ -341,7 +342,9 @@ def _parse_ordered(text: bytes) -> ScrState | None:
     """
     if b"_" in text:
         return None
-    text, has_rate, rate = text.partition(_EXTENSION)
+    text, has_rate, rate = text.partition(_YAW_RATE_BEGINS)
+    if has_rate and not rate.endswith(b")"):
+        return None
     words = text[:-1].replace(b")(", b" (").split(b" ")
     if len(words) != _WORDS or _pick_names(words) != _NAMES:
         return None
@@ -351,13 +354,13 @@ def _parse_ordered(text: bytes) -> ScrState | None:
         return None
     try:
         n = tuple(map(float, _pick_numbers(words)))
-        yaw_rate = float(rate.removesuffix(b")")) if has_rate else None
+        yaw_rate = float(rate[:-1]) if has_rate else None
     except ValueError:
         return None
-    if has_rate and not (rate.endswith(b")") and math.isfinite(yaw_rate or 0.0)):
-        return None
     gear, position = n[6], n[44]
-    if not (math.isfinite(sum(n)) and gear.is_integer() and position.is_integer()):
+    if not (
+        math.isfinite(sum(n) + (yaw_rate or 0.0)) and gear.is_integer() and position.is_integer()
+    ):
         return None
     state = (
         *n[:6], int(gear), n[7], n[8:44], int(position), n[45] / RPM,

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_torcs.actions import BRAKING
+from sb3_torcs.actions import BRAKE_THRESHOLD
 from sb3_torcs.car import FloatArray
 from sb3_torcs.errors import DriveFileError
 from sb3_torcs.telemetry.corners import Corner, corners_of, stretches
@@ -174,7 +174,7 @@ def _braking_point(own: SampledLap, grid: FloatArray, begin: float, corner: Corn
     inside = (grid >= corner.begin) & (grid <= corner.end)
     slowest = grid[inside][own.channels["speed"][inside].argmin()]
     before = (grid >= begin) & (grid <= slowest)
-    braking = grid[before & (own.channels["brake"] > BRAKING)]
+    braking = grid[before & (own.channels["brake"] > BRAKE_THRESHOLD)]
     return float(braking[0]) if braking.size else None
 
 

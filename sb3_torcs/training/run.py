@@ -144,8 +144,8 @@ def train_run(options: TrainOptions) -> Run:
     words = _zoo_words(options, wanted, changed)
     words += ["--log-folder", str(folder), "--tensorboard-log", str(tensorboard)]
     words += ["--trained-agent", str(resume)] if resume else []
-    drives = changed["env_kwargs"]
-    return _run_zoo(options, [*words, *options.zoo_args], entry, wanted, drives)
+    words += options.zoo_args
+    return _run_zoo(options, words, entry, wanted, changed["env_kwargs"])
 
 
 def _check_numbers(options: TrainOptions) -> None:
