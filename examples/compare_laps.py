@@ -12,14 +12,15 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
+from sb3_torcs.actions import BRAKE_THRESHOLD
 from sb3_torcs.agents.models import driver_record, load_driver
 from sb3_torcs.agents.robots import race
-from sb3_torcs.callbacks.metrics import BRAKING
+from sb3_torcs.car import KMH
 from sb3_torcs.errors import ends_in_a_line
 from sb3_torcs.evaluation.protocol import drive, race_environment
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.tracks.catalogue import load_track
-from sb3_torcs.tracks.plot import KMH, edges
+from sb3_torcs.tracks.plot import edges
 
 COLOURS = ("tab:blue", "tab:red", "tab:green", "tab:purple", "tab:orange")
 BENDS = 3  # that are shown from above
@@ -122,7 +123,7 @@ def sharp_bends(track):
 def where_it_brakes(lap, bend):
     """Shares of its time on the brake: shortly before a bend, and in one."""
     ahead = np.any([np.roll(bend, -step) for step in range(int(BEFORE / STEP))], axis=0)
-    braking = (lap.distance[lap.brake > BRAKING] / STEP).astype(int) % len(bend)
+    braking = (lap.distance[lap.brake > BRAKE_THRESHOLD] / STEP).astype(int) % len(bend)
     return np.mean((ahead & ~bend)[braking]), np.mean(bend[braking])
 
 
@@ -179,8 +180,9 @@ def main() -> None:
     laps = [best_lap(name, args.track) for name in args.drivers]
     for lap in laps:
         before, within = where_it_brakes(lap, bend)
+        share = np.mean(lap.brake > BRAKE_THRESHOLD)
         print(
-            f"{lap.name}: {lap.seconds:.3f} s, on the brake in {np.mean(lap.brake > BRAKING):.0%} "
+            f"{lap.name}: {lap.seconds:.3f} s, on the brake in {share:.0%} "
             f"of it; {before:.0%} of that at most {BEFORE:.0f} m before a bend, {within:.0%} in one"
         )
         line, last = offsets(lap, track), offsets(laps[-1], track)

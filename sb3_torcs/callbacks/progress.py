@@ -196,8 +196,7 @@ class RacingProgressCallback(BaseCallback):
         first = lap_time is not None and self.best_lap_time is None
         self._take_lap(lap_time)
         if lap_time is None:
-            driven = max(line.distance, 0.0)
-            self.say(f"{self._moment()}: an evaluation, which ended after {driven:.0f} m")
+            self.say(f"{self._moment()}: {max(line.distance, 0.0):.0f} m")
         elif not first:
             best = ", the best so far" if known and lap_time < min(known) else ""
             self.say(f"{self._moment()}: a whole lap, {lap_time:.2f} s{best}")
