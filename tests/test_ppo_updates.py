@@ -1,6 +1,8 @@
 """PPO with lean updates learns what stock PPO learns, but for rounding, and saves stock models."""
 
 import os
+from contextlib import closing
+from itertools import permutations
 
 import numpy as np
 import pytest
@@ -18,16 +20,17 @@ from sb3_torcs.callbacks import (
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.policies import BoundedPolicy
 from sb3_torcs.policies.ppo import LeanPPO, is_for
+from sb3_torcs.vec_env import TorcsVecEnv
 
 RELU = {"activation_fn": nn.ReLU}
 SMALL = {"net_arch": {"pi": [8], "vf": [12, 6]}, **RELU}
 
 
-def make(policy_kwargs=SMALL, policy="MlpPolicy", **kwargs):
+def make(policy_kwargs=SMALL, policy="MlpPolicy", env=None, **kwargs):
     """Rollouts of 40 timesteps in three unequal batches."""
     arguments = {"n_steps": 40, "batch_size": 16, "n_epochs": 3, "learning_rate": 0.01, **kwargs}
     with pytest.warns(UserWarning, match="truncated mini-batch"):
-        return PPO(policy, ToyRace(), policy_kwargs=policy_kwargs, seed=0, **arguments)
+        return PPO(policy, env or ToyRace(), policy_kwargs=policy_kwargs, seed=0, **arguments)
 
 
 def learned(model, callback=None):
@@ -117,6 +120,54 @@ def test_what_was_learned_before_ctrl_c_is_kept(monkeypatch):
     reference.learn(40, callback=LeanUpdatesCallback())
     states = [each.policy.state_dict() for each in (model, reference)]
     th.testing.assert_close(*states, rtol=0, atol=0)
+
+
+def interrupted(model, when, *callbacks):
+    """Learn until Ctrl-C comes: in the third timestep, or in the first update."""
+
+    class CtrlC(BaseCallback):
+        def _on_step(self):
+            if when == "rollout" and self.n_calls == 3:
+                raise KeyboardInterrupt
+            return True
+
+    if when == "update":
+        model.rollout_buffer.get = lambda batch_size: (_ for _ in ()).throw(KeyboardInterrupt)
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(80, callback=[*callbacks, CtrlC()])
+    vars(model.rollout_buffer).pop("get", None)
+
+
+@pytest.mark.parametrize("when", ["rollout", "update"])
+@pytest.mark.parametrize(
+    "callbacks", [*permutations([LeanUpdatesCallback, AdaptiveLearningRateCallback])]
+)
+def test_a_model_is_saved_after_ctrl_c(when, callbacks, tmp_path):
+    """Its environment cannot be pickled, so nothing of the callbacks may be left in it."""
+    with closing(TorcsVecEnv(2, env_id="TorcsLite-v0", threads=1)) as cars:
+        model = make(env=cars, n_steps=20, batch_size=12)
+        interrupted(model, when, *(callback() for callback in callbacks))
+        model.save(tmp_path / "model")
+        assert PPO.load(tmp_path / "model").lr_schedule(1.0) == model.learning_rate
+
+
+def test_a_training_after_ctrl_c_needs_no_callback():
+    model, reference = make(), make()
+    for each in (model, reference):
+        interrupted(each, "rollout", *([LeanUpdatesCallback()] if each is model else []))
+        each.set_random_seed(1)
+        each.learn(80)
+    states = [each.policy.state_dict() for each in (model, reference)]
+    th.testing.assert_close(*states, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("frozen", ["log_std", "value_net.bias"])
+def test_what_is_frozen_stays(frozen):
+    model = make()
+    own = model.policy.get_parameter(frozen).requires_grad_(False)
+    before = own.clone()
+    model.learn(80, callback=LeanUpdatesCallback())
+    assert own.equal(before)
 
 
 def test_a_deterministic_action_is_the_mean():
@@ -216,14 +267,28 @@ def test_only_ppo_tells_a_divergence():
 # --------------------------------------------------------------------------- values only
 
 
-@pytest.mark.parametrize("others", [[], [LeanUpdatesCallback()]])
-def test_only_the_value_function_learns(others):
-    """The actions of a rollout are those of the policy as it was."""
+@pytest.mark.parametrize("others", [(), (LeanUpdatesCallback,)])
+@pytest.mark.parametrize("first", [True, False])
+def test_only_the_value_function_learns(others, first):
+    """The actions of a rollout are those of the policy as it was, in any order of the callbacks."""
     model = make()
     before = {name: own.clone() for name, own in model.policy.state_dict().items()}
-    model.learn(80, callback=[ValuesOnlyCallback(), *others])
+    chances = []
+
+    class Look(BaseCallback):
+        def _on_step(self):
+            with th.no_grad():
+                seen, actions = self.locals["obs_tensor"], self.locals["actions"]
+                _, chance, _ = model.policy.evaluate_actions(seen, th.as_tensor(actions))
+            chances.append((chance, self.locals["log_probs"]))
+            return True
+
+    values, others = [ValuesOnlyCallback()], [callback() for callback in others]
+    model.learn(80, callback=[*(values + others if first else others + values), Look()])
     for name, own in model.policy.state_dict().items():
         assert own.equal(before[name]) is ("value_net" not in name), name
+    for expected, drawn in chances:
+        th.testing.assert_close(drawn, expected)
 
 
 def test_an_algorithm_without_such_a_value_function_is_told():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -39,25 +40,64 @@ RATE_STEP = 1.5  # [-] by which the learning rate changes after an update
 LEAST_RATE, MOST_RATE = 0.01, 4.0  # [-] of the model's own
 
 
+class _Training:
+    """
+    Replaces a model's ``train`` for one call, and then ends what callbacks changed for it.
+
+    :param model: that has just made a rollout
+    """
+
+    def __init__(self, model: Any) -> None:
+        self._model, self.train = model, model.train
+        self.undo: list[Callable[[], None]] = []
+
+    def __call__(self, *arguments: Any, **keywords: Any) -> None:
+        vars(self._model).pop("train", None)
+        try:
+            self.train(*arguments, **keywords)
+        finally:  # after Ctrl-C, too: then the model is saved, or learns on without the callbacks
+            for undo in self.undo:
+                undo()
+
+
 class _WhileLearning(BaseCallback):
     """
     Base of callbacks that change the algorithm only while it learns.
 
-    They change it at the end of a rollout and restore it at the beginning of the next, so that
-    models that other callbacks save are unchanged.
+    They change it at the end of a rollout, and end that when the algorithm has learned from it, so
+    that models that other callbacks save are unchanged.
     """
 
     def _on_step(self) -> bool:
         return True
 
     @abstractmethod
+    def _change(self, training: _Training) -> None:
+        """
+        Change the algorithm.
+
+        :param training: the model's ``train`` for once
+        """
+
+    @abstractmethod
     def _undo(self) -> None:
-        """Undo the change of ``_on_rollout_end``, if there is one."""
+        """Undo the change, if there is one."""
 
     def _on_rollout_start(self) -> None:
-        self._undo()
+        self._end()  # off-policy algorithms do not learn before `learning_starts`
+
+    def _on_rollout_end(self) -> None:
+        model: Any = self.model
+        if "train" not in vars(model):
+            model.train = _Training(model)
+        self._change(model.train)
+        model.train.undo.append(self._end)
 
     def _on_training_end(self) -> None:
+        self._end()
+
+    def _end(self) -> None:
+        vars(self.model).pop("train", None)
         self._undo()
 
 
@@ -89,7 +129,7 @@ class GradientStepsCallback(_WhileLearning):
             )
         self._algorithm, self._own = self.model, self.model.gradient_steps
 
-    def _on_rollout_end(self) -> None:
+    def _change(self, training: _Training) -> None:
         buffer = self._algorithm.replay_buffer
         remembered = 0 if buffer is None else buffer.size() * buffer.n_envs
         if max(self.num_timesteps, remembered) <= self.timesteps:
@@ -133,18 +173,12 @@ class LeanUpdatesCallback(_WhileLearning):
             self._updates.begin_rollout()
             self.model.policy.forward = self._updates.forward
 
-    def _on_rollout_end(self) -> None:
+    def _change(self, training: _Training) -> None:
         self._undo()
         if self._updates is not None:
-            self.model.train = self._train  # type: ignore[attr-defined]
-
-    def _train(self, *arguments: Any, **keywords: Any) -> None:
-        assert self._updates is not None
-        self._undo()  # so that a model that is saved after Ctrl-C is a stock one
-        self._updates.train(*arguments, **keywords)
+            training.train = self._updates.train
 
     def _undo(self) -> None:
-        vars(self.model).pop("train", None)
         vars(self.model.policy).pop("forward", None)
 
 
@@ -217,7 +251,7 @@ class AdaptiveLearningRateCallback(_WhileLearning):
         elif kl is not None and kl < 0.5 * target:
             self._set_factor(min(self.factor * RATE_STEP, MOST_RATE))
 
-    def _on_rollout_end(self) -> None:
+    def _change(self, training: _Training) -> None:
         self.model.lr_schedule = self._scaled
 
     def _scaled(self, progress_remaining: float) -> float:
@@ -314,7 +348,7 @@ class MirrorCallback(_WhileLearning):
             check_angles(angles, type(self).__name__)
         self._buffer = buffer
 
-    def _on_rollout_end(self) -> None:
+    def _change(self, training: _Training) -> None:
         self._buffer.sample = _MirroredSample(self._buffer)  # type: ignore[method-assign]
 
     def _undo(self) -> None:

@@ -110,23 +110,31 @@ class LeanPPO:
         )
         self.log_std = self.weights[:first]
         self.count = 0  # steps of Adam
+        self._versions = -1  # of the policy's parameters that were taken over
 
     # ------------------------------------------------------------------------ rollouts
 
     def begin_rollout(self) -> None:
         """Take over the parameters of the policy."""
+        self._versions = self._policy_versions()
         self._read(self.weights, [own.detach() for own in self.parameters])
+
+    def _policy_versions(self) -> int:
+        """Return a number that grows whenever a parameter of the policy is changed in place."""
+        return sum(own._version for own in self.parameters)
 
     def forward(
         self, obs: th.Tensor, deterministic: bool = False
     ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         """
-        Decide as the policy does, with the parameters that it had when the rollout began.
+        Decide as the policy does. Parameters that changed since the rollout began are taken over.
 
         :param obs: (batch, features)
         :param deterministic: as of the policy
         :return: actions, values of the observations, and logarithms of the actions' probabilities
         """
+        if self._policy_versions() != self._versions:
+            self.begin_rollout()
         seen, actor, critic = self._seen(obs), self.actor, self.critic
         batch = len(obs)
         noise = np.zeros((batch, len(self.log_std)), np.float32)
@@ -419,7 +427,8 @@ def is_for(model: PPO) -> bool:
         and model.clip_range_vf is None
         and model.target_kl is None
         and is_usual(policy.optimizer)
-        and all(own.dtype == th.float32 for own in policy.parameters())
+        and len(policy.optimizer.param_groups) == 1
+        and all(own.dtype == th.float32 and own.requires_grad for own in policy.parameters())
     )
 
 
