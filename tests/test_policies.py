@@ -181,6 +181,8 @@ def test_other_numbers_of_actions_take_other_heads():
     ({"init_std": "x"}, "pass a number above 0"),
     ({"net_arch": [300]}, "the critic has two layer sizes"),
     ({"net_arch": {"pi": [8]}}, "the critic has two layer sizes"),
+    ({"net_arch": [0, 64]}, "0 is no layer size; pass whole numbers >= 1"),
+    ({"net_arch": {"pi": [64.5], "qf": [8, 8]}}, "64.5 is no layer size"),
     ({"critic_lr_scale": 0.0}, "pass a number above 0"),
     ({"ema_decay": 1.0}, "pass a share in"),
     ({"symmetric": "no"}, "symmetric is 'no'; expected True or False"),
@@ -378,6 +380,14 @@ def test_the_average_drives_when_nothing_is_left_to_chance():
     drives, explores = (model.predict(OBSERVATIONS, deterministic=known)[0] for known in (1, 0))
     np.testing.assert_array_equal(drives, model.policy.unscale_action(scaled))
     assert not np.array_equal(drives, explores)
+
+
+def test_each_update_moves_the_average_once_whatever_optimizers_there_were():
+    """PyTorch wraps ``Adam.step`` when somebody makes the first one of a process."""
+    th.optim.Adam([th.nn.Parameter(th.zeros(1))])
+    model = make_model(ema_decay=0.75, optimizer_kwargs={"weight_decay": 1e-4})
+    model.learn(6)
+    assert model.policy.average.n_averaged == model._n_updates > 0
 
 
 @pytest.mark.parametrize("ema_decay", [None, 0.9])

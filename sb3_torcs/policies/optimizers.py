@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,11 +20,15 @@ class _LrScale:
     param_groups: list[dict[str, Any]]
 
     def step(self, closure: Callable[[], float] | None = None) -> Any:
+        step = super().step  # type: ignore[misc]
+        if getattr(step, "hooked", False):
+            # PyTorch wraps each class's own `step` to call the hooks: let them be called once.
+            step = partial(step.__wrapped__, self)
         rates = [group["lr"] for group in self.param_groups]
         try:
             for group, rate in zip(self.param_groups, rates, strict=True):
                 group["lr"] = rate * group.get("lr_scale", 1.0)
-            return super().step(closure)  # type: ignore[misc]
+            return step(closure)
         finally:
             # SB3 writes the schedule's rate into the groups and logs it: restore that value.
             for group, rate in zip(self.param_groups, rates, strict=True):
