@@ -92,6 +92,29 @@ def test_closing_it_closes_its_parts(joined):
             part.step(np.zeros((part.num_envs, 3), np.float32))
 
 
+def test_a_part_that_fails_leaves_the_others_in_step(joined, monkeypatch):
+    def fail():
+        raise RuntimeError("lost")
+
+    actions = np.zeros((5, 3), np.float32)
+    joined.seed(0)
+    first = joined.reset()
+    monkeypatch.setattr(joined.parts[0], "step_wait", fail)
+    waited = []
+    monkeypatch.setattr(joined.parts[1], "step_wait", lambda: waited.append(True))
+    with pytest.raises(RuntimeError, match="lost"):
+        joined.step(actions)
+    assert waited
+    monkeypatch.undo()
+    joined.seed(0)
+    assert (joined.reset() == first).all()
+    monkeypatch.setattr(joined.parts[0], "close", fail)
+    with pytest.raises(RuntimeError, match="lost"):
+        joined.close()
+    with pytest.raises(EnvClosed):
+        joined.parts[1].step(actions[2:])
+
+
 def test_parts_have_equal_spaces(make):
     with pytest.raises(InvalidOption, match=r"parts\[1\] has the action_space .*same sensors"):
         JoinedVecEnv(make((1, FAST), (1, {**FAST, "action": "pedal"})))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack
 from itertools import accumulate
 from typing import Any
 
@@ -89,7 +90,14 @@ class JoinedVecEnv(VecEnv):
 
         :return: observations, rewards, dones and infos
         """
-        answers = [part.step_wait() for part in self.parts]
+        answers, errors = [], []
+        for part in self.parts:
+            try:
+                answers.append(part.step_wait())
+            except Exception as error:  # the others have set out, too, and answer before it is told
+                errors.append(error)
+        if errors:
+            raise errors[0]
         observations, rewards, dones, infos = zip(*answers, strict=True)
         self._gather_reset_infos()
         return (
@@ -180,9 +188,10 @@ class JoinedVecEnv(VecEnv):
         return [image for part in self.parts for image in part.get_images()]
 
     def close(self) -> None:
-        """Close all parts."""
-        for part in self.parts:
-            part.close()
+        """Close all parts, also those after one that fails to."""
+        with ExitStack() as closing:
+            for part in reversed(self.parts):
+                closing.callback(part.close)
 
     def _gather_reset_infos(self) -> None:
         self.reset_infos = [info for part in self.parts for info in part.reset_infos]
