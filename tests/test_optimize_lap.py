@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import shutil
 import zipfile
@@ -167,6 +168,16 @@ def test_drives_go_on_from_the_mark_and_back(engines, starts):
     assert engines[1].read(0).distance_raced == path[0, 1]
     with pytest.raises(InvalidOption, match="going back 1 drives of 0"):
         rollouts.go_back(1)
+
+
+def test_candidates_keep_their_engines():
+    """Nothing is freed under them, whatever becomes of the list."""
+    made = [make_engine(find_game(), TRACK, [AGENT])]
+    made[0].start()
+    rollouts = make_rollouts(made)
+    made.clear()
+    gc.collect()
+    rollouts.go_back(0)
 
 
 def test_a_gain_is_time_against_the_line():

@@ -111,9 +111,10 @@ std::vector<Entry> entries_of(const std::vector<std::pair<std::string, int>>& na
     return entries;
 }
 
-template <typename Pointer>
-std::vector<Pointer> checked(std::vector<Pointer> engines) {
-    for (const Pointer& engine : engines)
+using Engines = std::vector<std::shared_ptr<Engine>>;
+
+Engines checked(Engines engines) {
+    for (const auto& engine : engines)
         if (!engine) throw py::type_error("engine is None; expected an Engine");
     return engines;
 }
@@ -451,14 +452,14 @@ PYBIND11_MODULE(_engine, module) {
              "Move the bare physics on; for benchmarks.");
 
     py::class_<Fleet>(module, "Fleet", "Engines that are driven at once, on threads that stay.")
-        .def(py::init([](const std::vector<std::shared_ptr<Engine>>& engines, int threads) {
+        .def(py::init([](const Engines& engines, int threads) {
                  return std::make_unique<Fleet>(checked(engines), threads);
              }),
              "engines"_a, "threads"_a)
         .def(
             "put",
             [](Fleet& fleet, std::size_t race, const std::shared_ptr<Engine>& engine) {
-                checked<std::shared_ptr<Engine>>({engine});
+                checked({engine});
                 const WithoutPython released;
                 fleet.put(race, engine);
             },
@@ -502,10 +503,10 @@ PYBIND11_MODULE(_engine, module) {
              "Wait for all races that have begun to move.");
 
     py::class_<Rollouts>(module, "Rollouts", "Short drives from one moment, at once.")
-        .def(py::init([](const std::vector<Engine*>& engines, int threads) {
+        .def(py::init([](const Engines& engines, int threads) {
                  return std::make_unique<Rollouts>(checked(engines), threads);
              }),
-             py::keep_alive<1, 2>(), "engines"_a, "threads"_a)
+             "engines"_a, "threads"_a)
         .def("mark", &Rollouts::mark, py::call_guard<WithoutPython>(),
              "Keep the moment of the first engine, from which all candidates begin.")
         .def(

@@ -126,6 +126,7 @@ void Race::close() {
     for (auto& library : robot_libraries_) Library::give_back(std::move(library));
     Library::give_back(std::move(simulation_library_));
     Library::give_back(std::move(track_library_));
+    session_ = Params(game_, nullptr);  // released here, while the game's lock is held
 }
 
 // ---- Loading ------------------------------------------------------------------------------------

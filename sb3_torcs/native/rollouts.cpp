@@ -73,7 +73,7 @@ bool on_road(const Waypoint& car, const Race& race) {
 
 }  // namespace
 
-Rollouts::Rollouts(const std::vector<Engine*>& engines, int threads)
+Rollouts::Rollouts(const std::vector<std::shared_ptr<Engine>>& engines, int threads)
     : places_(engines.size()), pool_(threads, engines.size(), [this](std::size_t i) { work(i); }) {
     for (std::size_t i = 0; i < engines.size(); i++) places_[i].engine = engines[i];
 }
@@ -92,7 +92,7 @@ void Rollouts::drive(const std::vector<Waypoint>& path, int ticks) {
 
 void Rollouts::go_back(std::size_t drives) {
     for (const Place& place : places_)
-        if (drives >= place.marks.size())
+        if (!place.marks.empty() && drives >= place.marks.size())
             throw Error("InvalidOption", "going back " + std::to_string(drives) + " drives of " +
                                              std::to_string(place.marks.size() - 1));
     job_ = Job::GO_BACK;

@@ -9,6 +9,7 @@
 #include <atomic>
 #include <cstddef>
 #include <exception>
+#include <memory>
 #include <vector>
 
 #include "engine.h"
@@ -42,8 +43,8 @@ struct Gains {
 
 class Rollouts {
 public:
-    // The engines must be of one race with one agent, at the same moment, and outlive this object.
-    Rollouts(const std::vector<Engine*>& engines, int threads);
+    // The engines must be of one race with one agent, at the same moment.
+    Rollouts(const std::vector<std::shared_ptr<Engine>>& engines, int threads);
 
     // Let candidates begin where the engines stand, and forget all other marks.
     void mark();
@@ -73,7 +74,7 @@ private:
 
     enum class Job { MARK, DRIVE, GO_BACK, FOLLOW };
     struct Place {
-        Engine* engine;
+        std::shared_ptr<Engine> engine;
         std::vector<Snapshot> marks;
         std::exception_ptr failure;
     };
