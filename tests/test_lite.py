@@ -172,6 +172,7 @@ def test_crossing_the_line_back_and_forth_counts_no_lap(oval):
         for _ in range(ticks):
             car = world.step(Controls(0.0, 0.5, 0.0, gear), 1)
     assert car.laps == 0
+    assert car.lap_time == pytest.approx(car.time, abs=0.5), "its clock runs since the first time"
 
 
 def test_the_first_lap_from_the_grid_counts_from_the_start(oval):

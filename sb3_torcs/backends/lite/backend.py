@@ -66,7 +66,6 @@ class LiteBackend:
         self._gearbox = physics.BY_ROAD_SPEED if by_road else physics.AUTOMATIC
         self.range_finder_angles = range_finder_angles(range_finders)
         self._random = isinstance(track, str) and track == RANDOM_TRACK
-        self._flying = False
         self._grip = 1.0
         self._state = np.zeros(physics.STATE_SIZE)
         self._set_track(load_track(track, np.random.default_rng(0) if self._random else None))
@@ -106,9 +105,9 @@ class LiteBackend:
         return self._table, self._edges
 
     @property
-    def manner(self) -> tuple[int, bool]:
-        """The gearbox, and whether the episode began elsewhere than on the grid."""
-        return self._gearbox, self._flying
+    def gearbox(self) -> int:
+        """``AUTOMATIC`` or ``BY_ROAD_SPEED`` of the physics."""
+        return self._gearbox
 
     def draw_track(self, rng: np.random.Generator) -> None:
         """Draw the next episode's track; see :class:`~sb3_torcs.backends.base.Backend`."""
@@ -118,8 +117,7 @@ class LiteBackend:
     def reset(self, rng: np.random.Generator, start: Start | None) -> CarState:
         """Begin an episode; see :class:`~sb3_torcs.backends.base.Backend`."""
         del rng  # the track is drawn already, and nothing else is by chance
-        self._flying = start is not None
-        track = self.track
+        track, flying = self.track, start is not None
         if start is None:
             start = Start(track.length - track.grid.distance)
             offset = track.grid.offset
@@ -133,13 +131,15 @@ class LiteBackend:
         self._state[:] = physics.place(x, y, yaw, start.speed, segment, self._table)
         if start.distance == 0.0:
             self._state[physics.CROSSINGS] = 1.0  # on the line itself, the lap has begun
+        elif flying:
+            self._state[physics.LAPS] = -1.0
         return self._read()
 
     def step(self, controls: Controls, ticks: int) -> CarState:
         """Drive on; see :class:`~sb3_torcs.backends.base.Backend`."""
         steering, throttle, brake, gear, clutch = controls
         asked = (steering, throttle, brake, self._gearbox if gear is None else gear, clutch)
-        physics.advance(self._state, self._table, asked, ticks, self._flying)
+        physics.advance(self._state, self._table, asked, ticks)
         if not math.isfinite(self._state[physics.X] + self._state[physics.VX]):
             raise self.lost()
         return self._read()

@@ -39,7 +39,6 @@ def _drive(
     reach: npt.NDArray[np.int64],
     angles: FloatArray,
     gearboxes: Rows,
-    flying: npt.NDArray[np.bool_],
     controls: FloatArray,
     ticks: Rows,
     cars: FloatArray,
@@ -57,7 +56,6 @@ def _drive(
     :param reach: of the edges
     :param angles: (races, 19) of the range finders [rad]
     :param gearboxes: (races,) ``AUTOMATIC`` or ``BY_ROAD_SPEED``
-    :param flying: (races,) whether the episode began elsewhere than on the grid
     :param controls: (n, 5)
     :param ticks: (n,) control ticks
     :param cars: (n, 111) filled
@@ -69,7 +67,7 @@ def _drive(
         steering, throttle, brake, gear, clutch = controls[row]
         wanted = gearboxes[race] if math.isnan(gear) else int(gear)
         asked = (steering, throttle, brake, wanted, clutch)
-        physics.advance(state, table, asked, ticks[row], flying[race])
+        physics.advance(state, table, asked, ticks[row])
         lost[row] = not math.isfinite(state[physics.X] + state[physics.VX])
         physics.read(
             state,
@@ -103,7 +101,6 @@ class LiteFleet:
             world.keep_state_in(row)
         self._angles = np.stack([world.range_finder_angles for world in self._worlds])
         self._gearboxes = np.zeros(len(self._worlds), np.int64)
-        self._flying = np.zeros(len(self._worlds), np.bool_)
         self._threads = threads
         self._others = ThreadPoolExecutor(max(threads - 1, 1))  # threads begin at need
         self._owner = os.getpid()
@@ -128,10 +125,9 @@ class LiteFleet:
 
         def drive(rows: Rows, road: Road) -> None:
             table, edges = road
-            manners = self._gearboxes, self._flying
             _drive(
-                rows, races, self._states, table, *edges, self._angles, *manners, controls, ticks,
-                cars, lost,
+                rows, races, self._states, table, *edges, self._angles, self._gearboxes, controls,
+                ticks, cars, lost,
             )  # fmt: skip
 
         jobs = iter(list(self._jobs(races)))
@@ -154,7 +150,7 @@ class LiteFleet:
         tracks: dict[int, list[int]] = {}
         for row, race in enumerate(races.tolist()):
             world = self._worlds[race]
-            self._gearboxes[race], self._flying[race] = world.manner
+            self._gearboxes[race] = world.gearbox
             tracks.setdefault(id(world.road[0]), []).append(row)
         for rows in tracks.values():
             road = self._worlds[races[rows[0]]].road

@@ -30,7 +30,8 @@ WALL_SPIN = 10.0  # how much a hit turns the car, simuv2's VELSCALE
 WALL_SPIN_MAX = 6.0  # [rad/s]
 DAMAGE_FACTOR = 0.8  # for a driver of the level "semi-pro"
 
-# The state vector
+# The state vector. LAPS is -1 for a car that begins elsewhere than on the grid or the line, until
+# it crosses the line: the drive up to there is not a lap.
 (
     STEPS, X, Y, YAW, VX, VY, YAW_RATE, ACC_X, ACC_Y, STEER,
     SPIN_FR, SPIN_FL, SPIN_RR, SPIN_RL, MOTOR, GEAR, SHIFT, DAMAGE,
@@ -50,7 +51,7 @@ def locate(state: Floats, track: Floats) -> None:
 
 
 @njit(cache=True)
-def _count_laps(state: Floats, track: Floats, previous: float, flying: bool) -> None:
+def _count_laps(state: Floats, track: Floats, previous: float) -> None:
     """Follow the distance and the crossings of the start line, as the game's race engine does."""
     length = track[-1, column.START] + track[-1, column.LENGTH]
     distance = track[int(state[SEGMENT]), column.START] + state[ALONG]
@@ -58,14 +59,13 @@ def _count_laps(state: Floats, track: Floats, previous: float, flying: bool) -> 
     if moved < -0.5 * length:
         moved += length
         state[CROSSINGS] += 1.0
-        if state[CROSSINGS] == 1.0 and flying:
-            state[LAP_START] = state[STEPS]  # the drive from the grid to the line is not a lap
-        elif state[CROSSINGS] > state[LAPS] + 1.0:
+        if state[CROSSINGS] > state[LAPS] + 1.0:
             lap = (state[STEPS] - state[LAP_START]) / STEPS_PER_SECOND
             state[LAPS] += 1.0
-            state[LAST_LAP] = lap
-            if state[BEST_LAP] == 0.0 or lap < state[BEST_LAP]:
-                state[BEST_LAP] = lap
+            if state[LAPS] > 0.0:
+                state[LAST_LAP] = lap
+                if state[BEST_LAP] == 0.0 or lap < state[BEST_LAP]:
+                    state[BEST_LAP] = lap
             state[LAP_START] = state[STEPS]
     elif moved > 0.5 * length:  # back over the line: the next crossing must not count again
         moved -= length
@@ -296,7 +296,6 @@ def advance(
     track: Floats,
     controls: tuple[float, float, float, int, float],
     ticks: int,
-    flying: bool,
 ) -> None:
     """
     Drive for some control ticks, changing the state vector in place.
@@ -306,7 +305,6 @@ def advance(
     :param controls: steering, throttle, brake, gear and clutch as in ``Controls``; the gear may be
         ``AUTOMATIC`` or ``BY_ROAD_SPEED``
     :param ticks: control ticks of 0.02 s
-    :param flying: whether the episode began elsewhere than on the grid
     """
     steering, throttle, brake, gear, pressed = controls
     for _tick in range(ticks):
@@ -326,7 +324,7 @@ def advance(
             state[STEPS] += 1.0
             locate(state, track)
             _hit_walls(state, track)
-            _count_laps(state, track, distance, flying)
+            _count_laps(state, track, distance)
 
 
 def place(x: float, y: float, yaw: float, speed: float, segment: int, track: Floats) -> Floats:
@@ -412,7 +410,7 @@ def read(
     scalars[15] = state[GEAR]
     scalars[16] = car.FUEL
     scalars[17] = state[DAMAGE]
-    scalars[18] = state[LAPS]
+    scalars[18] = max(state[LAPS], 0.0)
     scalars[19] = (state[STEPS] - state[LAP_START]) / STEPS_PER_SECOND
     scalars[20], scalars[21] = state[LAST_LAP], state[BEST_LAP]
     wheels[:] = state[SPIN_FR : SPIN_RL + 1]
