@@ -7,6 +7,7 @@ import re
 
 import gymnasium as gym
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 import torch as th
 from stable_baselines3 import PPO
@@ -410,4 +411,6 @@ def test_the_last_race_is_written_and_reported(capsys, game, tmp_path):
     best = {one["driver"]: one["best_lap"] for one in json.loads(noted)["races"][0]["standings"]}
     saved = {drive.driver: min(lap.time for lap in drive.laps) for drive in saved_drives(drives)}
     assert saved == pytest.approx(best, abs=1e-6)
+    moments = pq.read_table(drives, columns=["driver", "time"]).to_pandas()
+    assert not moments.duplicated().any()
     assert "<title>g-track-1: scripted " in page.read_text()

@@ -275,6 +275,8 @@ def _stretches(
                 engine.drive(part)
                 for watcher in watchers:
                     watcher.look()
+                if engine.ended:
+                    break
             tick += ticks
         yield
         if all(out or engine.finished(car) for car, *_, out in engine.results()):
