@@ -313,6 +313,35 @@ class TestMistakes:
         envs.step(np.array([GAS] * 3, np.float32))
 
 
+    def test_the_order_of_the_cars_changes_nothing(self, game):
+        """Who drives into the grass is the second of the list, then the first."""
+
+        def ends(order):
+            envs = make_race(2, track="aalborg")
+            cars = TorcsVecEnv([lambda env=envs[seat]: env for seat in order], threads=1)
+            cars.seed(0)
+            cars.reset()
+            actions = np.array([[[1.0, 1.0, 0.0], [0.0, 0.2, 0.0]][seat] for seat in order])
+            found = []
+            for timestep in range(60):
+                _, _, dones, infos = cars.step(actions)
+                found += [
+                    (timestep, seat, info["end"])
+                    for seat, done, info in zip(order, dones, infos, strict=True)
+                    if done
+                ]
+            cars.close()
+            return sorted(found)
+
+        assert ends([0, 1]) == ends([1, 0])
+
+    def test_cars_of_one_race_are_beside_each_other_in_the_list(self, game):
+        one, two = make_race(2, track=TRACK), make_race(2, track=TRACK)
+        mixed = [lambda env=env: env for env in (one[0], two[0], one[1], two[1])]
+        with pytest.raises(InvalidOption, match="list the agents of each race one after the other"):
+            TorcsVecEnv(mixed, threads=1)
+
+
 def by_hand(agents, actions, **options):
     """What a vector environment is held to: each car asked and valued alone, until one ends."""
     envs = make_race(agents, track=TRACK, **options)

@@ -170,6 +170,7 @@ class TorcsVecEnv(DummyVecEnv):
         super().__init__(makers)
         try:
             self._races = [_Race(env) for env in self._envs]
+            self._shared = _shared_races([race.racing for race in self._races])
             self._batch = Batch([race.racing for race in self._races], most)
         except BaseException:
             self.close()
@@ -177,7 +178,6 @@ class TorcsVecEnv(DummyVecEnv):
         self.threads = self._batch.threads
         self._elapsed = np.zeros(self.num_envs, np.int64)  # timesteps of the episodes
         self._limits = np.full(self.num_envs, NO_LIMIT)
-        self._shared = _shared_races([race.racing for race in self._races])
         self._watched = [i for i, race in enumerate(self._races) if race.is_watched]
 
     @property
@@ -247,19 +247,19 @@ class TorcsVecEnv(DummyVecEnv):
             race.ask()
         timestep = batch.step(self.actions)
         for race, members in self._shared.items():
-            race.advance(self._races[members[0]].racing.action_repeat)
+            race.advance(self._races[next(iter(members.values()))].racing.action_repeat)
         return timestep
 
     def _end_races(self, over: npt.NDArray[np.bool_]) -> None:
         """End the races all of whose first episodes are over; with them end all their others."""
         for race, members in self._shared.items():
-            ending = {number for number, i in enumerate(members) if over[i]}
+            ending = {number for number, i in members.items() if over[i]}
             if ending and race.is_over(ending):
                 race.end()
-                for i in members:
+                for i in members.values():
                     if not over[i]:
                         self._races[i].racing.end_race()
-                over[members] = True
+                    over[i] = True
 
     def _finish(self, i: int, timestep: Outcome) -> tuple[float, bool, dict[str, Any]]:
         """Take the last timestep of an episode through all wrappers, and reset."""
@@ -390,13 +390,19 @@ class _Race:
         self._noted = elapsed
 
 
-def _shared_races(envs: Sequence[RacingEnv]) -> dict[SharedRace, list[int]]:
-    """Return the races of several agents, and the indices of their environments."""
-    members: dict[SharedRace, list[int]] = {}
+def _shared_races(envs: Sequence[RacingEnv]) -> dict[SharedRace, dict[int, int]]:
+    """Return the races of several agents: each agent's number, and the index of its environment."""
+    members: dict[SharedRace, dict[int, int]] = {}
     for i, env in enumerate(envs):
         seat: Any = env.backend
         if isinstance(seat, Seat):
-            members.setdefault(seat.race, []).append(i)
+            members.setdefault(seat.race, {})[seat.number] = i
+    for race in members.values():
+        if max(race.values()) - min(race.values()) >= len(race):
+            raise InvalidOption(
+                f"environments {sorted(race.values())} are the agents of one race, with others "
+                "between them; list the agents of each race one after the other"
+            )
     return members
 
 
