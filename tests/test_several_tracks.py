@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 import sb3_torcs  # noqa: F401  # registers the ids
 from sb3_torcs.backends import several
-from sb3_torcs.backends.several import WorldPool
+from sb3_torcs.backends.several import Turn, WorldPool
 from sb3_torcs.errors import EnvClosed, InvalidOption, TrackNotFound
 from sb3_torcs.tracks.catalogue import load_track
 from sb3_torcs.vec_env import TorcsVecEnv
@@ -174,6 +174,22 @@ class TestWorldPool:
             pool.give_back(choice, world)
             pool.leave()
         assert all(world.closed for world in everything)
+
+    def test_who_gets_no_world_is_not_waited_for(self):
+        everything, fails = [], []
+
+        def load():
+            if fails:
+                raise MemoryError
+            return Loaded("a", everything)
+
+        pool = WorldPool([load])
+        first = Turn(pool)
+        fails.append(True)
+        with pytest.raises(MemoryError):
+            Turn(pool)
+        first.close()
+        assert [world.closed for world in everything] == [True]
 
     def test_what_was_loaded_before_a_wrong_choice_is_closed(self):
         everything = []

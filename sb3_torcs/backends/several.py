@@ -179,9 +179,9 @@ class Turn(Generic[World]):
 
     def __init__(self, pool: WorldPool[World]) -> None:
         self.pool = pool
-        pool.join()
         self._index = 0  # of the world
         self.world = pool.take(0)
+        pool.join()  # not before there is a world: who cannot get one never leaves
         self._closed = False
 
     def draw(self, rng: np.random.Generator) -> bool:
