@@ -65,7 +65,7 @@ STARTS_A_CHILD = {
     "tracks/trial.py",  # to load a track that may crash the game's loader
 }
 HAS_THE_GAME_RUN = {  # and nothing else: no world but one needs another process
-    "agents/text_mode.py", "backends/scr.py", "evaluation/watching.py",
+    "races/text_mode.py", "backends/scr.py", "evaluation/watching.py",
     "rendering/game_camera.py", "rendering/game_video.py", "scr/server.py", "torcs/libraries.py",
     "torcs/packages.py", "torcs/results.py", "torcs/window.py",
 }  # fmt: skip
@@ -76,7 +76,7 @@ ASKS_DRIVERS = {
     "agents/pilots.py",  # several at once, in one race
     "agents/rollout.py",
     "bench/torcs.py",  # on threads, where nobody looks at what is driven
-    "callbacks/metrics.py",  # hands on, for all cars of a vector
+    "callbacks/driven_line.py",  # hands on, for all cars of a vector
     "training/keeping.py",  # only to see whether the answer is a number
 }
 
@@ -430,7 +430,7 @@ def test_one_file_knows_python(path):
     assert "Python.h" not in text
 
 
-DRAWS_AS_SB3 = "policies/replay.py"  # the numbers that SB3's buffers would draw
+DRAWS_AS_SB3 = "policies/mirrored_replay.py"  # the numbers that SB3's buffers would draw
 ALLOWED_OF_RANDOM = {"Generator", "default_rng", "SeedSequence", "PCG64", "BitGenerator"}
 
 

@@ -15,15 +15,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNorm
 
 import sb3_torcs  # noqa: F401
 from sb3_torcs.callbacks import RewardCallback
-from sb3_torcs.callbacks.metrics import (
-    MONITOR_KWARGS,
-    DrivenLine,
-    DrivingMetricsCallback,
-    callbacks_in,
-    drive_lap,
-    line_image,
-    mean_q,
-)
+from sb3_torcs.callbacks.driven_line import DrivenLine, drive_lap, line_image
+from sb3_torcs.callbacks.metrics import MONITOR_KWARGS, DrivingMetricsCallback, mean_q
+from sb3_torcs.callbacks.tree import callbacks_in
 from sb3_torcs.envs.racing import RacingEnv
 from sb3_torcs.errors import InvalidOption
 

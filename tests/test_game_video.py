@@ -18,7 +18,6 @@ from displays import left_behind, traces
 from processes import gone_within, runs
 from recordings import FPS, LAP, SIZE, recorded, saved
 
-from sb3_torcs.agents.text_mode import run
 from sb3_torcs.errors import (
     DisplayUnavailable,
     GameFailed,
@@ -26,6 +25,7 @@ from sb3_torcs.errors import (
     InvalidOption,
     OutputNotWritable,
 )
+from sb3_torcs.races.text_mode import run
 from sb3_torcs.rendering import game_video as video_module
 from sb3_torcs.rendering.game_video import HEADER, GameVideo, read_frame, side_by_side
 from sb3_torcs.torcs.process import GameProcess

@@ -13,11 +13,12 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_torcs.callbacks import LinePicturesCallback, RacingProgressCallback
 from sb3_torcs.callbacks.display import bars
+from sb3_torcs.callbacks.driven_line import DrivenLine
 from sb3_torcs.callbacks.lines import DrivenLap, draw_learning, driven_laps
-from sb3_torcs.callbacks.metrics import DrivenLine, DrivingMetricsCallback
+from sb3_torcs.callbacks.metrics import DrivingMetricsCallback
 from sb3_torcs.callbacks.progress import spoken_moment
 from sb3_torcs.envs.racing import RacingEnv
-from sb3_torcs.errors import InvalidOption
+from sb3_torcs.errors import InvalidOption, OutputNotWritable
 
 EVERY = 16  # timesteps between two evaluations
 
@@ -57,15 +58,15 @@ def driven(oval, distance, lap_time=None):
     return DrivenLine(oval, x, np.zeros(3), np.full(3, 20.0), distance, lap_time)
 
 
-def learned(oval, lines, *states, stream=None, callbacks=()):
+def learned(oval, lines, *states, stream=None, callbacks=(), shown=True):
     env = DummyVecEnv([lambda: RacingEnv(ScriptedBackend(oval, *states))])
     model = PPO(
         "MlpPolicy", env, n_steps=32, batch_size=32, n_epochs=1, policy_kwargs={"net_arch": [4]},
         device="cpu", seed=0,
     )  # fmt: skip
     metrics = DrivingMetricsCallback()
-    progress = RacingProgressCallback(stream=stream or io.StringIO())
-    model.learn(64, [progress, metrics, *callbacks, Evaluations(env, metrics, lines)])
+    progress = [RacingProgressCallback(stream=stream or io.StringIO())] if shown else []
+    model.learn(64, [*progress, metrics, *callbacks, Evaluations(env, metrics, lines)])
 
 
 # ------------------------------------------------------------------------------ told
@@ -186,15 +187,32 @@ def test_a_full_disk_ends_the_series_and_not_the_training(oval, monkeypatch, tmp
     def full(*arguments, **keywords):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("sb3_torcs.tracks.plot.plot_track", full)
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", full)
     stream = io.StringIO()
     pictures = LinePicturesCallback(folder=str(tmp_path))
     learned(oval, [driven(oval, 296.0)] * 2, stream=stream, callbacks=[pictures])
     file = tmp_path / "001.png"
-    told = f"no more pictures: cannot write '{file}': No space left on device; give another folder"
-    assert stream.getvalue().splitlines().count(told) == 1
+    told = f"no more pictures: cannot write '{file}': No space left on device; choose a file"
+    assert sum(line.startswith(told) for line in stream.getvalue().splitlines()) == 1
     assert "64/64 timesteps" in stream.getvalue()
     assert list(tmp_path.iterdir()) == []
+
+
+def test_without_a_display_the_end_of_the_series_is_a_warning(oval, monkeypatch, tmp_path):
+    def full(*arguments, **keywords):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", full)
+    pictures = LinePicturesCallback(folder=str(tmp_path))
+    with pytest.warns(UserWarning, match="no more pictures: .*No space left"):
+        learned(oval, [driven(oval, 296.0)] * 2, callbacks=[pictures], shown=False)
+
+
+def test_a_folder_that_cannot_be_written_ends_the_training_before_it_begins(oval, tmp_path):
+    (tmp_path / "file.py").touch()
+    pictures = LinePicturesCallback(folder=str(tmp_path / "file.py"), every=0)
+    with pytest.raises(OutputNotWritable, match=r"cannot write to the folder '.*file.py'"):
+        learned(oval, [], callbacks=[pictures])
 
 
 def test_without_evaluations_there_is_nothing_to_draw(oval, tmp_path):

@@ -26,7 +26,7 @@ from sb3_torcs.policies.mirror import (
     mirror_image,
     mirror_observations,
 )
-from sb3_torcs.policies.replay import sample_mirrored
+from sb3_torcs.policies.mirrored_replay import sample_mirrored
 from sb3_torcs.sensors import View, encode, feature_slices
 from sb3_torcs.vec_env import MirrorVecEnv, TorcsVecEnv
 

@@ -26,10 +26,10 @@ from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.race_setup import RaceSetup
 from sb3_torcs.torcs.starting_list import AGENT
 from sb3_torcs.torcs.track_names import find_track
-from sb3_torcs.training import lap_search
-from sb3_torcs.training.lap_line import Line, lap_of, repeated
-from sb3_torcs.training.lap_search import Budget, LapSearch
-from sb3_torcs.training.lap_starts import find_starts, ghost_environment
+from sb3_torcs.training.lap_search import search
+from sb3_torcs.training.lap_search.line import Line, lap_of, repeated
+from sb3_torcs.training.lap_search.search import Budget, LapSearch
+from sb3_torcs.training.lap_search.starts import find_starts, ghost_environment
 
 pytestmark = pytest.mark.usefixtures("game")
 
@@ -42,10 +42,10 @@ ONE_RACE = 1_000  # rollouts: more than a race of the tiny search takes, less th
 def tiny():
     """A search with few and short candidates."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(lap_search, "CANDIDATES", 2)
-        patch.setattr(lap_search, "GENERATIONS", 1)
-        patch.setattr(lap_search, "HORIZON", 2.0)
-        patch.setattr(lap_search, "STRIDE", 1.0)
+        patch.setattr(search, "CANDIDATES", 2)
+        patch.setattr(search, "GENERATIONS", 1)
+        patch.setattr(search, "HORIZON", 2.0)
+        patch.setattr(search, "STRIDE", 1.0)
         yield
 
 

@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 import sb3_torcs  # noqa: F401  (registers the environments)
 from sb3_torcs.agents import remote as driving
 from sb3_torcs.agents.models import ModelDriver, load_driver
-from sb3_torcs.callbacks.metrics import drive_lap
+from sb3_torcs.callbacks.driven_line import drive_lap
 from sb3_torcs.evaluation.protocol import evaluate
 from sb3_torcs.scr.protocol import RESTART
 

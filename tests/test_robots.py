@@ -10,11 +10,11 @@ import itertools
 
 import pytest
 
-from sb3_torcs.agents.robots import MAX_ROBOTS, race
-from sb3_torcs.agents.text_mode import run as run_game
+from sb3_torcs.agents.robots import race
 from sb3_torcs.backends.native import make_engine
 from sb3_torcs.car import CONTROL_TICK
 from sb3_torcs.errors import InvalidOption, OutputNotWritable, TrackNotFound, UnknownRobot
+from sb3_torcs.races.text_mode import run as run_game
 from sb3_torcs.telemetry import TELEMETRY_FIELDS
 from sb3_torcs.torcs.starting_list import AGENT
 
@@ -174,8 +174,8 @@ class TestRefusals:
     @pytest.mark.parametrize(
         ("robots", "laps", "message"),
         [
-            ([], 1, "0 robots; expected 1 to 20"),
-            ([("inferno", 3)] * (MAX_ROBOTS + 1), 1, "21 robots; expected 1 to 20"),
+            ([], 1, "robots are none; expected at least one, none of them twice"),
+            ([("inferno", slot) for slot in range(21)], 1, "21 cars are named; a grid .* for 20"),
             ([("inferno", 3)], 0, "laps is 0; expected a whole number from 1 to 1073741824"),
             ([("inferno", 3)], 1 << 31, "laps is 2147483648"),
             ([("inferno", 3)] * 2, 1, "expected at least one, none of them twice"),

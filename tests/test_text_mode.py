@@ -11,8 +11,6 @@ from types import SimpleNamespace
 import pytest
 from fake_game import write, write_game, write_program
 
-from sb3_torcs.agents import text_mode
-from sb3_torcs.agents.text_mode import run
 from sb3_torcs.errors import (
     GameFailed,
     GameIncomplete,
@@ -23,6 +21,8 @@ from sb3_torcs.errors import (
     UnknownCar,
     UnknownRobot,
 )
+from sb3_torcs.races import text_mode
+from sb3_torcs.races.text_mode import run
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.libraries import missing_libraries
 from sb3_torcs.torcs.process import game_environment

@@ -9,7 +9,6 @@ from typing import Any
 
 from sb3_torcs.backends.native import make_engine
 from sb3_torcs.car import CarState, Controls
-from sb3_torcs.errors import InvalidOption
 from sb3_torcs.telemetry import STATE_FIELDS, DriveLabel, DriveLog, write_telemetry
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.race_results import Lap, RobotResult
@@ -20,7 +19,6 @@ from sb3_torcs.tracks.catalogue import lasting_name, load_track
 __all__ = ["PARQUET", "drive_log", "race"]
 
 TICKS_AT_ONCE = 50  # a second of the race
-MAX_ROBOTS = 20  # that a grid of the game's tracks has room for
 PARQUET = ".parquet"
 """Ending of files that :mod:`sb3_torcs.telemetry.drives` writes; all others are CSV."""
 WORLD = "Torcs-v0"  # the same physics
@@ -80,8 +78,6 @@ def _engine(
     robots: Sequence[tuple[str, int]], track: str, laps: int, session: Session
 ) -> Iterator[Any]:
     """Start a race, and close its engine at the end."""
-    if not robots or len(robots) > MAX_ROBOTS:
-        raise InvalidOption(f"{len(robots)} robots; expected 1 to {MAX_ROBOTS}")
     RaceSetup(track, robots, laps, session)  # refuses races that the game itself cannot run
     engine = make_engine(find_game(), track, robots, session=session, laps=laps)
     try:

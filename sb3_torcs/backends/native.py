@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Sequence
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -12,7 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from sb3_torcs.actions import checked_gearbox
-from sb3_torcs.backends.seats import SeatWorld, align, facts_of, profile_of
+from sb3_torcs.backends.engine_world import EngineWorld, align
+from sb3_torcs.backends.seats import SeatWorld
 from sb3_torcs.car import (
     DEFAULT_CAR,
     MANY_LAPS,
@@ -27,14 +28,12 @@ from sb3_torcs.car import (
 )
 from sb3_torcs.errors import BackendUnavailable, EnvClosed, InvalidOption, TrackFileError
 from sb3_torcs.torcs.building import build_command
-from sb3_torcs.torcs.car_file import CarFacts
 from sb3_torcs.torcs.installation import Game, find_game
 from sb3_torcs.torcs.race_setup import SCR_SERVER, SESSIONS, RaceSetup, Session, session_for
 from sb3_torcs.torcs.starting_list import AGENT, starting_list
 from sb3_torcs.torcs.track_names import TrackFile, find_track
 from sb3_torcs.torcs.trial_child import encoded
 from sb3_torcs.tracks.catalogue import load_track
-from sb3_torcs.tracks.profile import RoadProfile
 from sb3_torcs.tracks.track import Track
 from sb3_torcs.tracks.trial import check_road, engine_arguments, try_race
 
@@ -171,7 +170,7 @@ def make_rollouts(engines: Sequence[Engine]) -> Rollouts:
     return rollouts
 
 
-class NativeBackend:
+class NativeBackend(EngineWorld):
     """
     One agent in the real game, alone or among its robots.
 
@@ -201,8 +200,7 @@ class NativeBackend:
         sensor_noise: bool = False,
         gearbox: str = "automatic",
     ) -> None:
-        game = find_game()
-        entries = starting_list(game, opponents, grid_place)
+        entries = starting_list(find_game(), opponents, grid_place)
         checked_laps(laps)
         self.car = car
         self.range_finder_angles = range_finder_angles(range_finders)
@@ -217,34 +215,15 @@ class NativeBackend:
             "gearbox": gearbox,
         }
         self._entries = entries
-        file = find_track(track, game)
-        self.engine = make_engine(
-            game,
-            file,
-            entries,
-            car=car,
-            session="race" if opponents else "practice",
-            laps=laps if opponents and laps else 0,
-            angles=self.range_finder_angles,
-            gearbox=gearbox,
-        )
-        self.track: Track = load_track(file)
+        self.engine, self.track = load_race(
+            track, entries, cars=[car], gearboxes=[gearbox], angles=[self.range_finder_angles],
+            laps=laps if opponents and laps else 0, flagged=False,
+        )  # fmt: skip
         self.seat = entries.index(AGENT)  # in the starting list
         self.gears = self.engine.gears(self.seat)
         self._noise = sensor_noise
         self._conditions = 1.0, 1.0
-        align(self.engine, self.track)
         self._drive: list[Any] = []  # steps since the reset, for copies
-
-    @cached_property
-    def profile(self) -> RoadProfile:
-        """The road with its hills; see :class:`~sb3_torcs.backends.base.Backend`."""
-        return profile_of(self.engine, self.track)
-
-    @cached_property
-    def facts(self) -> CarFacts:
-        """What the car's file says; see :class:`~sb3_torcs.backends.base.Backend`."""
-        return facts_of(self.car)
 
     def race_setup(self) -> RaceSetup:
         """
@@ -335,7 +314,7 @@ class NativeBackend:
         return self._state
 
     def close(self) -> None:
-        """Return the race to the pool of loaded races."""
+        """Close the race; its libraries are there for the next one."""
         self.engine.close()
 
     def __getstate__(self) -> dict[str, Any]:

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from sb3_torcs.backends.engine_world import EngineWorld
 from sb3_torcs.backends.several import Drawn, Turn, WorldPool
 from sb3_torcs.car import CarState, Controls, FloatArray, Start
 from sb3_torcs.errors import InvalidOption
-from sb3_torcs.torcs.car_file import CarFacts, car_facts
-from sb3_torcs.torcs.installation import find_game
-from sb3_torcs.tracks.profile import RoadProfile, game_profile
 from sb3_torcs.tracks.track import Track
 
 if TYPE_CHECKING:
@@ -27,57 +23,13 @@ __all__ = [
     "Seat",
     "SeatWorld",
     "SharedRace",
-    "align",
-    "facts_of",
-    "profile_of",
 ]
 
 REJOIN_SPEED = 20.0
 """[m/s] of a car that is put back on the road, where no start was drawn for it."""
 
 
-MIN_SHIFT = 1.0  # [m] between the game's frame and the track's, from which positions are moved
-
-
-def align(engine: Engine, track: Track) -> None:
-    """
-    Move positions into the track's frame: the game counts one track's origin otherwise.
-
-    :param engine: of a race
-    :param track: the same road as it was read from its file
-    """
-    there = engine.track_summary()
-    x, y, _ = track.pose(0.0)
-    if abs(x - there["x"]) > MIN_SHIFT or abs(y - there["y"]) > MIN_SHIFT:
-        engine.set_origin(x - there["x"], y - there["y"])
-
-
-_profiles: WeakKeyDictionary[Track, RoadProfile] = WeakKeyDictionary()
-"""Of tracks that were looked ahead on. Races on one track share it."""
-
-
-def profile_of(engine: Engine, track: Track) -> RoadProfile:
-    """
-    Return the road of a race with its hills.
-
-    :param engine: of the race
-    :param track: the same road as it was read from its file
-    """
-    if track not in _profiles:
-        _profiles[track] = game_profile(engine.road())
-    return _profiles[track]
-
-
-def facts_of(car: str) -> CarFacts:
-    """
-    Return what a car's file says.
-
-    :param car: its name in the game
-    """
-    return car_facts(find_game().find_car(car))
-
-
-class SeatWorld:
+class SeatWorld(EngineWorld):
     """
     The car of an agent in a race that is loaded.
 
@@ -92,16 +44,6 @@ class SeatWorld:
         self.range_finder_angles = angles
         self.car = engine.car_name(seat)
         self.gears = engine.gears(seat)
-
-    @cached_property
-    def profile(self) -> RoadProfile:
-        """The road with its hills; see :class:`~sb3_torcs.backends.base.Backend`."""
-        return profile_of(self.engine, self.track)
-
-    @cached_property
-    def facts(self) -> CarFacts:
-        """What the car's file says; see :class:`~sb3_torcs.backends.base.Backend`."""
-        return facts_of(self.car)
 
     def arrive(self, controls: Controls, ticks: int, state: CarState) -> None:
         """Take the result of a step, of which nothing has to be remembered."""

@@ -14,7 +14,7 @@ from stable_baselines3 import DDPG
 from sb3_torcs.bench.policy import SpacesOnly, fill
 from sb3_torcs.bench.torcs import Figures
 from sb3_torcs.policies import SplitHeadPolicy
-from sb3_torcs.policies.replay import sample_mirrored
+from sb3_torcs.policies.mirrored_replay import sample_mirrored
 from sb3_torcs.policies.threads import one_thread
 from sb3_torcs.policies.updates import LeanUpdates
 from sb3_torcs.training.zoo import config_file, read_entry

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import weakref
 from collections.abc import Sequence
-from typing import TextIO
+from typing import Any, TextIO
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
@@ -13,7 +14,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-__all__ = ["Display", "bars"]
+__all__ = ["Display", "Unbroken", "bars"]
 
 BLOCKS = " ▁▂▃▄▅▆▇█"
 CURVE_HEIGHT = 5  # lines
@@ -131,3 +132,31 @@ class Display:
             )
             curves.add_row(*cells)
         return curves
+
+
+class Unbroken:
+    """
+    Text output that drops its text when the reader of the pipe, such as ``tee``, has ended.
+
+    :param stream: to write to
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        """
+        :param text: to write
+        :return: its length
+        """
+        with contextlib.suppress(OSError):
+            self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        """Flush the stream."""
+        with contextlib.suppress(OSError):
+            self._stream.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)

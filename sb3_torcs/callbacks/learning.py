@@ -17,13 +17,13 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_torcs.callbacks.progress import RacingProgressCallback
-from sb3_torcs.callbacks.switches import require_method
+from sb3_torcs.callbacks.tree import require_method
 from sb3_torcs.car import check_count, is_number
 from sb3_torcs.errors import InvalidOption, renamed
 from sb3_torcs.policies import ppo, updates
 from sb3_torcs.policies.mirror import check_angles
+from sb3_torcs.policies.mirrored_replay import sample_mirrored
 from sb3_torcs.policies.ppo import LeanPPO
-from sb3_torcs.policies.replay import sample_mirrored
 from sb3_torcs.policies.split_head import SplitHeadPolicy
 from sb3_torcs.policies.updates import LeanUpdates
 
@@ -72,12 +72,8 @@ class _WhileLearning(BaseCallback):
         return True
 
     @abstractmethod
-    def _change(self, training: _Training) -> None:
-        """
-        Change the algorithm.
-
-        :param training: the model's ``train`` for once
-        """
+    def _change(self) -> Callable[..., None] | None:
+        """Change the algorithm; return what learns instead of ``train``, if something does."""
 
     @abstractmethod
     def _undo(self) -> None:
@@ -90,7 +86,7 @@ class _WhileLearning(BaseCallback):
         model: Any = self.model
         if "train" not in vars(model):
             model.train = _Training(model)
-        self._change(model.train)
+        model.train.train = self._change() or model.train.train
         model.train.undo.append(self._end)
 
     def _on_training_end(self) -> None:
@@ -129,7 +125,7 @@ class GradientStepsCallback(_WhileLearning):
             )
         self._algorithm, self._own = self.model, self.model.gradient_steps
 
-    def _change(self, training: _Training) -> None:
+    def _change(self) -> None:
         buffer = self._algorithm.replay_buffer
         remembered = 0 if buffer is None else buffer.size() * buffer.n_envs
         if max(self.num_timesteps, remembered) <= self.timesteps:
@@ -173,10 +169,9 @@ class LeanUpdatesCallback(_WhileLearning):
             self._updates.begin_rollout()
             self.model.policy.forward = self._updates.forward
 
-    def _change(self, training: _Training) -> None:
+    def _change(self) -> Callable[..., None] | None:
         self._undo()
-        if self._updates is not None:
-            training.train = self._updates.train
+        return None if self._updates is None else self._updates.train
 
     def _undo(self) -> None:
         vars(self.model.policy).pop("forward", None)
@@ -251,7 +246,7 @@ class AdaptiveLearningRateCallback(_WhileLearning):
         elif kl is not None and kl < 0.5 * target:
             self._set_factor(min(self.factor * RATE_STEP, MOST_RATE))
 
-    def _change(self, training: _Training) -> None:
+    def _change(self) -> None:
         self.model.lr_schedule = self._scaled
 
     def _scaled(self, progress_remaining: float) -> float:
@@ -348,7 +343,7 @@ class MirrorCallback(_WhileLearning):
             check_angles(angles, type(self).__name__)
         self._buffer = buffer
 
-    def _change(self, training: _Training) -> None:
+    def _change(self) -> None:
         self._buffer.sample = _MirroredSample(self._buffer)  # type: ignore[method-assign]
 
     def _undo(self) -> None:

@@ -5,17 +5,20 @@ from __future__ import annotations
 import csv
 import math
 import time
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 
-from sb3_torcs.callbacks.metrics import DrivenLine, DrivingMetricsCallback, callbacks_in
+from sb3_torcs.callbacks.driven_line import DrivenLine
+from sb3_torcs.callbacks.metrics import DrivingMetricsCallback
 from sb3_torcs.callbacks.progress import RacingProgressCallback, spoken_moment
+from sb3_torcs.callbacks.tree import callbacks_in
 from sb3_torcs.car import is_number
 from sb3_torcs.errors import InvalidOption
-from sb3_torcs.files import whole_file
+from sb3_torcs.files import writable_folder
 
 if TYPE_CHECKING:
     from matplotlib.figure import SubFigure
@@ -70,9 +73,10 @@ class LinePicturesCallback(BaseCallback):
     It writes ``001.png``, ``002.png``, ... and ``laps.csv`` into the folder; a resumed training
     continues the series. The first evaluation and the first whole lap are always drawn. The lines
     come from the :class:`~sb3_torcs.callbacks.DrivingMetricsCallback` of the same training. If a
-    file cannot be written, the series ends, but the training continues.
+    file cannot be written later, the series ends with a warning, but the training continues.
 
-    :param folder: is made
+    :param folder: is made when the training begins, which is an ``OutputNotWritable`` if it cannot
+        be written
     :param every: seconds between two pictures, at least [s]
     :param verbose: as in ``BaseCallback``
     """
@@ -98,6 +102,7 @@ class LinePicturesCallback(BaseCallback):
         self._progress = [item for item in callbacks if isinstance(item, RacingProgressCallback)]
         self._begun = time.monotonic()
         self._due = -math.inf  # [s] since then
+        writable_folder(self.folder)
         self._before = driven_laps(self.folder)
         self._complete = any(lap.lap_time for lap in self._before)
 
@@ -128,6 +133,8 @@ class LinePicturesCallback(BaseCallback):
         except OSError as error:
             self.writable = False
             self._say(f"no more pictures: {error}")
+            if not self._progress:
+                warnings.warn(f"no more pictures: {error}", stacklevel=2)
 
     def _draw(self, line: DrivenLine, lap: DrivenLap) -> Path:
         # Graphics load only when there is something to draw.
@@ -138,10 +145,7 @@ class LinePicturesCallback(BaseCallback):
         driven = f"{lap.lap_time:.2f} s" if lap.lap_time else f"{max(lap.distance, 0.0):.0f} m"
         title = f"{spoken_moment(lap.seconds)}, {lap.timesteps:,} timesteps: {driven}"
         points = np.column_stack([line.x, line.y])
-        with whole_file(path, "give another folder") as aside:
-            plot_track(
-                line.track, aside, line=points, speed=line.speed, title=title, fastest=FASTEST
-            )
+        plot_track(line.track, path, line=points, speed=line.speed, title=title, fastest=FASTEST)
         self._say(f"{spoken_moment(lap.seconds)}: the line it drives, {path}")
         return path
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import os
 import sys
@@ -11,12 +10,14 @@ from typing import Any, TextIO
 
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_torcs.callbacks.display import Display
-from sb3_torcs.callbacks.metrics import DrivenLine, DrivingMetricsCallback, callbacks_in
+from sb3_torcs.callbacks.display import Display, Unbroken
+from sb3_torcs.callbacks.driven_line import DrivenLine
+from sb3_torcs.callbacks.metrics import DrivingMetricsCallback
+from sb3_torcs.callbacks.tree import callbacks_in
 from sb3_torcs.car import is_number
 from sb3_torcs.errors import InvalidOption
 
-__all__ = ["RacingProgressCallback", "Unbroken", "spoken_moment", "spoken_time"]
+__all__ = ["RacingProgressCallback", "spoken_moment", "spoken_time"]
 
 REDRAW = 0.2  # [s] between two pictures of the display
 FIRST_LAP = "bold green"  # style of the line that tells of it
@@ -45,34 +46,6 @@ def spoken_moment(seconds: float) -> str:
     """
     minutes, rest = divmod(round(seconds), 60)
     return f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"
-
-
-class Unbroken:
-    """
-    Text output that drops its text when the reader of the pipe, such as ``tee``, has ended.
-
-    :param stream: to write to
-    """
-
-    def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
-
-    def write(self, text: str) -> int:
-        """
-        :param text: to write
-        :return: its length
-        """
-        with contextlib.suppress(OSError):
-            self._stream.write(text)
-        return len(text)
-
-    def flush(self) -> None:
-        """Flush the stream."""
-        with contextlib.suppress(OSError):
-            self._stream.flush()
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._stream, name)
 
 
 class RacingProgressCallback(BaseCallback):

@@ -8,7 +8,7 @@ from typing import Any
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_torcs.callbacks.metrics import callbacks_in
+from sb3_torcs.callbacks.tree import callbacks_in, require_method
 from sb3_torcs.car import (
     StartName,
     checked_delay,
@@ -21,7 +21,7 @@ from sb3_torcs.car import (
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.rewards import Reward, RewardChoice
 
-__all__ = ["ConditionsCallback", "RandomStartCallback", "RewardCallback", "require_method"]
+__all__ = ["ConditionsCallback", "RandomStartCallback", "RewardCallback"]
 
 
 class _SwitchUser(BaseCallback):
@@ -62,7 +62,7 @@ class RewardCallback(_SwitchUser):
         super().__init__(verbose)
         Reward(reward)  # checked here, for a message of this process and not of a worker
         if timesteps != 0 and not is_count(timesteps):
-            raise InvalidOption(f"timesteps is {timesteps!r}; pass a whole number")
+            raise InvalidOption(f"timesteps is {timesteps!r}; pass a whole number >= 0")
         self.reward = reward
         self.also_eval = also_eval
         self.timesteps = timesteps
@@ -156,21 +156,6 @@ class ConditionsCallback(_SwitchUser):
     def _on_training_start(self) -> None:
         super()._on_training_start()
         self._switches = [_Switch(self.training_env, "set_conditions", self.conditions)]
-
-
-def require_method(env: VecEnv, name: str) -> None:
-    """
-    Make sure that environments have a method. A worker process would end with an error.
-
-    :param env: of the training
-    :param name: of the method
-    :raises InvalidOption: if they lack it
-    """
-    if not env.has_attr(name):
-        raise InvalidOption(
-            f"the environment has no {name}; use Torcs-v0, TorcsLite-v0 or another RacingEnv of "
-            "sb3_torcs"
-        )
 
 
 class _Switch:

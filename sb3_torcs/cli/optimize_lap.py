@@ -23,7 +23,7 @@ from sb3_torcs.files import writable_file
 
 if TYPE_CHECKING:
     from sb3_torcs.agents.ghosts import Ghost
-    from sb3_torcs.training.lap_search import Budget, LapSearch, State
+    from sb3_torcs.training.lap_search.search import Budget, LapSearch, State
 
 __all__ = ["add_parser", "run"]
 
@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
     """
     from sb3_torcs.agents.models import driver_name
     from sb3_torcs.errors import InvalidOption
-    from sb3_torcs.training.lap_starts import ghost_environment
+    from sb3_torcs.training.lap_search.starts import ghost_environment
 
     kwargs = ghost_environment(args.agent, args.track, args.car)
     if args.action_repeat is not None:
@@ -123,8 +123,8 @@ def _search(args: argparse.Namespace, kwargs: dict[str, Any]) -> tuple[Ghost | N
 
     :return: the best lap, how far the search came, and whether it was stopped
     """
-    from sb3_torcs.training.lap_search import Budget, LapSearch
-    from sb3_torcs.training.lap_starts import find_starts
+    from sb3_torcs.training.lap_search.search import Budget, LapSearch
+    from sb3_torcs.training.lap_search.starts import find_starts
 
     begun = time.monotonic()
     starts = find_starts(args.agent, kwargs, alone=args.alone, trust=args.trust)

@@ -161,7 +161,7 @@ def _drive(
     session = session_for(robots)
     with Console(stderr=True).status(f"{len(robots)} on {track}, {args.laps} laps"):
         if args.game:
-            from sb3_torcs.agents.text_mode import run as run_game
+            from sb3_torcs.races.text_mode import run as run_game
 
             return run_game(game, track, robots, args.laps, session)
         from sb3_torcs.agents.robots import race

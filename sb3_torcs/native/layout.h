@@ -10,6 +10,8 @@
 
 namespace torcs {
 
+constexpr int MANY_LAPS = 1 << 30;  // of a race without an end
+
 template <std::size_t n>
 using Unused = unsigned char[n];
 

@@ -9,7 +9,6 @@
 namespace torcs {
 namespace {
 
-constexpr double PI = 3.14159265358979323846;
 constexpr int SETTLING_STEPS = 300;  // of a car put down at the height at which it stands
 constexpr int AGAINST_RIGHT = 0;     // of to_global
 
@@ -34,7 +33,7 @@ int gear_for(const Field& field, const CarElement& car, double speed) {
 bool is_valid(const Start& start, double track_length) {
     // A car may stand a little beyond the end, because the game adds lengths up in several ways.
     return start.distance >= 0.0 && start.distance <= track_length + 1.0 &&
-           std::fabs(start.track_position) <= 5.0 && std::fabs(start.heading_error) <= 2.0 * PI &&
+           std::fabs(start.track_position) <= 5.0 && std::fabs(start.heading_error) <= 2.0 * M_PI &&
            start.speed >= 0.0 && start.speed <= 200.0;
 }
 
@@ -55,8 +54,8 @@ void place(const Field& field, CarElement& car, float distance, float to_right, 
     if (segment->type == LEFT_TURN) pose.az = segment->heading + position.to_start;
     pose.az -= heading_error;
     pose.z = field.road_height(&position) + height;
-    while (pose.az > 2 * PI) pose.az -= 2 * PI;
-    while (pose.az < 0) pose.az += 2 * PI;
+    while (pose.az > 2 * M_PI) pose.az -= 2 * M_PI;
+    while (pose.az < 0) pose.az += 2 * M_PI;
     field.simulation->config(&car, field.manager);
 }
 

@@ -17,7 +17,6 @@ constexpr std::size_t RACE_MEMORY = std::size_t{128} << 20;  // reserved; a full
 constexpr std::size_t TRACK_MEMORY = std::size_t{64} << 20;
 
 constexpr float PIT_LENGTH = 15.0f, SHORTEST_PIT = 1.0f;  // [m] by default; longer than nothing
-constexpr int MANY_LAPS = 1 << 30;
 
 const char* const SKILLS[] = {"rookie", "amateur", "semi-pro", "pro"};
 constexpr int SEMI_PROFESSIONAL = 2;  // what the game takes for drivers that do not say

@@ -6,8 +6,7 @@
 namespace torcs {
 namespace {
 
-constexpr double PI = 3.14159265358979323846;
-constexpr double SECTOR = 2.0 * PI / OPPONENT_SECTORS;  // [rad]
+constexpr double SECTOR = 2.0 * M_PI / OPPONENT_SECTORS;  // [rad]
 
 constexpr double RANGE_FINDER_NOISE = 0.1;  // [-] standard deviation relative to the reading
 constexpr double OPPONENT_NOISE = 0.02;
@@ -157,7 +156,7 @@ private:
 }  // namespace
 
 double heading_error(const CarElement& car) {
-    return std::remainder(road_heading(car.pub.track) - car.pub.local.pos.az, 2.0 * PI);
+    return std::remainder(road_heading(car.pub.track) - car.pub.local.pos.az, 2.0 * M_PI);
 }
 
 double distance_from_start(const CarElement& car) {
@@ -191,7 +190,7 @@ void range_finders(const CarElement& car, const double* angles, double* distance
 void focused_range_finders(const CarElement& car, double direction, double* distances) {
     double angles[RANGE_FINDERS] = {}, all[RANGE_FINDERS];
     for (int i = 0; i < FOCUS_BEAMS; i++)
-        angles[i] = direction + (i - FOCUS_BEAMS / 2) * PI / 180.0;
+        angles[i] = direction + (i - FOCUS_BEAMS / 2) * M_PI / 180.0;
     range_finders(car, angles, all);
     std::copy_n(all, FOCUS_BEAMS, distances);
 }
@@ -207,7 +206,7 @@ void opponents(const CarElement& car, CarElement* const* cars, int number, doubl
         const double x = double(other.pub.local.pos.x) - own.x;
         const double y = double(other.pub.local.pos.y) - own.y;
         const double distance = std::hypot(x, y);
-        const double clockwise = PI + std::remainder(own.az - std::atan2(y, x), 2.0 * PI);
+        const double clockwise = M_PI + std::remainder(own.az - std::atan2(y, x), 2.0 * M_PI);
         if (!(distance < SENSOR_RANGE && clockwise >= 0.0)) continue;  // nor what is no number
         // Half a turn to either side is the same direction: straight behind is sector 0.
         double& nearest = distances[int(clockwise / SECTOR) % OPPONENT_SECTORS];
@@ -279,7 +278,7 @@ std::uint64_t Generator::next() {
 double Generator::normal() {
     constexpr double UNIT = 0x1p-53;
     const double radius = std::sqrt(-2.0 * std::log(double((next() >> 11) + 1) * UNIT));
-    return radius * std::cos(2.0 * PI * (double(next() >> 11) * UNIT));
+    return radius * std::cos(2.0 * M_PI * (double(next() >> 11) * UNIT));
 }
 
 void add_noise(Generator& generator, double* range_finders, double* opponents) {

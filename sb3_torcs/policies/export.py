@@ -22,7 +22,7 @@ from sb3_torcs.files import whole_file
 __all__ = ["INPUT", "OUTPUT", "export_actor"]
 
 INPUT, OUTPUT = "observation", "action"
-"""Names in the graph: (n, …) float32 as the environment gives them, and (n, 3) as it takes them."""
+"""Names in the graph: rows of float32 as the environment gives them, and as it takes them."""
 
 NEEDED = ("onnx", "onnxscript")
 

@@ -17,7 +17,7 @@ from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.td3.policies import Actor
 from torch import nn
 from torch.func import functional_call
-from torch.optim.swa_utils import AveragedModel
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from sb3_torcs.policies import fused
 from sb3_torcs.policies.flat import FlatParameters
@@ -202,20 +202,8 @@ class ActorAverage(AveragedModel):
     """
 
     def __init__(self, actor: Actor, decay: float) -> None:
-        super().__init__(actor)
+        super().__init__(actor, multi_avg_fn=get_ema_multi_avg_fn(decay))
         self.decay = decay
-
-    @th.no_grad()
-    def update_parameters(self, model: nn.Module) -> None:
-        """
-        Follow the actor.
-
-        :param model: the actor
-        """
-        share = 1.0 - self.decay if self.n_averaged > 0 else 1.0
-        for average, new in zip(self.module.parameters(), model.parameters(), strict=True):
-            average.lerp_(new, share)
-        self.n_averaged += 1
 
 
 class LateActionQ(nn.Module):

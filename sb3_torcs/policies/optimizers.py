@@ -6,7 +6,6 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-import numpy as np
 import torch as th
 
 from sb3_torcs.policies import kernels
@@ -48,19 +47,6 @@ class LeanAdam(_LrScale, th.optim.Adam):
     def __init__(self, params: Any, **kwargs: Any) -> None:
         super().__init__(params, **{**kwargs, "fused": True})
 
-    def zero_grad(self, set_to_none: bool = True) -> None:
-        """
-        Forget the gradients.
-
-        :param set_to_none: as in ``Adam``
-        """
-        if not set_to_none:
-            super().zero_grad(set_to_none=False)
-            return
-        for group in self.param_groups:
-            for param in group["params"]:
-                param.grad = None
-
     @th.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> Any:
         """
@@ -74,18 +60,10 @@ class LeanAdam(_LrScale, th.optim.Adam):
         for group in self.param_groups:
             for param in group["params"]:
                 if param.grad is not None:
-                    self.step_of(param, param.grad.contiguous().view(-1).numpy())
+                    weights, gradient = param.detach(), param.grad.contiguous()
+                    flat = (own.numpy().reshape(-1) for own in (weights, gradient))
+                    kernels.adam(*flat, *self.begin_step(param))
         return None
-
-    def step_of(self, param: th.Tensor, gradient: np.ndarray) -> None:
-        """
-        Make one update of one parameter.
-
-        :param param: contiguous, on the CPU
-        :param gradient: its gradient, flat
-        """
-        weights = param.detach().numpy().reshape(-1)
-        kernels.adam(weights, gradient, *self.begin_step(param))
 
     def begin_step(self, param: th.Tensor) -> tuple[Any, ...]:
         """

@@ -271,16 +271,24 @@ def _stretches(
         look = tick + LOOK
         while tick < look and not engine.ended:
             ticks = look - tick if pilots is None else min(pilots.act(tick), look - tick)
-            for part in [1] * ticks if watchers else [ticks]:
-                engine.drive(part)
-                for watcher in watchers:
-                    watcher.look()
-                if engine.ended:
-                    break
+            _drive(engine, ticks, watchers)
             tick += ticks
         yield
         if all(out or engine.finished(car) for car, *_, out in engine.results()):
             return
+
+
+def _drive(engine: Engine, ticks: int, watchers: Sequence[Watcher]) -> None:
+    """Drive on, as far as the race goes."""
+    if not watchers:
+        engine.drive(ticks)
+        return
+    for _ in range(ticks):
+        if engine.ended:  # what has been looked at already
+            return
+        engine.drive(1)
+        for watcher in watchers:
+            watcher.look()
 
 
 def _standings(engine: Engine, names: Sequence[str]) -> list[Standing]:

@@ -72,13 +72,13 @@ class RaceSetup:
         checked_choice("session", self.session, SESSIONS)
         checked_laps(self.laps)
         drivers = list(self.drivers)
+        if not drivers or len(set(drivers)) < len(drivers):
+            named = ", ".join(f"{name}:{index}" for name, index in drivers) or "none"
+            raise InvalidOption(f"robots are {named}; expected at least one, none of them twice")
         if self.session == "practice" and len(drivers) != 1:
             raise InvalidOption(
                 f"a practice is for one robot, but {len(drivers)} are named; choose session 'race'"
             )
-        if not drivers or len(set(drivers)) < len(drivers):
-            named = ", ".join(f"{name}:{index}" for name, index in drivers) or "none"
-            raise InvalidOption(f"robots are {named}; expected at least one, none of them twice")
         if len(drivers) > GRID_SLOTS:
             raise InvalidOption(
                 f"{len(drivers)} cars are named; a grid of the game has room for {GRID_SLOTS}"

@@ -341,7 +341,7 @@ def _run_zoo(
     :param wanted: timesteps to learn from
     :param env_kwargs: of its environments
     """
-    from sb3_torcs.callbacks.progress import Unbroken
+    from sb3_torcs.callbacks.display import Unbroken
     from sb3_torcs.training import manager as zoo_training
     from sb3_torcs.training.keeping import SAVING
 

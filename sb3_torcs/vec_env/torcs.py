@@ -25,7 +25,7 @@ from sb3_torcs.errors import EnvClosed, InvalidOption
 __all__ = ["RaceInfo", "TorcsVecEnv", "glance"]
 
 TRUNCATED = "TimeLimit.truncated"
-NO_LIMIT = 1 << 62
+ENDLESS = 1 << 62
 
 
 class RaceInfo(MutableMapping[str, Any]):
@@ -177,7 +177,7 @@ class TorcsVecEnv(DummyVecEnv):
             raise
         self.threads = self._batch.threads
         self._elapsed = np.zeros(self.num_envs, np.int64)  # timesteps of the episodes
-        self._limits = np.full(self.num_envs, NO_LIMIT)
+        self._limits = np.full(self.num_envs, ENDLESS)
         self._watched = [i for i, race in enumerate(self._races) if race.is_watched]
 
     @property
@@ -373,7 +373,7 @@ class _Race:
             self.append = self._monitor.rewards.append
         if self._limit is None:
             self._noted = 0
-            return 0, NO_LIMIT
+            return 0, ENDLESS
         self._noted = self._limit._elapsed_steps
         return self._noted, self._limit._max_episode_steps
 

@@ -9,9 +9,8 @@
 namespace torcs::scr {
 namespace {
 
-constexpr double PI = 3.14159265358979323846;
-constexpr double RADIANS = PI / 180.0;  // per degree
-constexpr double KM_PER_HOUR = 3.6;     // per m/s
+constexpr double RADIANS = M_PI / 180.0;  // per degree
+constexpr double KM_PER_HOUR = 3.6;       // per m/s
 // The server calls revolutions what is ten times the angular speed.
 constexpr double RPM = 10.0;
 constexpr int DIGITS = 6;

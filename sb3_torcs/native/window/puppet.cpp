@@ -22,8 +22,7 @@ namespace {
 
 using namespace torcs;
 
-constexpr int LOOK_AROUND = 500;    // [ms] between two looks after the owner
-constexpr int MANY_LAPS = 1 << 30;  // of a race without an end
+constexpr int LOOK_AROUND = 500;  // [ms] between two looks after the owner
 
 // The parts of the game's graphics that remember the previous picture: some of the cameras, and the
 // needles of a car's instruments.

@@ -23,8 +23,16 @@ from sb3_torcs.envs.making import checked_threads
 from sb3_torcs.evaluation.protocol import RACE_LAPS
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.starting_list import AGENT
-from sb3_torcs.training.lap_line import PEDAL, STEERING, Line, blended, lap_of, repeated, waypoint
-from sb3_torcs.training.lap_starts import Start
+from sb3_torcs.training.lap_search.line import (
+    PEDAL,
+    STEERING,
+    Line,
+    blended,
+    lap_of,
+    repeated,
+    waypoint,
+)
+from sb3_torcs.training.lap_search.starts import Start
 
 __all__ = ["Budget", "LapSearch", "State"]
 

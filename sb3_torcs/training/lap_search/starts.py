@@ -19,7 +19,7 @@ from sb3_torcs.errors import InvalidOption, RobotUnavailable
 from sb3_torcs.evaluation.protocol import KEPT, RACE_LAPS, time_limit
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.track_names import lasting_track
-from sb3_torcs.training.lap_line import waypoint
+from sb3_torcs.training.lap_search.line import waypoint
 
 __all__ = ["Start", "find_starts", "ghost_environment"]
 

@@ -1,0 +1,1 @@
+"""A search for a fast lap, which a ghost keeps."""
