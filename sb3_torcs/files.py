@@ -15,6 +15,7 @@ import yaml
 from sb3_torcs.errors import OutputNotWritable, Sb3TorcsError
 
 __all__ = [
+    "IN_A_FOLDER",
     "listed",
     "path_and_arguments",
     "read_yaml",
@@ -22,6 +23,9 @@ __all__ = [
     "writable_file",
     "writable_folder",
 ]
+
+IN_A_FOLDER = "choose a file in an existing folder that you may write to"
+"""Advice where a file cannot be written."""
 
 MAX_LENGTH = 2**16  # [characters] PyYAML takes about a second for as many
 MAX_BRACKETS = 100  # open at once: PyYAML's time grows with their square

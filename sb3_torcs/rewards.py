@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Literal
 
 from sb3_torcs.car import CAR_WIDTH, FIRST_RIVAL, RIVALS, CarState, Controls, is_number
@@ -152,6 +153,10 @@ TERMS: dict[str, Term] = {
         places, gap, contact, fault, closing, passing, off_line, leaving,
     )
 }  # fmt: skip
+"""By name. Own ones may be added: functions of the car before and after, and of the controls."""
+
+OWN_TERMS: tuple[Term, ...] = tuple(TERMS.values())
+"""Those of this package, which return numbers."""
 
 LARGEST = 1e9  # of a weight, so that no reward is infinite
 SCALE = 0.1  # [1/m] a reward of 1 for ten metres along the road
@@ -186,7 +191,8 @@ class Reward:
         mapping may also hold ``scale`` (a factor on all terms, 1 if left out) and ``crash`` (added
         once, unscaled, when the episode ends badly, 0 if left out)
     :raises UnknownRewardTerm: if a name is unknown
-    :raises InvalidOption: if a weight is no number from -1e9 to 1e9
+    :raises InvalidOption: if a weight is no number from -1e9 to 1e9, or if an added term is no
+        function, or has a name that means something else
     """
 
     def __init__(self, reward: RewardChoice) -> None:
@@ -215,10 +221,16 @@ class Reward:
                     f"{-LARGEST:g} to {LARGEST:g}"
                 )
         self.weights = {name: float(weight) for name, weight in weights.items()}
+        for name in ("scale", "crash"):
+            if name in TERMS:
+                raise InvalidOption(
+                    f"a reward term is called '{name}', which is no term of a reward; add it to "
+                    "TERMS by another name"
+                )
         scale = self.weights.get("scale", 1.0)
         self._crash = float(weights.get("crash", 0.0))
         self.terms = tuple(
-            (name, TERMS[name], float(weight) * scale)
+            (name, _checked_term(name, TERMS[name]), float(weight) * scale)
             for name, weight in weights.items()
             if name in TERMS
         )
@@ -242,6 +254,7 @@ class Reward:
         :param controls: that were held in between
         :param end: why the episode ended, or ``None``
         :return: the weighted terms, ``crash`` last; their sum is the reward
+        :raises InvalidOption: if a term that was added returns no finite number
         """
         seconds = after.time - before.time
         terms = {}  # filled in a loop: a comprehension is one more call per timestep
@@ -250,3 +263,22 @@ class Reward:
             terms[name] = weight * seconds * term(before, after, controls) if seconds else 0.0
         terms["crash"] = self._crash if end in CRASHES else 0.0
         return terms
+
+
+def _checked_term(name: str, term: Term) -> Term:
+    """Let the values of a term be checked, if somebody has added it."""
+    if term in OWN_TERMS:
+        return term
+    if not callable(term):
+        raise InvalidOption(
+            f"reward term '{name}' is {term!r}; expected a function of the car before, the car "
+            "after and the controls"
+        )
+    return partial(_finite, name, term)  # no closure, which could not be pickled
+
+
+def _finite(name: str, term: Term, before: CarState, after: CarState, controls: Controls) -> float:
+    value = term(before, after, controls)
+    if not is_number(value):
+        raise InvalidOption(f"reward term '{name}' returned {value!r}; expected a finite number")
+    return float(value)

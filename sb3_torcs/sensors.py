@@ -26,7 +26,7 @@ from numba import literal_unroll, njit, types
 from numba.extending import overload
 
 from sb3_torcs.car import FIRST_RIVAL, KMH, REST_HEIGHT, RIVALS, CarState, FloatArray
-from sb3_torcs.errors import InvalidOption
+from sb3_torcs.errors import InvalidOption, near_miss
 from sb3_torcs.rivals import see_rivals
 from sb3_torcs.tracks.profile import INTERVALS, QUANTITIES, RoadProfile, look_ahead, speed_margins
 from sb3_torcs.tracks.racing_line import (
@@ -219,11 +219,14 @@ OBSERVATION_LOW = _LOW[:OBSERVATION_SIZE].astype(np.float32)
 OBSERVATION_HIGH = _HIGH[:OBSERVATION_SIZE].astype(np.float32)
 
 
-def checked_sensors(sensors: Sequence[SensorsName]) -> tuple[SensorsName, ...]:
+def checked_sensors(
+    sensors: Sequence[SensorsName], option: str = "sensors"
+) -> tuple[SensorsName, ...]:
     """
     Check a choice of groups.
 
     :param sensors: names of groups, ``"base"`` among them
+    :param option: that chooses them, for the message
     :return: the same in the order of the table
     :raises InvalidOption: if one is unknown or missing
     """
@@ -231,9 +234,10 @@ def checked_sensors(sensors: Sequence[SensorsName]) -> tuple[SensorsName, ...]:
     names = [name for name in GROUPS if listed and name in sensors]
     if "base" not in names or len(names) < len(sensors):
         others = ", ".join(repr(name) for name in GROUPS if name != "base")
-        raise InvalidOption(
-            f"sensors is {sensors!r}; expected a list with 'base', and any of {others}, each once"
-        )
+        advice = f"expected a list with 'base', and any of {others}, each once"
+        unknown = next((str(name) for name in sensors if name not in names), "") if listed else ""
+        hint = near_miss(unknown, GROUPS, advice)
+        raise InvalidOption(f"{option} is {sensors!r}{hint}")
     return tuple(names)
 
 

@@ -4,7 +4,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from stable_baselines3 import A2C, PPO
+from sb3_contrib import RecurrentPPO
+from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
 from torch import nn
 from toy import ToyRace
 
@@ -45,6 +46,24 @@ def test_each_actuator_may_have_a_deviation_of_its_own():
             InvalidOption, match=r"log_std_init is .*; expected numbers from -20 to"
         ):
             make(log_std_init=wrong)
+
+
+@pytest.mark.parametrize("algorithm", [SAC, TD3, DDPG, RecurrentPPO])
+def test_other_algorithms_are_told_their_policies(algorithm):
+    with pytest.raises(InvalidOption, match="a policy of PPO and A2C; give DDPG and TD3 SplitHead"):
+        algorithm(BoundedPolicy, ToyRace())
+    assert not hasattr(make().policy, "actor")
+
+
+@pytest.mark.parametrize("algorithm", [PPO, A2C])
+def test_algorithms_know_it_by_name(algorithm):
+    assert type(algorithm("BoundedPolicy", ToyRace()).policy) is BoundedPolicy
+
+
+@pytest.mark.parametrize("net_arch", [[0, 8], [8.5], {"pi": [8], "vf": ["8"]}])
+def test_layers_have_whole_sizes(net_arch):
+    with pytest.raises(InvalidOption, match="is no layer size; pass whole numbers >= 1"):
+        make(net_arch=net_arch)
 
 
 def test_a_saved_model_decides_as_before(tmp_path):
@@ -163,7 +182,7 @@ def test_an_actor_cannot_see_what_the_environment_does_not_give():
     ):
         make_asymmetric(actor_sensors=["base", "line"])
     for wrong in ("base", ["line"], ["base", "base"], 3):
-        with pytest.raises(InvalidOption, match="expected a list with 'base'"):
+        with pytest.raises(InvalidOption, match=r"actor_sensors is .* expected a list with 'base'"):
             make_asymmetric(actor_sensors=wrong)
     with pytest.raises(InvalidOption, match="take out what changes their bounds or size"):
         PPO(BoundedPolicy, gym.make("Pendulum-v1"), policy_kwargs={"actor_sensors": ["base"]})

@@ -575,6 +575,31 @@ def test_an_evaluation_has_a_number_of_laps(laps):
         evaluation.race_environment("TorcsLite-v0", {}, track="aalborg", laps=laps)
 
 
+def test_an_evaluation_takes_its_environment_from_a_record_that_may_be_empty():
+    with pytest.raises(InvalidOption, match=r"env_id is None.*pass 'Torcs-v0' or 'TorcsLite-v0'"):
+        evaluation.race_environment(None, {}, "aalborg")
+    with evaluation.race_environment("TorcsLite-v0", None, "aalborg") as env:
+        assert env.get_wrapper_attr("laps") == 3
+
+
+def test_an_evaluation_refuses_arguments_that_no_environment_has():
+    """Those that it leaves out on purpose are no mistake."""
+    given = {"opponents": ["bt"], "start": "random", "max_episode_steps": 9, "sensr": ["base"]}
+    with pytest.raises(InvalidOption, match=r"'sensr', which no.*did you mean 'sensors'"):
+        evaluation.race_environment("TorcsLite-v0", given, "aalborg")
+    del given["sensr"]
+    with evaluation.race_environment("TorcsLite-v0", given, "aalborg") as env:
+        assert env.spec.max_episode_steps > 9
+
+
+@pytest.mark.parametrize("driver", ["ddpg-aalborg", None])
+def test_an_evaluation_is_of_something_that_drives(driver):
+    with gym.make("TorcsLite-v0") as env:
+        message = f"driver is {driver!r}, which has no predict; .*load_driver"
+        with pytest.raises(InvalidOption, match=message):
+            evaluation.evaluate(env, driver)
+
+
 def test_an_evaluation_is_of_one_environment():
     with pytest.raises(InvalidOption, match="VectorEnv is no single environment"):
         evaluation.evaluate(gym.make_vec("TorcsLite-v0", num_envs=2), ScriptedDriver())

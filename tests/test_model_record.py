@@ -17,13 +17,19 @@ from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
 from stable_baselines3.common.callbacks import CheckpointCallback
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.save_util import load_from_zip_file
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 from torch import nn
 
 import sb3_torcs  # noqa: F401  (registers the environments)
 from sb3_torcs.agents import model_file, model_policy, models
 from sb3_torcs.agents.model_writing import RecordCallback, recipe, write_driver
-from sb3_torcs.errors import InvalidAction, ModelMismatch, ModelNotTrusted
+from sb3_torcs.errors import (
+    InvalidAction,
+    InvalidOption,
+    ModelMismatch,
+    ModelNotTrusted,
+    OutputNotWritable,
+)
 from sb3_torcs.policies import BoundedPolicy, SplitHeadPolicy
 from sb3_torcs.tracks.catalogue import load_track
 
@@ -149,6 +155,39 @@ def test_without_a_recipe_the_environment_tells(tmp_path):
     record = models.training_record(tmp_path / "m.zip")
     assert (record.algo, record.env_id) == ("ddpg", "TorcsLite-v0")
     assert record.kept(("track", "action_repeat")) == {"track": "alpine-1", "action_repeat": 10}
+
+
+def test_arrays_among_the_arguments_of_an_environment_are_recorded_as_lists(tmp_path):
+    """Left out, an evaluation would show the policy other beams."""
+    angles = np.linspace(-60, 60, 19)
+    made = {"range_finders": angles, "delay": np.array([0, 3]), "laps": np.int64(2)}
+    with gym.make("TorcsLite-v0", **made) as env:
+        trained(DDPG, "MlpPolicy", env, **OFF_POLICY).save(tmp_path / "m.zip")
+    record = models.training_record(tmp_path / "m.zip")
+    assert record.env_kwargs == {"range_finders": angles.tolist(), "delay": [0, 3], "laps": 2}
+
+
+@pytest.mark.parametrize("normalized", [False, True])
+def test_a_frame_stack_of_a_script_is_recorded(env, tmp_path, normalized):
+    where = DummyVecEnv([lambda: gym.make("TorcsLite-v0")])
+    where = VecFrameStack(VecNormalize(where) if normalized else where, 3)
+    model = trained(PPO, "MlpPolicy", where, n_steps=8, batch_size=8)
+    model.save(tmp_path / "m.zip")
+    assert models.training_record(tmp_path / "m.zip").hyperparameters["frame_stack"] == 3
+    driver = models.load_driver(tmp_path / "m.zip", env)
+    seen = where.venv.normalize_obs(OBSERVATIONS[:1]) if normalized else OBSERVATIONS[:1]
+    stacked = np.concatenate([np.zeros((1, 58), np.float32), seen], axis=1)
+    found, _ = driver.predict(OBSERVATIONS[:1], deterministic=True)
+    np.testing.assert_array_equal(found, model.predict(stacked, deterministic=True)[0])
+    where.close()
+
+
+def test_a_frame_stack_within_statistics_cannot_be_driven_and_says_so(env, tmp_path):
+    where = VecNormalize(VecFrameStack(DummyVecEnv([lambda: gym.make("TorcsLite-v0")]), 3))
+    trained(PPO, "MlpPolicy", where, n_steps=8, batch_size=8).save(tmp_path / "m.zip")
+    where.close()
+    with pytest.raises(ModelMismatch, match=r"sees 3 observations at once.*around VecNormalize"):
+        models.load_driver(tmp_path / "m.zip", env)
 
 
 def test_stock_sb3_reads_the_file_as_before_and_a_later_training_makes_the_record_void(tmp_path):
@@ -345,6 +384,37 @@ def test_a_driver_alone_drives_the_same_and_learns_nothing(env, tmp_path, record
         np.testing.assert_array_equal(driver.predict(OBSERVATIONS, deterministic=True)[0], expected)
     with pytest.raises(InvalidAction, match="nan"):
         stock.learn(20)
+
+
+def test_a_driver_may_take_the_place_of_its_model(env, file):
+    """Paths may be words; nothing is lost."""
+    before = models.load_driver(file, env).predict(OBSERVATIONS, deterministic=True)[0]
+    write_driver(str(file), str(file))
+    assert models.training_record(file).driver_only
+    after = models.load_driver(file, env).predict(OBSERVATIONS, deterministic=True)[0]
+    np.testing.assert_array_equal(before, after)
+
+
+def test_a_driver_that_cannot_be_written_leaves_the_file_that_was_there(
+    file, tmp_path, monkeypatch
+):
+    old = tmp_path / "driver.zip"
+    old.write_bytes(b"old")
+
+    def full(*args, **kwargs):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(zipfile.ZipFile, "writestr", full)
+        with pytest.raises(OutputNotWritable, match="No space left"):
+            write_driver(file, old)
+    assert old.read_bytes() == b"old"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["driver.zip", "m.zip"]
+
+
+def test_a_driver_is_written_from_a_file_and_not_from_a_model(tmp_path):
+    with pytest.raises(InvalidOption, match=r"model is a PPO; .*model.save\('model.zip'\)"):
+        write_driver(PPO.__new__(PPO), tmp_path / "driver.zip")
 
 
 @pytest.mark.parametrize("kept", [True, False])

@@ -166,7 +166,7 @@ def test_a_wrong_action_drives_nobody(make, actions, message):
     ("options", "message"),
     [
         ({"agents": 30}, "agents is 30, with 0 opponents"),
-        ({"max_episode_steps": 0}, "max_episode_steps is 0"),
+        ({"max_episode_steps": 0}, "max_episode_steps is 0.*or None for no limit"),
         ({"opponents": "bt"}, "opponents is 'bt'; expected a list"),
         ({"opponents": None}, "opponents is None; expected a list"),
         ({"flagged": "x"}, "flagged is 'x'; expected True or False"),
@@ -184,5 +184,16 @@ def test_closing_twice_does_no_harm(make):
     env = make(2)
     env.close()
     env.close()
-    with pytest.raises(EnvClosed):
+    with pytest.raises(EnvClosed, match=r"step after close; .*with parallel_env"):
         env.step({})
+    with pytest.raises(EnvClosed, match=r"reset after close; .*with parallel_env"):
+        env.reset()
+
+
+@pytest.mark.parametrize("seed", ["a", -1, 1.5, True])
+def test_a_wrong_seed_is_told_and_the_race_goes_on(make, seed):
+    env = make(2)
+    env.reset(seed=np.int64(0))
+    with pytest.raises(InvalidOption, match=f"seed is {seed!r}; expected a whole number >= 0"):
+        env.reset(seed=seed)
+    env.step({name: GAS for name in env.agents})

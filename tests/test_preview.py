@@ -232,6 +232,11 @@ def test_other_sensors_are_refused(choice):
         gym.make("TorcsLite-v0", sensors=choice)
 
 
+def test_a_mistyped_sensor_is_told_the_near_miss():
+    with pytest.raises(InvalidOption, match=r"did you mean 'preview'\? expected a list"):
+        gym.make("TorcsLite-v0", sensors=["base", "previev"])
+
+
 def test_the_order_of_names_does_not_matter(oval):
     env = RacingEnv(ScriptedBackend(oval), sensors=["preview", "base"])
     assert env.sensors == BOTH

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -177,6 +178,28 @@ def test_an_unknown_name_offers_the_near_miss():
 def test_a_weight_must_be_a_number(weight):
     with pytest.raises(InvalidOption, match="expected a number from -1e\\+09 to 1e\\+09"):
         Reward({"progress": weight})
+
+
+@pytest.mark.parametrize("value", [None, "1", np.ones(1), math.nan, math.inf])
+def test_a_term_that_somebody_adds_returns_a_finite_number(monkeypatch, value):
+    """So it is the same in one environment and in a batch of them, and the message names it."""
+    monkeypatch.setitem(TERMS, "odd", lambda *_: value)
+    reward = Reward({"odd": 1.0})
+    message = f"reward term 'odd' returned {re.escape(repr(value))}; expected a finite number"
+    with pytest.raises(InvalidOption, match=message):
+        reward(BEFORE, AFTER, GAS, None)
+
+
+def test_a_term_that_somebody_adds_is_a_function_and_has_a_name_of_its_own(monkeypatch):
+    monkeypatch.setitem(TERMS, "odd", 3)
+    with pytest.raises(InvalidOption, match="reward term 'odd' is 3; expected a function"):
+        Reward({"odd": 1.0})
+    monkeypatch.setitem(TERMS, "odd", lambda *_: np.float32(0.5))
+    value = Reward({"odd": 2.0})(BEFORE, AFTER, GAS, None)["odd"]
+    assert (value, type(value)) == (0.5, float)
+    monkeypatch.setitem(TERMS, "scale", TERMS["time"])
+    with pytest.raises(InvalidOption, match=r"called 'scale', .* by another name"):
+        Reward("progress")
 
 
 def test_a_reward_must_be_a_name_or_weights():

@@ -189,6 +189,7 @@ def test_a_lost_or_doubled_datagram_changes_nothing(backend):
         ({"track": "nowhere"}, TrackNotFound, "nowhere"),
         ({"car": "trabant"}, UnknownCar, "trabant"),
         ({"opponents": ["nobody"]}, UnknownRobot, "nobody"),
+        ({"opponents": ["ppo-any-road"]}, UnknownRobot, "agents are opponents with backend 'nat"),
         ({"opponents": "inferno"}, InvalidOption, "expected a list of names"),
         ({"grid_place": 2}, InvalidOption, "expected 1 to 1"),
         ({"sensor_noise": True}, InvalidOption, "-noisy"),

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import pickle
-from contextlib import nullcontext
+from contextlib import closing, nullcontext
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
@@ -100,6 +101,11 @@ def test_processes_take_it(make):
     envs.close()
 
 
+def test_an_id_may_name_its_package_as_in_gym_make():
+    with closing(TorcsVecEnv(2, env_id="sb3_torcs:TorcsLite-v0", track=TRACKS)) as envs:
+        assert envs.get_attr("spec")[0].id == "TorcsLite-v0"
+
+
 def test_what_cannot_be_is_told(make):
     with pytest.raises(InvalidOption, match="empty list"):
         make(track=[])
@@ -114,6 +120,16 @@ def test_what_has_one_track_refuses_a_list(options):
         gym.make("Torcs-v0", track=TRACKS, **options)
     with pytest.raises(InvalidOption, match="one car"):
         gym.make("Torcs-v0", car=["car1-trb1"], **options)
+
+
+@pytest.mark.usefixtures("game")
+@pytest.mark.parametrize("options", [{"track": TRACKS}, {"opponents": ("ppo-any-road",)}])
+def test_each_mode_that_is_offered_can_be_made(options):
+    """Gymnasium's check makes one of each; the game's picture shows one track and one agent."""
+    env = gym.make("Torcs-v0", **options).unwrapped
+    assert env.metadata["render_modes"] == ["rgb_array", "human"]
+    check_env(env)
+    env.close()
 
 
 @pytest.mark.usefixtures("game")

@@ -312,7 +312,6 @@ class TestMistakes:
         assert [car.time for car in envs.get_attr("car")] == before
         envs.step(np.array([GAS] * 3, np.float32))
 
-
     def test_the_order_of_the_cars_changes_nothing(self, game):
         """Who drives into the grass is the second of the list, then the first."""
 
@@ -699,7 +698,8 @@ class TestAgentsAsOpponents:
             ({"action_repeat": 2}, "action_repeat is 2, .* were trained with 5"),
             ({"grip": 0.9}, "grip is .* which this world cannot change"),
             ({"picture": "game", "render_mode": "rgb_array"}, "'scripted' is an agent"),
-            ({"opponents": ["infermo"]}, "no robot 'infermo'; did you mean 'inferno'"),
+            ({"opponents": ["infermo"]}, "no robot 'infermo'; did you mean 'inferno'.*give the"),
+            ({"opponents": ["inferno"] * 20}, "opponents has 20 names; expected at most 19"),
         ],
     )
     def test_what_one_environment_against_them_cannot_do(self, options, message):

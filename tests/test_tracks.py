@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from conftest import segment
 
-from sb3_torcs.errors import InvalidOption, TrackFileError, TrackNotFound
+from sb3_torcs.errors import InvalidOption, OutputNotWritable, TrackFileError, TrackNotFound
 from sb3_torcs.torcs import track_names
 from sb3_torcs.tracks import catalogue
 from sb3_torcs.tracks import track as tracks
@@ -190,6 +190,8 @@ class TestLoading:
     def test_a_random_track_needs_a_generator(self):
         with pytest.raises(InvalidOption, match=r"pass rng=numpy\.random\.default_rng"):
             load_track("random")
+        with pytest.raises(InvalidOption, match="rng is 3; pass rng=numpy"):
+            load_track("random", 3)
         assert load_track("random", np.random.default_rng(1)).source == "random"
 
     def test_a_changed_file_is_read_again(self, tmp_path):
@@ -251,10 +253,17 @@ class TestCompactFile:
         np.testing.assert_array_equal(copy.table, track.table)
         assert path.read_text().startswith("# Source: this test.\n# Two lines.\nsb3-torcs track,1")
 
+    def test_a_file_that_cannot_be_written_is_told(self, oval, tmp_path):
+        for write in (write_track_file, plot_track):
+            with pytest.raises(
+                OutputNotWritable, match=r"cannot write '.*no/x.png'.*choose a file"
+            ):
+                write(oval, tmp_path / "no" / "x.png")
+
     def test_two_surfaces_of_one_name_cannot_be_written(self, oval, tmp_path):
         odd = segment(1.0)
         odd = odd._replace(road=odd.road._replace(friction=9.0))
-        with pytest.raises(TrackFileError, match="two different surfaces are called 'asphalt'"):
+        with pytest.raises(TrackFileError, match=r"two different surfaces .* are called 'asphalt'"):
             write_track_file(Track("t", "road", (*oval.segments, odd)), tmp_path / "t.csv")
 
     @pytest.mark.parametrize(

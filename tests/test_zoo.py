@@ -311,6 +311,7 @@ def test_another_script_is_told(words):
     done = zoo_script(*words)
     assert done.returncode == 1
     assert done.stderr.startswith("the RL Zoo has no script '")
+    assert "it has enjoy, " in done.stderr
 
 
 @pytest.mark.parametrize(

@@ -62,14 +62,14 @@ def plain(value: Any) -> Any:
     """
     Turn a value into JSON's types.
 
-    :param value: of numbers, words, lists, mappings and classes
-    :return: the same; a class becomes ``{"class": its dotted path}``
+    :param value: of numbers, words, lists, arrays, mappings and classes
+    :return: the same; an array becomes a list, and a class becomes ``{"class": its dotted path}``
     :raises TypeError: for anything else
     """
     if value is None or isinstance(value, bool | int | float | str):
         return value
-    if isinstance(value, np.generic):
-        return plain(value.item())
+    if isinstance(value, np.generic | np.ndarray):
+        return plain(value.tolist())
     if isinstance(value, list | tuple):
         return [plain(item) for item in value]
     if isinstance(value, Mapping) and all(isinstance(key, str) for key in value):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import os
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,6 +19,7 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.save_util import data_to_json
+from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize, unwrap_vec_wrapper
 
 from sb3_torcs import __version__
 from sb3_torcs.agents.model_file import IDLE, VALUES, saved_data, saved_weights
@@ -36,7 +38,8 @@ from sb3_torcs.agents.model_record import (
     record_beside,
     record_within,
 )
-from sb3_torcs.errors import ModelNotTrusted
+from sb3_torcs.errors import InvalidOption, ModelNotTrusted
+from sb3_torcs.files import whole_file
 from sb3_torcs.policies.asymmetric import columns_of
 from sb3_torcs.torcs.track_names import lasting_kwargs
 from sb3_torcs.tracks.catalogue import lasting_name
@@ -117,7 +120,7 @@ def write_record(model: BaseAlgorithm, asked: Recipe) -> None:
     setattr(model, RECORD, record)
 
 
-def write_driver(model: Path, driver: Path, *, value_function: bool = True) -> None:
+def write_driver(model: str | Path, driver: str | Path, *, value_function: bool = True) -> None:
     """
     Write a small file of a model that can drive but not learn, with its record.
 
@@ -125,12 +128,20 @@ def write_driver(model: Path, driver: Path, *, value_function: bool = True) -> N
     well. Stock SB3 still loads the file and predicts the same to the bit. A training that resumes
     from it fails with the first update.
 
-    :param model: the complete file
-    :param driver: the file to write
+    :param model: the complete file, that ``model.save`` wrote
+    :param driver: the file to write, completely or not at all; it may be the same
     :param value_function: whether to keep that of PPO, from which another training may go on.
         Without it, sensors that only the value function saw (``actor_sensors``) are left out, too
+    :raises InvalidOption: if ``model`` is no path
     :raises ModelMismatch: if the model cannot be read
+    :raises OutputNotWritable: if the file cannot be written; the previous one is kept
     """
+    if not isinstance(model, str | Path):
+        raise InvalidOption(
+            f"model is a {type(model).__name__}; write_driver takes the path of a saved one: "
+            "model.save('model.zip'), then write_driver('model.zip', 'driver.zip')"
+        )
+    model, driver = Path(os.path.expanduser(model)), Path(os.path.expanduser(driver))
     data, weights = saved_data(model), saved_weights(model)
     data[RECORD] = {**_record_in(model, data), "driver_only": True}
     if not value_function:
@@ -141,7 +152,11 @@ def write_driver(model: Path, driver: Path, *, value_function: bool = True) -> N
     for name, tensor in weights.items():
         if name.startswith(left_out) and tensor.is_floating_point():
             tensor.fill_(float("nan"))
-    with zipfile.ZipFile(model) as source, zipfile.ZipFile(driver, "w") as target:
+    with (
+        whole_file(driver) as aside,
+        zipfile.ZipFile(model) as source,
+        zipfile.ZipFile(aside, "w") as target,
+    ):
         for name in source.namelist():
             content = source.read(name)
             if name == "data":
@@ -211,15 +226,24 @@ def _recipe_of_environment(model: BaseAlgorithm) -> Recipe:
     (spec,) = env.get_attr("spec", 0)
     name = type(model).__name__
     algo = "ppo_lstm" if name == "RecurrentPPO" else name.lower()
+    seen = _frames_of(env)
     if spec is None:
-        return recipe(algo, None, {})
+        return recipe(algo, None, seen)
     kwargs = {name: value for name, value in spec.kwargs.items() if name != "render_mode"}
     tracks = kwargs.get("track")
     if isinstance(tracks, Track):
         kwargs["track"] = lasting_name(tracks)
     elif isinstance(tracks, (list, tuple)):
         kwargs["track"] = [lasting_name(t) if isinstance(t, Track) else t for t in tracks]
-    return recipe(algo, spec.id, {"env_kwargs": kwargs})
+    return recipe(algo, spec.id, {"env_kwargs": kwargs, **seen})
+
+
+def _frames_of(env: VecEnv) -> dict[str, int]:
+    """Tell of a frame stack, but of none within statistics: a driver has it around them."""
+    stack, outer = (unwrap_vec_wrapper(env, kind) for kind in (VecFrameStack, VecNormalize))
+    if outer is not None and outer.norm_obs and unwrap_vec_wrapper(outer, VecFrameStack):
+        return {}
+    return {} if stack is None else {"frame_stack": stack.stacked_obs.n_stack}
 
 
 def _plain_part(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -176,8 +176,9 @@ def agent_record(driver: str | Path, game: Game | None) -> TrainingRecord:
         if game is None:
             missing = "there are no robots, since TORCS was not found"
             raise InvalidOption(f"{error}; and {missing}; type: {INSTALL}") from None
-        hint = near_miss(str(driver), game.robots())
-        raise InvalidOption(f"{error}; and there is no robot '{driver}'{hint}") from None
+        what, _, advice = str(error).partition("; ")
+        hint = near_miss(str(driver), game.robots(), advice)
+        raise InvalidOption(f"{what}, and there is no robot '{driver}'{hint}") from None
 
 
 def driver_name(driver: str | Path) -> str:
@@ -269,7 +270,13 @@ def check_spaces(
         name = env.spec.id if env.spec else "Torcs-v0"  # cars of one race have no spec
         frames_seen = _frames_seen(has, needs) if what == "observations" else None
         option = _option_of(has)
-        if record.env_id == name:
+        if record.env_id == name and frames_seen is not None and frames is None:
+            advice = (
+                f"it sees {frames_seen} observations at once, which its record does not tell; "
+                "train it with VecFrameStack around VecNormalize, not within it, and with "
+                "RecordCallback"
+            )
+        elif record.env_id == name:
             said = ", ".join(f"{key}={value!r}" for key, value in _task(record).items())
             advice = f"it learned there with {said}; give it the same"
         elif record.known or (frames_seen is None and option is None):

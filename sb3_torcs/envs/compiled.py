@@ -27,9 +27,7 @@ __all__ = ["COMPILED", "aid_cars", "read_actions", "value_timesteps"]
 
 Counts = npt.NDArray[np.int64]
 
-COMPILED: tuple[rewards.Term, ...] = tuple(
-    term for term in rewards.TERMS.values() if term.__module__ == rewards.__name__
-)
+COMPILED = rewards.OWN_TERMS
 """The terms of rewards of this package. Terms that a user adds are called in Python."""
 
 

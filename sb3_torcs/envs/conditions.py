@@ -98,7 +98,7 @@ class Conditions:
         for name in self._changed:
             if name not in optional(world, "conditions"):
                 raise InvalidOption(
-                    f"{name} is {tuple(self._factors[name])!r}, which this world cannot change; "
+                    f"{name} is {self.choice[name]!r}, which this world cannot change; "
                     "leave it out, or use backend 'native' of Torcs-v0, with no agents as opponents"
                 )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 from collections.abc import Callable
 from dataclasses import replace
@@ -33,12 +34,13 @@ NO_LIMIT = -1  # as in gym.make
 MANY_RACES = 10_000  # [-] at once: a greater number is mistyped
 
 
-def checked_time_limit(steps: Any, env_id: str) -> int:
+def checked_time_limit(steps: Any, env_id: str, *, unlimited: str = "-1") -> int:
     """
     Check the option ``max_episode_steps`` as ``gym.make`` means it.
 
     :param steps: timesteps; ``None`` is the limit that the environment is registered with, -1 none
     :param env_id: of the environment
+    :param unlimited: what to advise for no limit
     :return: timesteps, or ``NO_LIMIT``
     :raises InvalidOption: if it is no such number
     """
@@ -46,7 +48,8 @@ def checked_time_limit(steps: Any, env_id: str) -> int:
         return gym.spec(env_id).max_episode_steps or NO_LIMIT
     if not is_count(steps) and steps != NO_LIMIT:
         raise InvalidOption(
-            f"max_episode_steps is {steps!r}; expected a whole number >= 1, or -1 for no limit"
+            f"max_episode_steps is {steps!r}; expected a whole number >= 1, or {unlimited} for no "
+            "limit"
         )
     return int(steps)
 
@@ -72,10 +75,14 @@ def env_makers(races: int, agents: int, env_id: str, env_kwargs: dict[str, Any])
 
     :param races: their number
     :param agents: in each
-    :param env_id: ``"Torcs-v0"`` or ``"TorcsLite-v0"``
+    :param env_id: ``"Torcs-v0"`` or ``"TorcsLite-v0"``; as in ``gym.make``, also after the name of
+        the package that registers it: ``"sb3_torcs:Torcs-v0"``
     :param env_kwargs: of all races; ``max_episode_steps`` may be a list, which goes round
     :raises InvalidOption: if there are no such races
     """
+    module, _, env_id = env_id.rpartition(":")
+    if module:
+        importlib.import_module(module)
     if agents > 1 or _has_guests(env_id, env_kwargs):
         return _shared(races, agents, env_id, env_kwargs)
     limits = _limits(env_kwargs.get("max_episode_steps"), env_id, races)

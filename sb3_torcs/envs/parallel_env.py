@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from functools import partial
+from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -53,7 +54,9 @@ class TorcsParallelEnv(ParallelEnv[str, Observation, Action]):
         self, agents: int = 2, *, max_episode_steps: int | None = MAX_STEPS, **options: Any
     ) -> None:
         limit = checked_time_limit(
-            NO_LIMIT if max_episode_steps is None else max_episode_steps, "Torcs-v0"
+            NO_LIMIT if max_episode_steps is None else max_episode_steps,
+            "Torcs-v0",
+            unlimited="None",
         )
         if options.pop("render_mode", None) is not None:
             raise InvalidOption(
@@ -102,9 +105,12 @@ class TorcsParallelEnv(ParallelEnv[str, Observation, Action]):
         :param options: where the field starts, as of ``Torcs-v0``; the place is the first agent's.
             Other names are ignored: PettingZoo's tests hand over one
         :return: observations and infos
-        :raises InvalidOption: if options have wrong values, and the race before goes on; or if the
-            game lets no car start there, and there is no race then
+        :raises InvalidOption: if the seed or options have wrong values, and the race before goes
+            on; or if the game lets no car start there, and there is no race then
+        :raises EnvClosed: after ``close``
         """
+        self._check_open("reset")
+        seed = _checked_seed(seed)
         given = options if isinstance(options, Mapping) else {}
         options = {name: given[name] for name in RESET_OPTIONS if name in given}
         read_start(options, next(iter(self._envs.values())).track.length)  # before anything changes
@@ -126,9 +132,11 @@ class TorcsParallelEnv(ParallelEnv[str, Observation, Action]):
         :param actions: by agent
         :return: observations, rewards, terminations, truncations and infos, by agent
         :raises InvalidAction: if one is missing or invalid; then no car has been driven
+        :raises EnvClosed: before ``reset``, after the race and after ``close``
         """
-        if self._closed or not self.agents:
-            raise EnvClosed("step before reset, after the race or after close; call reset first")
+        self._check_open("step")
+        if not self.agents:
+            raise EnvClosed("step before reset or after the race; call reset first")
         racing = {name: self._envs[name] for name in self.agents}
         self._hold(racing, actions)
         failure = self._drive(next(iter(racing.values())))
@@ -145,6 +153,10 @@ class TorcsParallelEnv(ParallelEnv[str, Observation, Action]):
                 self.agents.remove(name)
                 env.seat.retire()
         return answers
+
+    def _check_open(self, what: str) -> None:
+        if self._closed:
+            raise EnvClosed(f"{what} after close; make a new environment with parallel_env")
 
     def _hold(self, racing: Mapping[str, RaceCarEnv], actions: Mapping[str, Action]) -> None:
         given = actions if isinstance(actions, Mapping) else ()
@@ -177,6 +189,14 @@ class TorcsParallelEnv(ParallelEnv[str, Observation, Action]):
         self.agents = []
         for env in self._envs.values():
             env.close()
+
+
+def _checked_seed(seed: Any) -> int | None:
+    if seed is None:
+        return None
+    if isinstance(seed, bool) or not isinstance(seed, Integral) or seed < 0:
+        raise InvalidOption(f"seed is {seed!r}; expected a whole number >= 0, or None")
+    return int(seed)
 
 
 def _car(env: RaceCarEnv, failure: Exception | None) -> CarState:

@@ -92,8 +92,8 @@ def _check_tells(world: Backend, view: View, aids: Aids) -> None:
     if lacking and not optional(world, "tells_race"):
         raise InvalidOption(
             "this world does not tell of other cars, which is needed for "
-            f"{' and '.join(map(repr, lacking))}; use Torcs-v0 with backend 'native', or type "
-            "`sb3-torcs race`, which also makes videos (--video FILE.mp4 --view behind)"
+            f"{' and '.join(map(repr, lacking))}; use Torcs-v0 with backend 'native', or on the "
+            "command line `sb3-torcs race`, which also makes videos"
         )
     untold = sorted(NEEDS_CAR.intersection(view.sensors))
     if untold and optional(world, "facts") is None:

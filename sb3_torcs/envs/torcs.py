@@ -26,7 +26,7 @@ from sb3_torcs.car import (
 )
 from sb3_torcs.envs.racing import RacingEnv, RenderMode
 from sb3_torcs.envs.torcs_race import make_shared_race
-from sb3_torcs.errors import InvalidOption
+from sb3_torcs.errors import InvalidOption, UnknownRobot, near_miss
 from sb3_torcs.rewards import RewardChoice
 from sb3_torcs.sensors import SensorsName
 from sb3_torcs.torcs.installation import find_game
@@ -169,7 +169,8 @@ class TorcsEnv(RacingEnv):
                 "picture 'game' is for backend 'native'; `sb3-torcs serve --window` shows the "
                 "game of backend 'scr'"
             )
-        if self.picture == "game" and (is_several(track) or is_several(car, "car")):
+        several = is_several(track) or is_several(car, "car")
+        if self.picture == "game" and several:
             raise InvalidOption("picture 'game' is for one track and one car, not for a list")
         named = opponents if isinstance(opponents, (list, tuple)) else ()
         guests = guests_of(named, find_game()) if named else []
@@ -178,6 +179,15 @@ class TorcsEnv(RacingEnv):
                 f"picture 'game' is for races against robots, and '{guests[0]}' is an agent; use "
                 "picture 'above'"
             )
+        if guests and backend != "native":
+            robots = find_game().robots()
+            hint = near_miss(guests[0], robots, f"it has {', '.join(robots)}")
+            raise UnknownRobot(
+                f"the game has no robot '{guests[0]}'{hint}; agents are opponents with backend "
+                "'native' only"
+            )
+        if several or guests:
+            self.metadata = RacingEnv.metadata  # without "game", which would be refused
         if self.picture == "game":
             one: Any = track
             game = find_game()

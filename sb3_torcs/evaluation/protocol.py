@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from inspect import signature
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -16,7 +17,7 @@ import gymnasium as gym
 from sb3_torcs.agents.model_record import DRIVEN_WITH
 from sb3_torcs.agents.rollout import Driver, Timestep, drive
 from sb3_torcs.car import CONTROL_TICK, check_count
-from sb3_torcs.errors import InvalidOption
+from sb3_torcs.errors import InvalidOption, near_miss
 from sb3_torcs.torcs.track_names import RANDOM_TRACK, kind_without_game
 
 __all__ = [
@@ -152,7 +153,7 @@ def time_limit(kwargs: Mapping[str, Any]) -> int:
 
 def race_environment(
     env_id: str,
-    env_kwargs: Mapping[str, Any],
+    env_kwargs: Mapping[str, Any] | None = None,
     track: str | None = None,
     *,
     laps: int = RACE_LAPS,
@@ -162,22 +163,51 @@ def race_environment(
     """
     Build the environment of an evaluation: laps from the grid.
 
+    It takes track, car, reward, and what an agent drives with (:data:`KEPT`) from the training. It
+    leaves out the rest, so that all races are alike: start, time limit, conditions, opponents,
+    noise, pictures, and what ends episodes.
+
     :param env_id: of the training
-    :param env_kwargs: of the training
+    :param env_kwargs: of the training; ``None`` if they are not known
     :param track: instead of the training's
     :param laps: to drive
     :param hyperparameters: of the training, whose wrappers are put around the environment
     :param trust: as of :func:`~sb3_torcs.agents.wrapping.wrapped`
     :return: the environment, whose time limit never ends a race
-    :raises InvalidOption: if ``laps`` is no whole number of at least 1
+    :raises InvalidOption: if ``laps`` is no whole number of at least 1, if there is no ``env_id``,
+        or if no environment has such an argument
     """
     from sb3_torcs.agents.wrapping import wrapped
 
     check_count("laps", laps)
+    if not isinstance(env_id, str):
+        raise InvalidOption(
+            f"env_id is {env_id!r}, as in the record of a model that does not tell where it was "
+            f"trained; pass '{GAME}' or '{WITHOUT_GAME}'"
+        )
+    env_kwargs = env_kwargs or {}
+    _check_names(env_kwargs, env_id)
     kwargs = {name: env_kwargs[name] for name in KEPT if name in env_kwargs}
     kwargs.update({"laps": laps}, **({} if track is None else {"track": track}))
     env = gym.make(env_id, max_episode_steps=time_limit(kwargs), **kwargs)
     return wrapped(env, hyperparameters, trust=trust)
+
+
+def _check_names(env_kwargs: Mapping[str, Any], env_id: str) -> None:
+    """Refuse arguments that no racing environment has: a mistyped one would have no effect."""
+    from sb3_torcs.envs.torcs import TorcsEnv
+    from sb3_torcs.envs.torcs_lite import TorcsLiteEnv
+
+    if env_id.rpartition(":")[2] not in (GAME, WITHOUT_GAME):
+        return  # somebody's own, whose arguments are not known here
+    known = {"max_episode_steps", "flagged"}  # of gym.make, and of races of several agents
+    for kind in (TorcsEnv, TorcsLiteEnv):  # a record of one may be driven in the other
+        known.update(signature(kind).parameters)
+    for name in env_kwargs:
+        if name not in known:
+            raise InvalidOption(
+                f"env_kwargs has '{name}', which no environment takes{near_miss(name, known)}"
+            )
 
 
 def evaluate(
@@ -191,14 +221,19 @@ def evaluate(
     :param episodes: how many
     :param seed: of the first reset; the next episodes go on from it
     :return: the results of each
-    :raises InvalidOption: if ``episodes`` is no whole number of at least 1, or ``env`` is no single
-        environment
+    :raises InvalidOption: if ``episodes`` is no whole number of at least 1, ``env`` is no single
+        environment, or ``driver`` cannot drive
     """
     check_count("episodes", episodes)
     if not isinstance(env, gym.Env):
         raise InvalidOption(
             f"{type(env).__name__} is no single environment; evaluate drives one that gym.make or "
             "race_environment has made"
+        )
+    if not callable(getattr(driver, "predict", None)):
+        raise InvalidOption(
+            f"driver is {driver!r}, which has no predict; pass a model, or what "
+            "sb3_torcs.agents.load_driver(path, env) returns"
         )
     results = []
     for number in range(episodes):

@@ -21,12 +21,25 @@ from torch import nn
 
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.policies.asymmetric import ActorSensors
-from sb3_torcs.policies.exact import ExactDriver, ExactPolicy
+from sb3_torcs.policies.exact import ExactDriver, ExactPolicy, check_sizes
 from sb3_torcs.sensors import SensorsName, checked_sensors
 
 __all__ = ["BoundedHead", "BoundedPolicy"]
 
 LARGEST_LOG_STD = 20
+
+PARTS_ELSEWHERE = ("actor", "lstm_actor")
+"""Parts that the policies of other algorithms have, which ask for them first."""
+
+
+class _WrongAlgorithm(InvalidOption, AttributeError):
+    """Also an AttributeError, so that ``hasattr`` may ask."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            "BoundedPolicy is a policy of PPO and A2C; give DDPG and TD3 SplitHeadPolicy, SAC, "
+            'TQC and CrossQ their own "MlpPolicy", and RecurrentPPO "MlpLstmPolicy"'
+        )
 
 
 class BoundedHead(nn.Module):
@@ -71,8 +84,9 @@ class BoundedPolicy(ExactPolicy, ActorCriticPolicy):
     :param actor_sensors: groups of sensors that the actor sees, ``"base"`` among them, while the
         value function sees all that the environment gives; ``None`` is all for both
     :param kwargs: the other arguments of ``ActorCriticPolicy``, but for ``use_sde``
-    :raises InvalidOption: if the action space has no bounds, if ``log_std_init`` has other numbers,
-        if observations lack one of ``actor_sensors``, or with ``use_sde``
+    :raises InvalidOption: if the action space has no bounds, if ``net_arch`` or ``log_std_init``
+        has other numbers, if observations lack one of ``actor_sensors``, with ``use_sde``, or if
+        the algorithm is neither PPO nor A2C
     """
 
     action_net: BoundedHead
@@ -86,6 +100,8 @@ class BoundedPolicy(ExactPolicy, ActorCriticPolicy):
         actor_sensors: Sequence[SensorsName] | None = None,
         **kwargs: Any,
     ) -> None:
+        if "n_critics" in kwargs:  # DDPG gives it
+            raise _WrongAlgorithm
         if not isinstance(action_space, spaces.Box) or not action_space.is_bounded():
             raise InvalidOption(
                 f"BoundedPolicy needs a Box of actions with finite bounds, not {action_space}; "
@@ -93,9 +109,11 @@ class BoundedPolicy(ExactPolicy, ActorCriticPolicy):
             )
         if kwargs.get("use_sde"):
             raise InvalidOption("BoundedPolicy has no use_sde; leave it out, or use MlpPolicy")
+        check_sizes(kwargs.get("net_arch") or [])
         self._first_log_std = _log_std(log_std_init, get_action_dim(action_space))
-        self.actor_sensors = None if actor_sensors is None else checked_sensors(actor_sensors)
+        self.actor_sensors = None
         if actor_sensors is not None:
+            self.actor_sensors = checked_sensors(actor_sensors, "actor_sensors")
             kwargs["share_features_extractor"] = False
         super().__init__(observation_space, action_space, lr_schedule, **kwargs)
         self.log_std_init = self._first_log_std  # type: ignore[assignment]  # for copies of it
@@ -121,6 +139,12 @@ class BoundedPolicy(ExactPolicy, ActorCriticPolicy):
             )
             self.mlp_extractor.policy_net = actor.policy_net
             self.mlp_extractor.latent_dim_pi = actor.latent_dim_pi
+
+    def __getattr__(self, name: str) -> Any:
+        """Find a part as PyTorch does, and tell an algorithm that this policy is not for it."""
+        if name in PARTS_ELSEWHERE:
+            raise _WrongAlgorithm
+        return super().__getattr__(name)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {**super()._get_constructor_parameters(), "actor_sensors": self.actor_sensors}

@@ -7,7 +7,8 @@ a lap. Actions in double precision, rounded to single, are the same on all of th
 from __future__ import annotations
 
 import copy
-from typing import cast
+from collections.abc import Iterator, Mapping
+from typing import Any, cast
 
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
@@ -15,9 +16,35 @@ from stable_baselines3.common.preprocessing import preprocess_obs
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
+from sb3_torcs.car import is_count
+from sb3_torcs.errors import InvalidOption
 from sb3_torcs.policies.mirror import mirror_actions, mirror_image, mirror_observations
 
-__all__ = ["ExactDriver", "ExactPolicy"]
+__all__ = ["ExactDriver", "ExactPolicy", "check_sizes"]
+
+
+def check_sizes(net_arch: Any) -> None:
+    """
+    Check the numbers of hidden units of a policy.
+
+    :param net_arch: as of SB3's policies: a list of sizes, or a mapping to such lists
+    :raises InvalidOption: if one is no whole number of at least 1
+    """
+    for size in _sizes(net_arch):
+        if not is_count(size):
+            raise InvalidOption(
+                f"net_arch={net_arch!r}: {size!r} is no layer size; pass whole numbers >= 1, e.g. "
+                "net_arch=[300, 600]"
+            )
+
+
+def _sizes(net_arch: Any) -> Iterator[Any]:
+    """Walk over the sizes of layers."""
+    if isinstance(net_arch, Mapping | list | tuple):
+        for part in net_arch.values() if isinstance(net_arch, Mapping) else net_arch:
+            yield from _sizes(part)
+    else:
+        yield net_arch
 
 
 class ExactDriver(nn.Module):

@@ -1,9 +1,8 @@
 """A policy for the stock DDPG and TD3 with one output function per actuator.
 
 The networks are those of the original post: an actor of 300 and 600 ReLU units whose heads start
-near zero, and a critic that the action joins at the second hidden layer. Importing this module
-makes ``DDPG("SplitHeadPolicy", ...)`` and ``TD3("SplitHeadPolicy", ...)`` work; a hyperparameter
-file can name ``sb3_torcs.policies.split_head.SplitHeadPolicy`` without an import.
+near zero, and a critic that the action joins at the second hidden layer. A hyperparameter file can
+name ``sb3_torcs.policies.split_head.SplitHeadPolicy`` without an import.
 """
 
 from __future__ import annotations
@@ -14,9 +13,7 @@ from typing import Any, cast
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3 import DDPG, TD3
-from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
+from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import Schedule
@@ -27,7 +24,7 @@ from sb3_torcs.actions import layout_of_width
 from sb3_torcs.car import check_count, checked_flag, is_number
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.policies import fast_matmul as matmul
-from sb3_torcs.policies.exact import ExactDriver, ExactPolicy
+from sb3_torcs.policies.exact import ExactDriver, ExactPolicy, check_sizes
 from sb3_torcs.policies.export import export_actor
 from sb3_torcs.policies.flat import FlatParameters, keep_plain_state
 from sb3_torcs.policies.mirror import sensors_of
@@ -271,6 +268,7 @@ def _check_net_arch(net_arch: Any) -> None:
             "second) and the actor at least one; pass net_arch=[300, 600], or "
             "net_arch=dict(pi=[300, 600], qf=[300, 600])"
         )
+    check_sizes(net_arch)
 
 
 def _check_symmetric(
@@ -306,16 +304,6 @@ def _fast_optimizer(kwargs: dict[str, Any]) -> dict[str, Any]:
         options["fused"] = True
         optimizer_class = LeanAdam if optimizer_class is th.optim.Adam else optimizer_class
     return {**kwargs, "optimizer_class": optimizer_class, "optimizer_kwargs": options}
-
-
-def _register(*algorithms: type[BaseAlgorithm]) -> None:
-    for algorithm in algorithms:
-        # SB3's classes share one dictionary: each gets a copy of its own.
-        aliases: dict[str, type[BasePolicy]] = {**algorithm.policy_aliases}
-        algorithm.policy_aliases = {**aliases, "SplitHeadPolicy": SplitHeadPolicy}
-
-
-_register(DDPG, TD3)
 
 
 # Saved models and YAML files name the class by its package, whichever file it stands in.

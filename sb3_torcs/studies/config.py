@@ -252,7 +252,8 @@ def _trials(
             f"exactly; give {algo.removeprefix(SBX)}, or type: sb3-torcs train --algo {algo}"
         )
     conf_file = source["conf_file"] and file.parent / Path(os.path.expanduser(source["conf_file"]))
-    entry = zoo.read_entry(zoo.config_file(algo, conf_file), source["entry"] or env_id)
+    entries = zoo.config_file(algo, conf_file, "conf_file: FILE.yml")
+    entry = zoo.read_entry(entries, source["entry"] or env_id)
     if source["n_timesteps"] is not None:
         entry["n_timesteps"] = source["n_timesteps"]
     try:

@@ -53,6 +53,11 @@ def starting_list(
         raise InvalidOption(
             f"grid_place is {grid_place!r}; expected 1 to {len(entries) + 1}, or None"
         )
+    if agents == 1 and len(entries) >= GRID_SLOTS:  # gym.make has no ``agents``
+        raise InvalidOption(
+            f"opponents has {len(entries)} names; expected at most {GRID_SLOTS - 1}, since a grid "
+            f"has room for {GRID_SLOTS} cars"
+        )
     if not is_count(agents) or agents + len(entries) > GRID_SLOTS:
         raise InvalidOption(
             f"agents is {agents!r}, with {len(entries)} opponents; expected a whole number from 1, "

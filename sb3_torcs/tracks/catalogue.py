@@ -36,13 +36,16 @@ def load_track(
         a track, which comes back as it is
     :param rng: what a random track is drawn from; only ``"random"`` needs it
     :return: the track
+    :raises TrackNotFound: if there is none
+    :raises InvalidOption: if ``"random"`` has no generator
     """
     if isinstance(track, Track):
         return track
     if isinstance(track, str) and track == RANDOM_TRACK:
-        if rng is None:
+        if not isinstance(rng, np.random.Generator):
             raise InvalidOption(
-                f"track '{RANDOM_TRACK}' needs a generator; pass rng=numpy.random.default_rng(seed)"
+                f"track '{RANDOM_TRACK}' needs a generator, and rng is {rng!r}; pass "
+                "rng=numpy.random.default_rng(seed)"
             )
         return random_track(rng)
     return _read(find_track(track))

@@ -26,10 +26,11 @@ import math
 from pathlib import Path
 
 from sb3_torcs.errors import TrackFileError
+from sb3_torcs.files import IN_A_FOLDER, whole_file
 from sb3_torcs.torcs.params import read_bounded
 from sb3_torcs.tracks.track import Grid, Segment, Surface, Track
 
-__all__ = ["read_track_file", "write_track_file"]
+__all__ = ["read_track_file", "surfaces_of", "write_track_file"]
 
 MAGIC = ["sb3-torcs track", "1"]
 NUMBERS_PER_SEGMENT = 8
@@ -218,6 +219,24 @@ def read_track_file(path: Path) -> Track:
     return reader.track()
 
 
+def surfaces_of(track: Track) -> list[Surface]:
+    """
+    Return the different surfaces of a track, each once.
+
+    :param track: whose file names them
+    :raises TrackFileError: if two have one name
+    """
+    surfaces: dict[str, Surface] = {}
+    for segment in track.segments:
+        for surface in _surfaces(segment):
+            if surfaces.setdefault(surface.name, surface) != surface:
+                raise TrackFileError(
+                    f"two different surfaces of the track '{track.name}' are called "
+                    f"'{surface.name}'; rename one"
+                )
+    return list(surfaces.values())
+
+
 def _surfaces(segment: Segment) -> tuple[Surface, ...]:
     """List the surfaces of a segment in the order of the file."""
     return segment.road, segment.left, segment.right, segment.left_wall, segment.right_wall
@@ -230,14 +249,10 @@ def write_track_file(track: Track, path: str | Path, comment: str = "") -> None:
     :param track: to write
     :param path: of the file
     :param comment: for the top of the file, e.g. where the figures come from
+    :raises TrackFileError: if two surfaces have one name
+    :raises OutputNotWritable: if the file cannot be written; the previous one is kept
     """
-    surfaces: dict[str, Surface] = {}
-    for segment in track.segments:
-        for surface in _surfaces(segment):
-            if surfaces.setdefault(surface.name, surface) != surface:
-                raise TrackFileError(
-                    f"{path}: two different surfaces are called '{surface.name}'; rename one"
-                )
+    surfaces = surfaces_of(track)
     text = io.StringIO()
     text.writelines(f"# {line}".rstrip() + "\n" for line in comment.splitlines())
     rows = csv.writer(text, lineterminator="\n")
@@ -246,8 +261,9 @@ def write_track_file(track: Track, path: str | Path, comment: str = "") -> None:
     rows.writerow(["category", track.category])
     rows.writerow(["start", track.start_x, track.start_y, track.start_heading])
     rows.writerow(["grid", *track.grid])
-    rows.writerows(["surface", *surface] for surface in surfaces.values())
+    rows.writerows(["surface", *surface] for surface in surfaces)
     for segment in track.segments:
         names = [surface.name for surface in _surfaces(segment)]
         rows.writerow(["segment", *segment[:NUMBERS_PER_SEGMENT], *names])
-    Path(path).write_text(text.getvalue(), encoding="utf-8")
+    with whole_file(Path(path), IN_A_FOLDER) as aside:
+        aside.write_text(text.getvalue(), encoding="utf-8")

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 import os
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sb3_torcs.car import KMH, FloatArray
+from sb3_torcs.files import IN_A_FOLDER, whole_file
 from sb3_torcs.tracks.track import CURVATURE, LENGTH, Track
 
 if TYPE_CHECKING:
@@ -43,6 +45,7 @@ def plot_track(
     :param title: above the picture; ``None`` is the track's name and measures
     :param fastest: speed at the end of the colours, which begin at 0 [m/s]; ``None`` spreads them
         over the given speeds
+    :raises OutputNotWritable: if the file cannot be written; the previous one is kept
     """
     # Drawing is rare and its import is slow. Figures of their own leave the caller's windows be.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -67,7 +70,8 @@ def plot_track(
     axes.set_title(measures if title is None else title)
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")
-    figure.savefig(path, dpi=120)
+    with whole_file(Path(path), IN_A_FOLDER) as aside:
+        figure.savefig(aside, dpi=120, format=aside.suffix[1:] or "png")
 
 
 def _size(track: Track) -> tuple[float, float]:

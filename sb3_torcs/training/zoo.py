@@ -110,12 +110,15 @@ def shipped_folder() -> Path:
     return Path(__file__).resolve().parents[2] / "zoo_configs"
 
 
-def config_file(algo: str, conf_file: str | Path | None = None) -> Path:
+def config_file(
+    algo: str, conf_file: str | Path | None = None, option: str = "--conf-file FILE.yml"
+) -> Path:
     """
     Find the hyperparameter file of an algorithm.
 
     :param algo: as the zoo calls it, e.g. ``"ddpg"``
     :param conf_file: a file to use instead of the shipped one
+    :param option: how to give such a file, for the message
     :return: its path
     :raises ZooConfigError: if there is none
     """
@@ -127,7 +130,7 @@ def config_file(algo: str, conf_file: str | Path | None = None) -> Path:
     path = shipped_folder() / f"{algo.removeprefix(SBX)}.yml"
     if not path.is_file():
         known = sorted(file.stem for file in shipped_folder().glob("*.yml"))
-        advice = f"shipped: {', '.join(known)}; for another one give a file: --conf-file FILE.yml"
+        advice = f"shipped: {', '.join(known)}; for another one give a file: {option}"
         raise ZooConfigError(
             f"no hyperparameters are shipped for the algorithm '{algo}'"
             f"{near_miss(algo, known, advice)}"
