@@ -225,6 +225,17 @@ def test_tracks_are_driven_and_compared_with_robots(tmp_path, game):
     assert "ppo-roads: completes 2 of 2, 2 without damage; median gap" in done.stdout
 
 
+def test_on_a_random_road_the_robots_drive_first(monkeypatch, tmp_path, game):
+    run(monkeypatch, "random_roads.py", str(tmp_path), "--number", "1")
+    (road,) = tmp_path.iterdir()
+    program = [sys.executable, EXAMPLES / "evaluate_tracks.py", "ppo-any-road", "--jobs=1"]
+    done = subprocess.run([*program, "--track", road], capture_output=True, text=True, check=True)
+    (row,) = re.findall(r"^random-0 +3 +(\S+) +(\S+) +(\S+) +0 ", done.stdout, re.MULTILINE)
+    lap, robot, gap = map(float, row)
+    assert gap == pytest.approx(100 * (lap / robot - 1), abs=0.06)
+    assert lap < robot
+
+
 @pytest.mark.parametrize(("name", "words", "message"), [
     ("specialize.py", ["ddpg-roads", "--track", "forza"], "ddpg-roads is no model of PPO"),
     ("distill.py", ["--teach", "ddpg-roads", "forza"], "ddpg-roads is no model of PPO"),

@@ -4,11 +4,17 @@ from __future__ import annotations
 
 import math
 
+import gymnasium as gym
 import numpy as np
 import pytest
+from stadium import stadium
 
+import sb3_torcs  # noqa: F401  registers the environments
+from sb3_torcs.errors import InvalidOption, OutputNotWritable
+from sb3_torcs.tracks.catalogue import load_track
 from sb3_torcs.tracks.generator import SPARE, random_track
-from sb3_torcs.tracks.track import closing_gap
+from sb3_torcs.tracks.torcs_xml_writer import write_track_xml
+from sb3_torcs.tracks.track import X, Y, closing_gap
 
 SEEDS = range(60)
 
@@ -93,3 +99,41 @@ def test_the_grid_is_on_the_side_of_the_first_bend(circuits):
         bend = next(s.curvature for s in track.segments if s.curvature)
         assert track.grid.offset * bend > 0.0
         assert abs(track.grid.offset) == pytest.approx(track.width / 6.0)
+
+
+# ---- As files of TORCS ----------------------------------------------------------------------
+
+
+def test_a_file_of_torcs_holds_the_same_road(circuits, tmp_path):
+    """A bend is written by radius and arc, from which its length comes back rounded."""
+    for number, track in enumerate(circuits[:20]):
+        write_track_xml(track, tmp_path / f"road-{number}.xml")
+        back = load_track(tmp_path / f"road-{number}.xml")
+        moved = back.table.copy()
+        moved[:, [X, Y]] -= moved[0, [X, Y]]  # the game moves a road's corner to its origin
+        np.testing.assert_allclose(moved, track.table, rtol=1e-9, atol=1e-6)
+        assert [segment[8:] for segment in back.segments] == [s[8:] for s in track.segments]
+        assert back.grid.distance == track.grid.distance
+        assert back.grid.offset * track.grid.offset > 0.0
+
+
+def test_the_real_game_drives_it(circuits, tmp_path, game):
+    """The road that the game has laid is held to the file's each time that a race is loaded."""
+    path = tmp_path / "road.xml"
+    write_track_xml(circuits[0], path)
+    env = gym.make("Torcs-v0", track=str(path))
+    env.reset(seed=0)
+    for _ in range(30):
+        *_, info = env.step(np.array([0.0, 1.0, 0.0], np.float32))
+    assert info["distance"] > 20.0
+    env.close()
+
+
+def test_what_torcs_cannot_write_is_refused(circuits, tmp_path):
+    with pytest.raises(InvalidOption, match=r"is 10 to 12 m wide, .* has one width"):
+        write_track_xml(stadium(0.02), tmp_path / "road.xml")
+    with pytest.raises(InvalidOption, match=r"choose one that ends in \.xml"):
+        write_track_xml(circuits[0], tmp_path / "road.csv")
+    with pytest.raises(OutputNotWritable):
+        write_track_xml(circuits[0], tmp_path / "nowhere" / "road.xml")
+    assert not list(tmp_path.iterdir())
