@@ -39,7 +39,7 @@ class Lap(NamedTuple):
     speed: np.ndarray  # (n,) [m/s]
     place: np.ndarray  # (n,) -1 to 1, left positive
     offset: np.ndarray  # (n,) [m] from the middle of the road, left positive
-    gas: np.ndarray  # (n,)
+    throttle: np.ndarray  # (n,)
     brake: np.ndarray  # (n,)
     line: np.ndarray  # (n, 2) [m] x and y
 
@@ -92,7 +92,7 @@ def best_lap(name, track):
         speed=columns["speed_x"],
         place=2.0 * columns["distance_from_axis"] / columns["track_width"],
         offset=columns["distance_from_axis"],
-        gas=columns["throttle"],
+        throttle=columns["throttle"],
         brake=columns["brake"],
         line=np.stack([columns["x"], columns["y"]], axis=1),
     )
@@ -138,12 +138,12 @@ def draw_along(figure, laps):
     for lap, colour in zip(laps, COLOURS, strict=False):
         label = f"{lap.name}, {lap.seconds:.2f} s"
         speed.plot(lap.distance, KMH * lap.speed, color=colour, label=label)
-        pedals.plot(lap.distance, lap.gas, color=colour, linewidth=0.8)
+        pedals.plot(lap.distance, lap.throttle, color=colour, linewidth=0.8)
         pedals.fill_between(lap.distance, -lap.brake, color=colour, alpha=0.5, linewidth=0.0)
         place.plot(lap.distance, lap.place, color=colour)
     speed.set_ylabel("speed [km/h]")
     speed.legend(fontsize=8, ncols=len(laps), loc="lower left", bbox_to_anchor=(0.0, 1.0))
-    pedals.set_ylabel("brake (down), gas (up)")
+    pedals.set_ylabel("brake (down), throttle (up)")
     pedals.axhline(0.0, color="black", linewidth=0.6)
     place.set_ylabel("right edge to left edge")
     place.axhline(0.0, color="black", linewidth=0.6, linestyle="--")
