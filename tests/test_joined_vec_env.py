@@ -120,6 +120,8 @@ def test_parts_have_equal_spaces(make):
         JoinedVecEnv(make((1, FAST), (1, {**FAST, "action": "pedal"})))
     with pytest.raises(InvalidOption, match="parts is empty"):
         JoinedVecEnv([])
+    with pytest.raises(InvalidOption, match="parts is one vector environment; expected a list"):
+        JoinedVecEnv(make((1, FAST))[0])
 
 
 def test_parts_are_different_vector_environments(make):

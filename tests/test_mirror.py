@@ -296,6 +296,11 @@ def test_other_environments_have_no_mirror_image():
         MirrorVecEnv(DummyVecEnv([lambda: gym.make("CartPole-v1")]))
 
 
+def test_only_vector_environments_are_mirrored():
+    with pytest.raises(InvalidOption, match="expected a vector environment"):
+        MirrorVecEnv(gym.make("TorcsLite-v0"))
+
+
 def test_normalized_observations_have_no_mirror_image():
     cars = TorcsVecEnv(2, env_id="TorcsLite-v0")
     with pytest.raises(InvalidOption, match=r"put it inside: VecNormalize\(MirrorVecEnv"):

@@ -9,10 +9,12 @@ import json
 import math
 import os
 import re
+import subprocess
 import sys
 import threading
 import time
 from contextlib import nullcontext
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -351,6 +353,41 @@ def circle(arcs, radius):
         <attstr name="name" val="circle"/><attnum name="version" val="4"/></section>
         <section name="Main Track"><attnum name="width" val="10"/>
         <section name="Track Segments">{segments}</section></section></params>"""
+
+
+TOO_MANY_MAPS = """
+import mmap
+from contextlib import suppress
+from sb3_torcs.backends.native import make_engine
+from sb3_torcs.errors import BackendUnavailable
+from sb3_torcs.torcs.installation import find_game
+
+def race():
+    return make_engine(find_game(), "g-track-1", [("", 0)])
+
+race().close()
+maps, races = [], []
+with suppress(OSError):
+    for _ in range(10**6):
+        maps.append(mmap.mmap(-1, 1))
+del maps[-60:]
+try:
+    for _ in range(60):
+        races.append(race())
+except BackendUnavailable as error:
+    print(error)
+"""
+
+
+def test_more_races_than_the_machine_maps_libraries_for(game):
+    """It is no fault of the game's, so the advice is not to install it again."""
+    limit = int(Path("/proc/sys/vm/max_map_count").read_text())
+    if limit > 10**6:
+        return  # nobody reaches it
+    done = subprocess.run(
+        [sys.executable, "-c", TOO_MANY_MAPS], capture_output=True, text=True, check=True
+    )
+    assert re.search(r"hold fewer races .* sudo sysctl vm.max_map_count=1000000$", done.stdout)
 
 
 class TestTracks:

@@ -12,8 +12,11 @@ struct Error : std::runtime_error {
     const char* python_class;
 };
 
-// The remedy for EMFILE.
+// The remedies for EMFILE, and for ENOMEM where the loader says it.
 constexpr const char* MORE_FILES =
     "; each module of a race keeps a file open: raise the limit with ulimit -n";
+constexpr const char* MORE_MAPS =
+    "; each race maps parts of libraries: hold fewer races at once, or raise the limit with "
+    "sudo sysctl vm.max_map_count=1000000";
 
 }  // namespace torcs

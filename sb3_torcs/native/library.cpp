@@ -314,12 +314,18 @@ void forget_needs(std::vector<char>& bytes, const std::string& folder) {
     }
 }
 
+constexpr const char* NO_MAP = "failed to map segment";  // as the loader says it
+
 [[noreturn]] void refuse_copy(const std::string& path, const char* error,
                               const std::string& reason) {
     std::string remedy = REINSTALL;
     if (reason.find(strerror(EMFILE)) != std::string::npos) {
         error = "BackendUnavailable";
         remedy = MORE_FILES;
+    } else if (reason.find(NO_MAP) != std::string::npos ||
+               reason.find(strerror(ENOMEM)) != std::string::npos) {
+        error = "BackendUnavailable";
+        remedy = MORE_MAPS;
     } else if (access("/proc/self/fd", F_OK) != 0) {
         error = "BackendUnavailable";
         remedy = "; the loader finds copies of modules in /proc, which is not mounted";

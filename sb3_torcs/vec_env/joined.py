@@ -31,10 +31,13 @@ class JoinedVecEnv(VecEnv):
     of cars that are alone. The environments of the first part come first.
 
     :param parts: vector environments with equal spaces; closed with this one
-    :raises InvalidOption: if there is none, if one is there twice, or if their spaces differ
+    :raises InvalidOption: if there is no list of them, if one is there twice, or if their spaces
+        differ
     """
 
     def __init__(self, parts: Iterable[VecEnv]) -> None:
+        if isinstance(parts, VecEnv):
+            raise InvalidOption("parts is one vector environment; expected a list of them")
         parts = tuple(parts)
         if not parts:
             raise InvalidOption("parts is empty; expected at least one vector environment")

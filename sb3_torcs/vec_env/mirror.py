@@ -27,11 +27,15 @@ class MirrorVecEnv(VecEnvWrapper):
     In a file of hyperparameters: ``vec_env_wrapper: sb3_torcs.vec_env.MirrorVecEnv``.
 
     :param venv: of Torcs-v0 or TorcsLite-v0; the first car is not mirrored, the second is
-    :raises InvalidOption: if the range finders look further to one side than to the other, or if
-        observations are stacked or normalized already
+    :raises InvalidOption: if it is no vector environment, if the range finders look further to one
+        side than to the other, or if observations are stacked or normalized already
     """
 
     def __init__(self, venv: VecEnv) -> None:
+        if not isinstance(venv, VecEnv):
+            raise InvalidOption(
+                f"venv is {venv!r}; expected a vector environment, e.g. TorcsVecEnv(races=8)"
+            )
         super().__init__(venv)
         normalized = unwrap_vec_wrapper(venv, VecNormalize)
         if normalized is not None and normalized.norm_obs:
