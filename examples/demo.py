@@ -151,7 +151,7 @@ def clear(folder: Path) -> None:
 def train(folder: Path, wanted: int, done: int, seed: int) -> bool:
     """Learn from the timesteps that are still wanted; say whether Ctrl-C ended it."""
     before, course = runs(folder), course_of(folder)
-    (folder / STATE).write_text(json.dumps({"timesteps": wanted, "seed": seed}))
+    (folder / STATE).write_text(json.dumps({"timesteps": wanted}))
     options = TrainOptions(
         algo=course.algo,
         env=course.env,

@@ -142,7 +142,7 @@ def go_on(args: argparse.Namespace, tracks: list[str], settings: Settings) -> Pa
     ]
     model.learn(args.timesteps, callback=callbacks)
     cars.close()
-    specialist = args.folder / f"{tracks[0] if len(tracks) == 1 else 'together'}.zip"
+    specialist = args.folder / f"{Path(tracks[0]).stem if len(tracks) == 1 else 'together'}.zip"
     model.save(specialist)
     return specialist
 

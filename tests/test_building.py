@@ -30,7 +30,7 @@ def installed_from(monkeypatch, record):
 
 def pip_installs(*words):
     command = [sys.executable, "-m", "pip", "install", "--force-reinstall", "--no-deps", *words]
-    return f"{' '.join(command)}; it needs a C++17 compiler: sudo apt install g++ python3-dev"
+    return f"{' '.join(command)} (it needs a C++17 compiler: sudo apt install g++ python3-dev)"
 
 
 def test_the_remedy_installs_from_where_the_package_came_from(monkeypatch, tmp_path):
@@ -49,7 +49,7 @@ def test_the_remedy_installs_from_where_the_package_came_from(monkeypatch, tmp_p
 )
 def test_the_remedy_names_a_checkout_where_none_is_known(monkeypatch, record):
     installed_from(monkeypatch, record)
-    assert "--no-deps . (in a checkout of sb3-torcs); it needs" in build_command()
+    assert "--no-deps . (in a checkout of sb3-torcs) (it needs" in build_command()
 
 
 def build(folder, **environment):

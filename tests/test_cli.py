@@ -385,6 +385,29 @@ def test_without_a_whole_lap_there_are_figures_and_no_report(capsys, tmp_path, p
     assert "report:" not in run(capsys, *words)[1]
 
 
+def test_a_video_that_fails_takes_nothing_else_with_it(capsys, tmp_path, monkeypatch):
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", "/bin/false")
+    files = {kind: str(tmp_path / f"one{kind}") for kind in (".mp4", ".png", ".parquet", ".html")}
+    options = zip(("--video", "--line", "--telemetry", "--report"), files.values(), strict=True)
+    words = ["evaluate", "scripted", *LITE, "--laps", "1", *itertools.chain(*options)]
+    status, _, err = run(capsys, *words)
+    assert status != 0
+    assert "ffmpeg" in err
+    made = sorted(path.suffix for path in tmp_path.iterdir())
+    assert made == [".html", ".parquet", ".png"]
+
+
+def test_no_report_lays_laps_of_several_roads_on_one(capsys, tmp_path, monkeypatch):
+    """Whether the random track is typed, or of the model's own training."""
+    record = models.TrainingRecord(env_id="TorcsLite-v0", env_kwargs={"track": "random"})
+    monkeypatch.setattr(evaluate, "told_record", lambda driver: record)
+    words = ["evaluate", "scripted", "--report", str(tmp_path / "one.html")]
+    for more in ([], ["--track", "random"]):
+        status, _, err = run(capsys, *words, *more)
+        assert status == 2
+        assert "--report compares laps of one track; give --track a name" in err
+
+
 @pytest.mark.parametrize("words", ["delay", "=3"])
 def test_an_argument_without_a_value_is_refused(words):
     with pytest.raises(argparse.ArgumentTypeError, match=r"expected NAME=VALUE, e\.g\. delay=2"):

@@ -388,6 +388,17 @@ def test_a_budget_without_a_whole_race_is_said(tiny, tmp_path, capsys):
     assert not list(tmp_path.iterdir())
 
 
+def test_ctrl_c_before_a_whole_race_is_no_mistake(tiny, tmp_path, monkeypatch, capsys):
+    def interrupted(search, budget):
+        yield search.state()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(LapSearch, "run", interrupted)
+    assert main(words(tmp_path / "lap.npz")) == 130
+    assert capsys.readouterr().err.rstrip().endswith("so no ghost is kept")
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("by", [KeyboardInterrupt, SystemExit(143)])
 def test_an_interrupted_search_keeps_what_it_found(tiny, ghost, tmp_path, monkeypatch, capsys, by):
     def interrupted(search, budget):

@@ -400,6 +400,17 @@ def test_ctrl_c_keeps_the_races_that_are_over(capsys, game, tmp_path, monkeypatc
     assert capsys.readouterr().out == ""
 
 
+def test_a_video_that_fails_takes_nothing_else_with_it(capsys, game, tmp_path, monkeypatch):
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", "/bin/false")
+    words = ["race", "scripted", "bt", "--track", SHORT, "--laps", "1", "--races", "1"]
+    files = {"--video": "a.mp4", "--picture": "a.png", "--telemetry": "a.parquet"}
+    for option, name in files.items():
+        words += [option, str(tmp_path / name)]
+    assert main(words) != 0
+    assert "ffmpeg" in capsys.readouterr().err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.parquet", "a.png"]
+
+
 def test_the_last_race_is_written_and_reported(capsys, game, tmp_path):
     """Tick by tick, which changes nothing: the standings are those of a race that nobody notes."""
     words = ["race", "scripted", "bt", "--track", SHORT, "--laps", "2", "--races", "1", "--json"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import gymnasium as gym
@@ -14,7 +15,7 @@ from sb3_torcs.errors import InvalidOption, OutputNotWritable
 from sb3_torcs.tracks.catalogue import load_track
 from sb3_torcs.tracks.generator import SPARE, random_track
 from sb3_torcs.tracks.torcs_xml_writer import write_track_xml
-from sb3_torcs.tracks.track import X, Y, closing_gap
+from sb3_torcs.tracks.track import Grid, X, Y, closing_gap
 
 SEEDS = range(60)
 
@@ -115,6 +116,16 @@ def test_a_file_of_torcs_holds_the_same_road(circuits, tmp_path):
         assert [segment[8:] for segment in back.segments] == [s[8:] for s in track.segments]
         assert back.grid.distance == track.grid.distance
         assert back.grid.offset * track.grid.offset > 0.0
+
+
+@pytest.mark.parametrize("share", [0.0, 1 / 6, 1 / 4, -3 / 10])
+def test_a_grid_that_the_game_knows_comes_back(circuits, tmp_path, share):
+    """Slots stand beside each other at equal distances, one to four of them."""
+    width = circuits[0].segments[0].width_start
+    grid = Grid(12.0, share * width)
+    write_track_xml(dataclasses.replace(circuits[0], grid=grid), tmp_path / "road.xml")
+    back = load_track(tmp_path / "road.xml").grid
+    assert back == pytest.approx(grid)
 
 
 def test_the_real_game_drives_it(circuits, tmp_path, game):

@@ -7,8 +7,11 @@ import contextlib
 import json
 import math
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from sb3_torcs.files import writable_file
 
 if TYPE_CHECKING:
     from sb3_torcs.agents.models import TrainingRecord
@@ -20,6 +23,7 @@ __all__ = [
     "INTERRUPTED",
     "MODEL_HELP",
     "TRUST_HELP",
+    "asked_files",
     "lacks_cache",
     "natural",
     "parsed_robots",
@@ -42,6 +46,21 @@ AGENT_HELP = "a saved .zip, a run's folder, a shipped agent, or 'scripted'"
 MODEL_HELP = AGENT_HELP.replace(", or ", ", a ghost, or ")
 
 TRUST_HELP = "run the code that is pickled in the model: only if you trust its author"
+
+
+def asked_files(args: argparse.Namespace, kinds: Mapping[str, tuple[str, ...]]) -> dict[str, Path]:
+    """
+    Check the files that are asked for, before anything is driven.
+
+    :param args: from the command line
+    :param kinds: the allowed endings of each option
+    :return: their paths, by option
+    """
+    return {
+        what: writable_file(getattr(args, what), suffixes)
+        for what, suffixes in kinds.items()
+        if getattr(args, what) is not None
+    }
 
 
 def lacks_cache(error: Exception) -> bool:

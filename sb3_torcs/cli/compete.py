@@ -111,7 +111,7 @@ def _figures(agent: Agent) -> dict[str, Any]:
     import numpy as np
 
     latencies = 1000.0 * np.array(agent.backend.latencies)
-    median, late, longest = np.percentile(latencies, (50, 99, 100)) if latencies.size else [0.0] * 3
+    median, late, longest = np.percentile(latencies, (50, 99, 100))
     return {
         "laps": len(agent.lap_times),
         "lap_times": agent.lap_times,

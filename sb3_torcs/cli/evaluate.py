@@ -13,6 +13,7 @@ from sb3_torcs.car import DEFAULT_CAR
 from sb3_torcs.cli.common import (
     MODEL_HELP,
     TRUST_HELP,
+    asked_files,
     positive,
     print_json,
     quiet_output,
@@ -21,7 +22,6 @@ from sb3_torcs.cli.common import (
     table,
     told_record,
 )
-from sb3_torcs.files import writable_file
 
 if TYPE_CHECKING:
     from sb3_torcs.agents.models import TrainingRecord
@@ -100,7 +100,7 @@ def run(args: argparse.Namespace) -> int:
     :param args: from the command line
     :return: the exit status
     """
-    files = _files(args)
+    files = asked_files(args, FILES)
     with quiet_output(args.json):
         result, recorder, log = _drive(args, ticks=_ticks_wanted(files, "telemetry", "report"))
     # Before the files: a full disk does not drop what was driven.
@@ -112,41 +112,27 @@ def run(args: argparse.Namespace) -> int:
         print(table(HEADERS, [_row(number, episode) for number, episode in enumerate(result, 1)]))
     with quiet_output(args.json), contextlib.closing(recorder):
         _write(files, recorder, log, str(args.model))
-    if "report" in files and not _reported(files["report"], recorder, log):
-        print(f"sb3-torcs: no report: nobody drove a whole lap of {recorder.names()['track']}",
-            file=sys.stderr)  # fmt: skip
-        del files["report"]
+        if "report" in files and not _reported(files["report"], recorder, log):
+            print(f"sb3-torcs: no report: nobody drove a whole lap of {recorder.names()['track']}",
+                file=sys.stderr)  # fmt: skip
+            del files["report"]
+        if "video" in files:  # last: it takes longest, and may fail
+            recorder.save_video(files["video"])
     for what, path in files.items():
         if not args.json:
             print(f"{what}: {path}")
     return 0
 
 
-def _files(args: argparse.Namespace) -> dict[str, Path]:
-    """Check the files that are asked for, before anything is driven."""
-    from sb3_torcs.errors import InvalidOption
-    from sb3_torcs.torcs.track_names import RANDOM_TRACK
-
-    if args.report and args.track == RANDOM_TRACK:
-        raise InvalidOption("--report compares laps of one track; give --track a name")
-    return {
-        what: writable_file(getattr(args, what), suffixes)
-        for what, suffixes in FILES.items()
-        if getattr(args, what)
-    }
-
-
 def _write(files: Mapping[str, Path], recorder: Recorder, log: DriveLog, model: str) -> None:
     """
-    Write the files that show the drives.
+    Write the line and the telemetry of the drives.
 
     :param files: by what they hold
     :param recorder: of the timesteps
     :param log: of the control ticks
     :param model: as typed
     """
-    if "video" in files:
-        recorder.save_video(files["video"])
     if "line" in files:
         recorder.draw_line(files["line"])
     if _ticks_wanted(files, "telemetry"):
@@ -183,10 +169,12 @@ def _drive(args: argparse.Namespace, *, ticks: bool) -> tuple[list[Episode], Rec
     """
     from sb3_torcs.agents.models import driver_name, load_driver
     from sb3_torcs.agents.wrapping import wrapped
+    from sb3_torcs.errors import InvalidOption
     from sb3_torcs.evaluation.protocol import choose_world, evaluate, time_limit
     from sb3_torcs.evaluation.recording import Recorder
     from sb3_torcs.evaluation.ticks import log_drives
     from sb3_torcs.telemetry import DriveLog
+    from sb3_torcs.torcs.track_names import RANDOM_TRACK
     from sb3_torcs.training.zoo import check_env_kwargs, check_racing
 
     _check_options(args.env_kwargs)
@@ -198,6 +186,8 @@ def _drive(args: argparse.Namespace, *, ticks: bool) -> tuple[list[Episode], Rec
     check_racing(env_id)
     check_env_kwargs(dict(args.env_kwargs), env_id, "--env-kwargs")
     kwargs = environment_kwargs(args, record)
+    if args.report is not None and kwargs.get("track") == RANDOM_TRACK:
+        raise InvalidOption("--report compares laps of one track; give --track a name")
     recorder = Recorder(env_id, kwargs, time_limit(kwargs))
     # The recorder is inside the wrappers, so it records the actions that reach the car.
     env = wrapped(recorder, record.hyperparameters, trust=args.trust)

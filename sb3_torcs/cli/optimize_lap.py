@@ -90,10 +90,14 @@ def run(args: argparse.Namespace) -> int:
         ghost, state, stopped = _search(args, kwargs)
     seconds = time.monotonic() - begun
     if ghost is None:
-        raise InvalidOption(
+        why = (
             f"the search ended before its first race of its own was whole ({state.rollouts} "
-            f"rollouts, {seconds:.0f} s), so no ghost is kept; give more --seconds or --rollouts"
+            f"rollouts, {seconds:.0f} s), so no ghost is kept"
         )
+        if stopped:
+            print(f"sb3-torcs: {why}", file=sys.stderr)
+            return INTERRUPTED
+        raise InvalidOption(f"{why}; give more --seconds or --rollouts")
     standing, *flying = ghost.lap_times
     figures = {
         "track": track,

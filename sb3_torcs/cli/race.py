@@ -12,6 +12,7 @@ from sb3_torcs.cli.common import (
     AGENT_HELP,
     INTERRUPTED,
     TRUST_HELP,
+    asked_files,
     positive,
     print_json,
     quiet_output,
@@ -19,7 +20,6 @@ from sb3_torcs.cli.common import (
     table,
     warn_unless_known,
 )
-from sb3_torcs.files import writable_file
 from sb3_torcs.signals import held_back
 
 if TYPE_CHECKING:
@@ -111,11 +111,7 @@ def run(args: argparse.Namespace) -> int:
     :param args: from the command line
     :return: the exit status
     """
-    files = {
-        what: writable_file(getattr(args, what), suffixes)
-        for what, suffixes in FILES.items()
-        if getattr(args, what) is not None
-    }
+    files = asked_files(args, FILES)
     from sb3_torcs.errors import InvalidOption
     from sb3_torcs.telemetry import DriveLog
 
@@ -134,10 +130,10 @@ def run(args: argparse.Namespace) -> int:
     if at_once:
         _drop(files, ("video",), "the command was told to end")
     with quiet_output(args.json):
-        if footage is not None and "video" in files:
+        _write(files, races[-1], log, entrants[0].name)
+        if footage is not None and "video" in files:  # last: it takes longest, and may fail
             sys.stderr.write(DRAWING if stopped else "")
             footage.save(files["video"], _followed(entrants, races[0]), args.laps)
-        _write(files, races[-1], log, entrants[0].name)
     if not args.json:
         for what, path in files.items():
             print(f"{what}: {path}")

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from sb3_torcs.car import CarState, Controls
 from sb3_torcs.evaluation.ticks import TickedWorld
 from sb3_torcs.telemetry import CONTROL_FIELDS, STATE_FIELDS, write_telemetry
+from sb3_torcs.tracks.track import Track
 
 __all__ = ["Recorded", "Recorder", "Stretch", "best_stretch"]
 
@@ -72,6 +73,7 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
     def __init__(self, env_id: str, kwargs: dict[str, Any], max_episode_steps: int) -> None:
         self.env_id = env_id
         self.episodes: list[list[Recorded]] = []
+        self._tracks: list[Track] = []  # of the episodes
         self._kwargs = kwargs
         self._limit = max_episode_steps
         self._seed: int | None = None
@@ -89,7 +91,9 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
         """
         self._seed = seed if seed is not None else self._seed
         self.episodes.append([])
-        return self.env.reset(seed=seed, options=options)
+        begun = self.env.reset(seed=seed, options=options)
+        self._tracks.append(self.get_wrapper_attr("backend").track)
+        return begun
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """
@@ -138,8 +142,7 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
         cars = [d.car for d in self.episodes[stretch.episode][stretch.first : stretch.last]]
         line = np.array([(car.x, car.y) for car in cars])
         speed = np.array([car.speed_x for car in cars])
-        with self._again(stretch.episode) as env:
-            plot_track(env.get_wrapper_attr("backend").track, path, line=line, speed=speed)
+        plot_track(self._tracks[stretch.episode], path, line=line, speed=speed)
 
     def save_video(self, path: Path) -> None:
         """
@@ -157,7 +160,7 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
     def _frames(self, stretch: Stretch, repeat: int) -> Iterator[npt.NDArray[np.uint8]]:
         """Drive the episode again, and render the stretch: some frames of each timestep."""
         timesteps = self.episodes[stretch.episode]
-        with self._again(stretch.episode, render_mode="rgb_array") as env:
+        with self._again(stretch.episode) as env:
             racing: Any = env.unwrapped
             ticks = itertools.count(1)
             frames: list[npt.NDArray[np.uint8]] = []
@@ -176,9 +179,9 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
                 yield from frames
                 frames.clear()
 
-    def _again(self, episode: int, **changes: Any) -> gym.Env[Any, Any]:
-        """Build the environment anew, at the beginning of an episode."""
-        kwargs = {**self._kwargs, **changes}
+    def _again(self, episode: int) -> gym.Env[Any, Any]:
+        """Build the environment anew with pictures, at the beginning of an episode."""
+        kwargs = {**self._kwargs, "render_mode": "rgb_array"}
         env = gym.make(self.env_id, max_episode_steps=self._limit + 1, **kwargs)
         env.reset(seed=self._seed)
         for _ in range(episode):  # each reset draws from the same generator

@@ -296,8 +296,8 @@ def _source(
 def _tracks(value: Any, what: str) -> tuple[str, ...]:
     """Read a list of tracks; a category stands for all of its tracks."""
     tracks = [value] if isinstance(value, str) else value
-    listed = isinstance(tracks, list) and all(isinstance(track, str) for track in tracks)
-    if not listed or not tracks:
+    named = isinstance(tracks, list) and all(isinstance(track, str) for track in tracks)
+    if not named or not tracks:
         categories = ", ".join(f"'{category}'" for category in CATEGORIES)
         raise StudyError(f"{what} is {value!r}; expected a list of tracks, or of {categories}")
     tracks = list(chain.from_iterable(map(tracks_of, tracks)))

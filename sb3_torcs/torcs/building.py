@@ -25,7 +25,7 @@ def build_command() -> str:
     words = [sys.executable, "-m", "pip", "install", "--force-reinstall", "--no-deps"]
     command = shlex.join([*words, *(["--editable"] if editable else []), source])
     where = " (in a checkout of sb3-torcs)" if source == ANYWHERE else ""
-    return f"{command}{where}; it needs a C++17 compiler: sudo apt install g++ python3-dev"
+    return f"{command}{where} (it needs a C++17 compiler: sudo apt install g++ python3-dev)"
 
 
 def _source() -> tuple[str, bool]:

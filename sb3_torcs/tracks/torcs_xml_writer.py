@@ -21,8 +21,9 @@ def write_track_xml(track: Track, path: str | Path) -> None:
     Write a track as a file of TORCS; the road is flat.
 
     ``sb3_torcs.tracks.load_track`` reads it, and so does ``Torcs-v0``. The game turns and moves the
-    road: it begins along the x-axis, and all of it has positive coordinates. The game's own window
-    needs a model of the scenery besides.
+    road: it begins along the x-axis, and all of it has positive coordinates. The game knows some
+    first grid slots only, and gets the nearest one. Its own window needs a model of the scenery
+    besides.
 
     :param track: whose road has one width
     :param path: of the file, which ends in ``.xml``
@@ -46,7 +47,8 @@ def write_track_xml(track: Track, path: str | Path) -> None:
         _set(own, friction=surface.friction, rebound=surface.rebound, dammage=surface.damage)
         own.set("rolling resistance", surface.rolling_resistance)
     main = root.make("Main Track")
-    main.set("width", widths.pop())
+    (width,) = widths
+    main.set("width", width)
     for side in ("Left", "Right"):
         main.make(f"{side} Border").set("width", 0.0)
     for number, segment in enumerate(track.segments, start=1):
@@ -54,6 +56,7 @@ def write_track_xml(track: Track, path: str | Path) -> None:
     grid = root.make("Starting Grid")
     grid.set("distance to start", track.grid.distance)
     grid.set("pole position side", "left" if track.grid.offset > 0.0 else "right")
+    grid.set("rows", max(round(width / (0.5 * width - abs(track.grid.offset))) - 1, 1))
     with whole_file(path, IN_A_FOLDER) as aside:
         root.write(aside)
 

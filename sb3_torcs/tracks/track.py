@@ -163,10 +163,16 @@ class Track:
             row[LENGTH:X] = s.length, s.curvature
             row[X:WIDTH_START] = pose
             row[WIDTH_START:ROAD_FRICTION] = s[2:8]
-            for column, surface in zip(range(12, 18, 2), (s.road, s.left, s.right), strict=True):
-                row[column : column + 2] = surface.friction, surface.rolling_resistance
-            for column, wall in zip(range(18, 24, 3), (s.left_wall, s.right_wall), strict=True):
-                row[column : column + 3] = wall.friction, wall.rebound, wall.damage
+            row[ROAD_FRICTION:LEFT_WALL_FRICTION] = [
+                value
+                for ground in (s.road, s.left, s.right)
+                for value in (ground.friction, ground.rolling_resistance)
+            ]
+            row[LEFT_WALL_FRICTION:] = [
+                value
+                for wall in (s.left_wall, s.right_wall)
+                for value in (wall.friction, wall.rebound, wall.damage)
+            ]
             start += s.length
             pose = _advance(pose, s.length, s.curvature)
         table.setflags(write=False)
