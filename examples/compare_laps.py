@@ -4,22 +4,17 @@ python examples/compare_laps.py ddpg-aalborg inferno --track aalborg
 """
 
 import argparse
-import csv
-import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 from matplotlib.figure import Figure
 
+import sb3_torcs
 from sb3_torcs.actions import BRAKE_THRESHOLD
-from sb3_torcs.agents.models import driver_record, load_driver
-from sb3_torcs.agents.robots import race
 from sb3_torcs.car import KMH
 from sb3_torcs.errors import ends_in_a_line
-from sb3_torcs.evaluation.protocol import drive, race_environment
-from sb3_torcs.torcs.installation import find_game
-from sb3_torcs.tracks.catalogue import load_track
 from sb3_torcs.tracks.plot import edges
 
 COLOURS = ("tab:blue", "tab:red", "tab:green", "tab:purple", "tab:orange")
@@ -31,71 +26,32 @@ BEFORE = 120.0  # [m] in which a car slows down for it
 
 
 class Lap(NamedTuple):
-    """The best flying lap of a driver, sampled as often as it decides."""
+    """The best flying lap of a driver, every 0.02 s."""
 
     name: str
     seconds: float
-    distance: np.ndarray  # (n,) [m] from the line
-    speed: np.ndarray  # (n,) [m/s]
-    place: np.ndarray  # (n,) -1 to 1, left positive
-    offset: np.ndarray  # (n,) [m] from the middle of the road, left positive
-    throttle: np.ndarray  # (n,)
-    brake: np.ndarray  # (n,)
-    line: np.ndarray  # (n, 2) [m] x and y
+    rows: pd.DataFrame
+
+    @property
+    def distance(self):
+        """[m] from the line."""
+        return self.rows["distance_from_start"].to_numpy()
+
+    @property
+    def offset(self):
+        """[m] from the middle of the road, left positive."""
+        return self.rows["distance_from_axis"].to_numpy()
+
+    @property
+    def brake(self):
+        """From 0 to 1."""
+        return self.rows["brake"].to_numpy()
 
 
-def robot_samples(name, track):
-    """What a robot does in three laps, every 0.02 s."""
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "telemetry.csv"
-        race([find_game().parse_robot(name)], track, 3, telemetry=file)
-        with file.open(newline="") as lines:
-            return [{key: float(row[key]) for key in row if key != "robot"}
-                    for row in csv.DictReader(lines)]  # fmt: skip
-
-
-def model_samples(name, track):
-    """What a model does in three laps, once per timestep."""
-    record = driver_record(name)
-    env = race_environment(
-        record.env_id or "Torcs-v0",
-        record.env_kwargs,
-        track,
-        hyperparameters=record.hyperparameters,
-    )
-    rows = []
-    for timestep in drive(env, load_driver(name, env)):
-        controls = env.get_wrapper_attr("controls")
-        pedals = {"throttle": controls.throttle, "brake": controls.brake}
-        rows.append({**timestep.car._asdict(), **pedals})
-    env.close()
-    return rows
-
-
-def best_lap(name, track):
-    """Drive three laps, and cut the best flying one out."""
-    robot = name.partition(":")[0] in find_game().robots()
-    rows = (robot_samples if robot else model_samples)(name, track)
-    laps = {}
-    for row in rows:
-        laps.setdefault(int(row["laps"]), []).append(row)
-    times = {lap: laps[lap + 1][0]["last_lap_time"] for lap in laps if lap >= 1 and lap + 1 in laps}
-    if not times:
-        raise SystemExit(f"{name} does not drive a whole flying lap of {track}")
-    lap = min(times, key=times.get)
-    columns = {key: np.array([row[key] for row in laps[lap]]) for key in laps[lap][0]
-               if np.isscalar(laps[lap][0][key])}  # fmt: skip
-    return Lap(
-        name=Path(name).name if Path(name).is_dir() else name,
-        seconds=times[lap],
-        distance=columns["distance_from_start"],
-        speed=columns["speed_x"],
-        place=2.0 * columns["distance_from_axis"] / columns["track_width"],
-        offset=columns["distance_from_axis"],
-        throttle=columns["throttle"],
-        brake=columns["brake"],
-        line=np.stack([columns["x"], columns["y"]], axis=1),
-    )
+def best_lap(driver):
+    """Take the best flying lap of a driver that was compared."""
+    name, lap = driver.drive.driver, driver.lap
+    return Lap(Path(name).name if Path(name).is_dir() else name, lap.time, lap.rows)
 
 
 def tightest_bends(track):
@@ -137,10 +93,10 @@ def draw_along(figure, laps):
     speed, pedals, place = figure.subplots(3, 1, sharex=True)
     for lap, colour in zip(laps, COLOURS, strict=False):
         label = f"{lap.name}, {lap.seconds:.2f} s"
-        speed.plot(lap.distance, KMH * lap.speed, color=colour, label=label)
-        pedals.plot(lap.distance, lap.throttle, color=colour, linewidth=0.8)
+        speed.plot(lap.distance, KMH * lap.rows["speed_x"], color=colour, label=label)
+        pedals.plot(lap.distance, lap.rows["throttle"], color=colour, linewidth=0.8)
         pedals.fill_between(lap.distance, -lap.brake, color=colour, alpha=0.5, linewidth=0.0)
-        place.plot(lap.distance, lap.place, color=colour)
+        place.plot(lap.distance, 2.0 * lap.offset / lap.rows["track_width"], color=colour)
     speed.set_ylabel("speed [km/h]")
     speed.legend(fontsize=8, ncols=len(laps), loc="lower left", bbox_to_anchor=(0.0, 1.0))
     pedals.set_ylabel("brake (down), throttle (up)")
@@ -163,7 +119,7 @@ def draw_bends(figure, laps, track):
             axes.plot(*edge.T, color="#4a4f57", linewidth=1.0)
         axes.plot(*centre.T, color="#4a4f57", linewidth=0.7, linestyle="--")
         for lap, colour in zip(laps, COLOURS, strict=False):
-            axes.plot(*lap.line.T, color=colour, linewidth=1.8)
+            axes.plot(lap.rows["x"], lap.rows["y"], color=colour, linewidth=1.8)
         axes.set(xlim=(x - VIEW, x + VIEW), ylim=(y - VIEW, y + VIEW), aspect="equal")
         axes.set_title(f"{place:.0f} m", fontsize=9)
         axes.set(xticks=[], yticks=[])
@@ -175,9 +131,9 @@ def main() -> None:
     parser.add_argument("--track", default="aalborg")
     parser.add_argument("--out", type=Path, default=Path("laps.png"))
     args = parser.parse_args()
-    track = load_track(args.track)
+    compared = sb3_torcs.compare(*args.drivers, track=args.track).comparison
+    track, laps = compared.track, [best_lap(driver) for driver in compared.drivers]
     bend = sharp_bends(track)
-    laps = [best_lap(name, args.track) for name in args.drivers]
     for lap in laps:
         before, within = where_it_brakes(lap, bend)
         share = np.mean(lap.brake > BRAKE_THRESHOLD)

@@ -15,18 +15,16 @@ from rich.console import Console
 from rich.progress import track as progress
 
 import sb3_torcs  # noqa: F401  (registers the environments)
+from sb3_torcs.agents.model_record import DRIVEN_WITH
 from sb3_torcs.agents.models import driver_record, load_driver
 from sb3_torcs.agents.rollout import Driver, drive
 from sb3_torcs.car import Start
 from sb3_torcs.cli.common import table
-from sb3_torcs.envs.aids import AIDS
 from sb3_torcs.errors import ends_in_a_line
 
 ROUNDING = 1e-6  # [-] between observations, which are at most 3
 SAME = 1e-4  # [-] between two actions that count as equal
 MILLISECOND = 0.001  # [s]
-# Of a model's training.
-KEPT = ("car", "sensors", "action_repeat", "range_finders", "action", "gearbox", *AIDS)
 HEADERS = ("track", "equal", "same actions", "difference", "laps, engine", "laps, game")
 
 
@@ -105,8 +103,9 @@ def main() -> None:
     words = parser.parse_args()
     tracks = words.tracks.split(",")
     rows, all_equal = [], True
-    settings = driver_record(words.model).kept(KEPT)
-    driver = load_driver(words.model, gym.make("Torcs-v0", **settings))
+    settings = driver_record(words.model).kept(("car", *DRIVEN_WITH))
+    with gym.make("Torcs-v0", **settings) as env:
+        driver = load_driver(words.model, env)
     for track in progress(tracks, "racing", console=Console(stderr=True)):
         answer = compare(track, driver, laps=words.laps, **settings)
         all_equal &= answer.equal

@@ -17,6 +17,7 @@ from sb3_torcs.errors import Sb3TorcsError
 from sb3_torcs.races.text_mode import run as run_game
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.race_results import RobotResult
+from sb3_torcs.torcs.race_setup import session_for
 from sb3_torcs.torcs.track_names import find_track
 
 ROBOTS = "inferno,berniw,bt,olethros,tita,lliaw"
@@ -67,7 +68,7 @@ def compare(field: list[str], track: str, laps: int) -> dict[str, object]:
     :return: who, where, whether all is equal, and what is not
     """
     robots = [find_game().parse_robot(name) for name in field]
-    session = "practice" if len(robots) == 1 else "race"
+    session = session_for(robots)
     row = {"robots": field, "track": track}
     try:
         game = measures(run_game(find_game(), track, robots, laps, session))

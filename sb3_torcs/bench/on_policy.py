@@ -20,7 +20,7 @@ from sb3_torcs.vec_env import TorcsVecEnv
 
 __all__ = ["ppo"]
 
-TORCS = "Torcs-v0"
+ENTRY = "Torcs-v0"  # of the hyperparameter file, and the environment
 CORES = 2
 ROLLOUTS = 4  # of a turn
 
@@ -49,7 +49,7 @@ class _Training:
     def __init__(self, entry: dict[str, Any], plain: bool) -> None:
         from sb3_torcs.training.manager import build
 
-        self.model, self.callbacks, _ = build("ppo", TORCS, entry)
+        self.model, self.callbacks, _ = build("ppo", ENTRY, entry)
         self.made = self.model.get_env()
         if plain:
             assert isinstance(self.made, TorcsVecEnv)
@@ -87,7 +87,7 @@ def ppo(seconds: float) -> Figures:
     names = "ppo_timesteps_per_s", "ppo_dummy_timesteps_per_s"
     if len(os.sched_getaffinity(0)) < CORES:
         return dict.fromkeys(names)
-    entry = read_entry(config_file("ppo"), TORCS)
+    entry = read_entry(config_file("ppo"), ENTRY)
     begin = time.perf_counter()
     with _on_two_cores():
         trainings = [_Training(entry, plain) for plain in (False, True)]

@@ -48,9 +48,6 @@ KEYS = (
 """All figures, in the order they are shown; those of worlds that are not here stay empty."""
 
 
-BATCH = 64
-
-
 def stages(seconds: float) -> dict[str, Callable[[], Figures]]:
     """
     List the measurements.
@@ -71,7 +68,7 @@ def stages(seconds: float) -> dict[str, Callable[[], Figures]]:
         "SCR": _where_it_is(lambda: scr.ticks(share)),
         "SCR resets": _where_it_is(scr.resets),
         "pictures": _where_it_is(scr.pictures),
-        "policy": lambda: _policy(share),
+        "policy": lambda: measure(seconds=share),
         "updates": lambda: default_updates(share),
         "learning": _where_it_is(lambda: training_rate(max(int(400.0 * share), 100))),
         "PPO": _where_it_is(lambda: ppo(share)),
@@ -89,8 +86,3 @@ def _where_it_is(measure: Callable[[], Figures]) -> Callable[[], Figures]:
             return {}
 
     return measured
-
-
-def _policy(seconds: float) -> Figures:
-    """Measure the policy's updates."""
-    return measure(batch_size=BATCH, seconds=seconds)

@@ -16,6 +16,7 @@ Measure speeds on one core, in processor time. Figures to be compared are measur
 lite_ticks_per_s          env.step of TorcsLite-v0, action_repeat=1, without resets; a scripted
                           driver has chosen the actions beforehand
 racetrack_v1_steps_per_s  env.step of highway-env's racetrack-v1
+lite_reset_ms             resets of TorcsLite-v0
 torcs_limit_ticks_per_s   the game's bare physics, along a recorded drive
 torcs_cpp_ticks_per_s     the same drive in the engine, with rules and sensors
 torcs_env_*               the same drive by env.step of Torcs-v0

@@ -15,7 +15,7 @@ from sb3_torcs.studies.config import trial_name
 from sb3_torcs.studies.estimates import Array, Estimate, estimate, share
 from sb3_torcs.studies.pictures import PANELS, curves_of
 from sb3_torcs.studies.results import Results
-from sb3_torcs.telemetry.document import OKABE_ITO, Cell, chip, document, paragraph, table
+from sb3_torcs.telemetry.document import Cell, chip, colour_of, document, paragraph, table
 
 __all__ = ["Section", "study_page"]
 
@@ -53,7 +53,7 @@ def study_page(
     :return: HTML, which works without any other file and without a network
     """
     panels = _panels(variants)
-    colours = {variant: _colour(number) for number, variant in enumerate(variants)}
+    colours = {variant: colour_of(number) for number, variant in enumerate(variants)}
     legend = " ".join(
         f"{chip(colour)}{escape(variant)}&emsp;" for variant, colour in colours.items()
     )
@@ -71,10 +71,6 @@ def study_page(
         body += [table(section.headers, [section.rows], kind="sortable")]
     body += ["<h2>Laps of each seed</h2>", *_links(variants, folder, output), "</main>"]
     return document(name, "\n".join(body), {"panels": panels}, ["page_study.js"])
-
-
-def _colour(number: int) -> str:
-    return OKABE_ITO[number % len(OKABE_ITO)]
 
 
 def _frame(panel: Mapping[str, Any]) -> str:
@@ -103,7 +99,7 @@ def _panels(variants: Mapping[str, Sequence[Results]]) -> list[dict[str, Any]]:
 def _curve(text: str, number: int, x: Array, y: Array, **more: Any) -> dict[str, Any]:
     """Return a curve as the script draws it; what is not finite leaves a gap."""
     values = [round(float(value), 4) if np.isfinite(value) else None for value in y]
-    colour = _colour(number)
+    colour = colour_of(number)
     return {"text": escape(text), "colour": colour, "x": x.tolist(), "y": values, **more}
 
 

@@ -14,7 +14,16 @@ from typing import Any, NamedTuple
 from sb3_torcs.errors import PackageMissing
 from sb3_torcs.files import whole_file
 
-__all__ = ["OKABE_ITO", "Cell", "chip", "document", "paragraph", "table", "write_document"]
+__all__ = [
+    "OKABE_ITO",
+    "Cell",
+    "chip",
+    "colour_of",
+    "document",
+    "paragraph",
+    "table",
+    "write_document",
+]
 
 FOLDER = Path(__file__).parent
 
@@ -102,6 +111,15 @@ def write_document(path: Path, text: str) -> None:
     """
     with whole_file(path) as aside:
         aside.write_text(text, encoding="utf-8")
+
+
+def colour_of(number: int) -> str:
+    """
+    Choose a colour.
+
+    :param number: of what has it, from 0; colours come again after seven
+    """
+    return OKABE_ITO[number % len(OKABE_ITO)]
 
 
 def chip(colour: str) -> str:

@@ -14,14 +14,13 @@ from sb3_torcs.tracks.track import Track
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["CHANNELS", "Drive", "Lap", "SampledLap", "drives_of", "grid_of", "sample"]
+__all__ = ["Drive", "Lap", "SampledLap", "drives_of", "grid_of", "sample"]
 
 STEP = 1.0  # [m] between two samples of a lap
 MOST_SAMPLES = 5000  # of a lap; longer tracks get longer steps
 ROLLING = 10.0  # [m/s] from which a wheel's radius can be measured
 PEDAL_UP = 0.1  # [-] of a pedal's travel; below, a wheel rolls freely
 
-CHANNELS = ("speed", "throttle", "brake", "steering", "gear", "position", "slip")
 """What is sampled of a lap besides the time."""
 
 
@@ -32,7 +31,6 @@ class Lap:
     number: int  # from 1
     time: float  # [s]
     rows: pd.DataFrame
-    episode: int = 1
 
     @property
     def standing(self) -> bool:
@@ -68,7 +66,7 @@ class SampledLap:
     lap: Lap
     time: FloatArray  # (n,) [s] since the lap began
     offset: FloatArray  # (n,) [m] from the axis, left positive
-    channels: dict[str, FloatArray]  # (n,) each, by their names in CHANNELS
+    channels: dict[str, FloatArray]  # (n,) each: speed, throttle, brake, steering, gear and more
 
 
 def drives_of(frame: pd.DataFrame) -> list[Drive]:
@@ -88,12 +86,12 @@ def drives_of(frame: pd.DataFrame) -> list[Drive]:
 def _laps(rows: pd.DataFrame) -> list[Lap]:
     """Cut the whole laps out of one driver's episodes."""
     laps = []
-    for episode, race in rows.groupby("episode", sort=True):
+    for _, race in rows.groupby("episode", sort=True):
         parts = dict(iter(race.groupby("laps", sort=True)))
         for done, part in parts.items():
             if done + 1 in parts:  # whose first row says how long this lap took
                 time = float(parts[done + 1]["last_lap_time"].iloc[0])
-                laps.append(Lap(int(done) + 1, time, part, int(episode)))
+                laps.append(Lap(int(done) + 1, time, part))
     return laps
 
 

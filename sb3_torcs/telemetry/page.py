@@ -12,9 +12,11 @@ import numpy as np
 from sb3_torcs.car import KMH, FloatArray
 from sb3_torcs.telemetry.comparison import Comparison, CornerPass, DriverLap
 from sb3_torcs.telemetry.document import (
+    FOLDER,
     OKABE_ITO,
     Cell,
     chip,
+    colour_of,
     document,
     paragraph,
     table,
@@ -145,11 +147,6 @@ def missing(comparison: Comparison) -> list[str]:
     return notes
 
 
-def colour_of(number: int) -> str:
-    """Colour of a driver, by its number from 0."""
-    return OKABE_ITO[number % len(OKABE_ITO)]
-
-
 def _name(number: int, one: DriverLap) -> Cell:
     """Cell with a driver's colour and name."""
     name = one.drive.driver
@@ -158,8 +155,6 @@ def _name(number: int, one: DriverLap) -> Cell:
 
 def _moment(drivers: Sequence[DriverLap]) -> str:
     """Lay out charts, map and the table of the moment, which the script fills."""
-    from sb3_torcs.telemetry.document import FOLDER
-
     rows = "".join(
         f'<tr id="driver-{number}"><td class="word">{_name(number, one).html}</td>'
         f"{'<td></td>' * 5}</tr>"

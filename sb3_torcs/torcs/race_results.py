@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 __all__ = ["Lap", "RobotResult"]
 
@@ -47,9 +47,9 @@ class RobotResult:
     rank: int
     damage: int
     out: bool
-    laps_completed: int = field(default=0)
-    best_lap: float | None = field(default=None)
-    client: str = field(default="")
+    laps_completed: int = 0
+    best_lap: float | None = None
+    client: str = ""
 
     @property
     def driver(self) -> str:
