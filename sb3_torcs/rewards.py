@@ -14,7 +14,7 @@ from typing import Literal
 
 from sb3_torcs.car import CAR_WIDTH, FIRST_RIVAL, RIVALS, CarState, Controls, is_number
 from sb3_torcs.errors import InvalidOption, UnknownRewardTerm, near_miss
-from sb3_torcs.rivals import clarity
+from sb3_torcs.rivals import clarity, rival
 
 __all__ = ["CRASHES", "PRESETS", "TERMS", "Reward", "RewardChoice", "RewardName", "safe_speed"]
 
@@ -109,8 +109,7 @@ def closing(before: CarState, after: CarState, controls: Controls) -> float:
     worst = 0.0
     rivals = after.race[FIRST_RIVAL:]
     for i in range(RIVALS):
-        along, across, faster = rivals[i], rivals[RIVALS + i], rivals[2 * RIVALS + i]
-        length, width = rivals[4 * RIVALS + i], rivals[5 * RIVALS + i]
+        along, across, faster, _, length, width = rival(rivals, i)
         if along > 0.0 and abs(across) < width + ROOM:
             # Between their centres lies half of each car; its own length is taken as the other's.
             room = max(along - length - ROOM, 0.0)
@@ -126,7 +125,8 @@ def passing(before: CarState, after: CarState, controls: Controls) -> float:
     gained = 0.0
     rivals = after.race[FIRST_RIVAL:]
     for i in range(RIVALS):
-        gained -= clarity(rivals[i]) * rivals[2 * RIVALS + i]
+        along, _, faster, _, _, _ = rival(rivals, i)
+        gained -= clarity(along) * faster
     return float(gained)
 
 

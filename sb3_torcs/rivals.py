@@ -9,7 +9,7 @@ from numba import njit
 
 from sb3_torcs.car import CAR_WIDTH, FIRST_RIVAL, RIVALS, CarState, FloatArray
 
-__all__ = ["clarity", "needed_brake", "needed_turn", "see_rivals"]
+__all__ = ["clarity", "needed_brake", "needed_turn", "rival", "see_rivals"]
 
 NEARBY = 80.0  # [m] along the road, within which cars are seen
 HALF_ALONG, HALF_ACROSS = 10.0, 3.0  # [m] distances that are seen as 0.5
@@ -38,6 +38,22 @@ VERGE = 0.5  # [m] to the edge of the road, from which on a car makes less room
 
 
 @njit(cache=True)
+def rival(rivals: FloatArray, number: int) -> tuple[float, float, float, float, float, float]:
+    """
+    Pick the numbers of one car nearby.
+
+    :param rivals: (6 × ``RIVALS``,) as of :func:`see_rivals`
+    :param number: of the car, 0 is the nearest
+    :return: how far it is along the road [m] and across it [m], how much faster both ways [m/s],
+        its length and its width [m]
+    """
+    return (
+        rivals[number], rivals[RIVALS + number], rivals[2 * RIVALS + number],
+        rivals[3 * RIVALS + number], rivals[4 * RIVALS + number], rivals[5 * RIVALS + number],
+    )  # fmt: skip
+
+
+@njit(cache=True)
 def clarity(along: float) -> float:
     """
     Tell how much a car nearby counts: 1 beside, falling to 0 at 80 m.
@@ -59,9 +75,7 @@ def see_rivals(rivals: FloatArray) -> FloatArray:
     """
     seen = np.zeros(6 * RIVALS)
     for i in range(RIVALS):
-        along, across = rivals[i], rivals[RIVALS + i]
-        faster, aside = rivals[2 * RIVALS + i], rivals[3 * RIVALS + i]
-        length, width = rivals[4 * RIVALS + i], rivals[5 * RIVALS + i]
+        along, across, faster, aside, length, width = rival(rivals, i)
         clear = clarity(along)
         if clear == 0.0:
             continue
@@ -94,9 +108,7 @@ def needed_brake(car: CarState) -> float:
     speed = max(car.speed_x, 0.0)
     rivals = car.race[FIRST_RIVAL:]
     for i in range(RIVALS):
-        along, across = rivals[i], rivals[RIVALS + i]
-        faster, aside = rivals[2 * RIVALS + i], rivals[3 * RIVALS + i]
-        length, width = rivals[4 * RIVALS + i], rivals[5 * RIVALS + i]
+        along, across, faster, aside, length, width = rival(rivals, i)
         if not 0.5 * length < along <= NEARBY or faster >= 1.0:
             continue
         if min(abs(across), abs(across + HOLD * aside)) > width + SIDE:
@@ -123,9 +135,7 @@ def needed_turn(car: CarState) -> float:
     turn = 0.0
     rivals = car.race[FIRST_RIVAL:]
     for i in range(RIVALS):
-        along, across = rivals[i], rivals[RIVALS + i]
-        faster, aside = rivals[2 * RIVALS + i], rivals[3 * RIVALS + i]
-        length, width = rivals[4 * RIVALS + i], rivals[5 * RIVALS + i]
+        along, across, faster, aside, length, width = rival(rivals, i)
         soon = min(abs(along), abs(along + SOON * faster))
         if abs(along) > 2.0 * length or soon > length + APART:
             continue
