@@ -12,14 +12,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sb3_torcs.studies.config import trial_name
-from sb3_torcs.studies.estimates import Array, Estimate, estimate, share
-from sb3_torcs.studies.pictures import PANELS, curves_of
-from sb3_torcs.studies.results import Results
+from sb3_torcs.studies.curves import COMPLETES, PANELS, Learning
+from sb3_torcs.studies.estimates import Array, Estimate
 from sb3_torcs.telemetry.document import Cell, chip, colour_of, document, paragraph, table
 
 __all__ = ["Section", "study_page"]
 
-SHARE = ("completes", "share of races that complete")
 BESIDE = {"lap report": "lap.html", "video": "lap.mp4"}
 """What a seed's folder may hold, and where."""
 
@@ -36,7 +34,7 @@ def study_page(
     name: str,
     notes: Sequence[str],
     sections: Sequence[Section],
-    variants: Mapping[str, Sequence[Results]],
+    variants: Sequence[Learning],
     *,
     folder: Path,
     output: Path,
@@ -47,15 +45,15 @@ def study_page(
     :param name: of the study
     :param notes: what a reader should know first
     :param sections: the tables
-    :param variants: trials by variant
+    :param variants: how each learned
     :param folder: of the study
     :param output: folder that the page will lie in
     :return: HTML, which works without any other file and without a network
     """
     panels = _panels(variants)
-    colours = {variant: colour_of(number) for number, variant in enumerate(variants)}
     legend = " ".join(
-        f"{chip(colour)}{escape(variant)}&emsp;" for variant, colour in colours.items()
+        f"{chip(colour_of(number))}{escape(learning.variant)}&emsp;"
+        for number, learning in enumerate(variants)
     )
     body = [
         f"<header><h1>{escape(name)}</h1>",
@@ -77,22 +75,20 @@ def _frame(panel: Mapping[str, Any]) -> str:
     return f'<div id="{panel["id"]}"></div>'
 
 
-def _panels(variants: Mapping[str, Sequence[Results]]) -> list[dict[str, Any]]:
-    """Return the three panels with the curves of all seeds."""
-    every = {variant: [curves_of(trial) for trial in group] for variant, group in variants.items()}
+def _panels(variants: Sequence[Learning]) -> list[dict[str, Any]]:
+    """Return the panels with the curves of all seeds."""
     panels = []
-    for name, title in (*PANELS, SHARE):
+    for name, title in PANELS.items():
         curves: list[dict[str, Any]] = []
-        for number, (variant, group) in enumerate(variants.items()):
-            own = every[variant]
-            if name != SHARE[0]:
-                for trial, seed in zip(group, own, strict=True):
-                    told = f"{variant}, seed {trial.seed}"
+        for number, learning in enumerate(variants):
+            if name != COMPLETES:
+                for trial, seed in zip(learning.trials, learning.seeds, strict=True):
+                    told = f"{learning.variant}, seed {trial.seed}"
                     curves.append(_curve(told, number, seed["timesteps"], seed[name]))
-            curves += _mean(variant, number, own, name)
+            curves += _mean(learning, number, name)
         from_zero = "tozero" if name == "distance" else "normal"
         panel = {"id": f"panel-{name}", "title": title, "curves": curves, "rangemode": from_zero}
-        panels.append(panel | ({"range": [-0.03, 1.03]} if name == SHARE[0] else {}))
+        panels.append(panel | ({"range": [-0.03, 1.03]} if name == COMPLETES else {}))
     return panels
 
 
@@ -103,17 +99,11 @@ def _curve(text: str, number: int, x: Array, y: Array, **more: Any) -> dict[str,
     return {"text": escape(text), "colour": colour, "x": x.tolist(), "y": values, **more}
 
 
-def _mean(
-    variant: str, number: int, every: Sequence[dict[str, Array]], name: str
-) -> list[dict[str, Any]]:
+def _mean(learning: Learning, number: int, name: str) -> list[dict[str, Any]]:
     """Return the interval and the mean of a variant's seeds, as far as all seeds are."""
-    length = min(len(curves["timesteps"]) for curves in every)
-    x = np.mean([curves["timesteps"][:length] for curves in every], axis=0)
-    scores = np.array([curves[name][:length] for curves in every])
-    figure = estimate(scores, share) if name == SHARE[0] else estimate(scores)
-    told = f"{variant}, {len(every)} seeds"
-    mean = _curve(told, number, x, figure.value, bold=True)
-    return [*_band(told, number, x, figure), mean]
+    x, figure = learning.timesteps, learning.figures[name]
+    told = f"{learning.variant}, {len(learning.trials)} seeds"
+    return [*_band(told, number, x, figure), _curve(told, number, x, figure.value, bold=True)]
 
 
 def _band(text: str, number: int, x: Array, figure: Estimate) -> list[dict[str, Any]]:
@@ -126,16 +116,16 @@ def _band(text: str, number: int, x: Array, figure: Estimate) -> list[dict[str, 
     return [_curve(text, number, around, outline, band=True)]
 
 
-def _links(variants: Mapping[str, Sequence[Results]], folder: Path, output: Path) -> Sequence[str]:
+def _links(variants: Sequence[Learning], folder: Path, output: Path) -> Sequence[str]:
     """Link each seed's lap report and video, or say how to make them."""
     rows: list[list[Cell | str]] = []
-    for variant, group in variants.items():
-        for trial in group:
-            home = folder / trial_name(variant, trial.seed)
+    for learning in variants:
+        for trial in learning.trials:
+            home = folder / trial_name(learning.variant, trial.seed)
             cells = [_link(home / file, what, output) for what, file in BESIDE.items()]
-            rows.append([f"{variant}, {trial.seed}", *cells])
-    variant, group = next(iter(variants.items()))
-    example = folder / trial_name(variant, group[0].seed)
+            rows.append([f"{learning.variant}, {trial.seed}", *cells])
+    first = variants[0]
+    example = folder / trial_name(first.variant, first.trials[0].seed)
     report, video = f"{example}/lap.html", f"{example}/lap.mp4"
     how = shlex.join(["sb3-torcs", "evaluate", str(example), "--report", report, "--video", video])
     told = f"A seed's lap report and video are made by: {how}. Then write this page again."

@@ -14,9 +14,10 @@ import numpy as np
 from sb3_torcs.errors import StudyError
 from sb3_torcs.evaluation.ladder import RUNGS
 from sb3_torcs.studies.config import slug
+from sb3_torcs.studies.curves import NO_LAP, learning_of
 from sb3_torcs.studies.estimates import Estimate, estimate
 from sb3_torcs.studies.page import Section, study_page
-from sb3_torcs.studies.pictures import NO_LAP, draw_together, draw_variant
+from sb3_torcs.studies.pictures import draw_together, draw_variant
 from sb3_torcs.studies.results import Results
 from sb3_torcs.studies.storage import RECIPE, RESULTS, ROWS, WHY_DIVERGED, write_whole
 
@@ -103,14 +104,15 @@ def write_report(folder: Path, output: Path) -> Path:
         lines += [note, ""]
     for section in sections:
         lines += _markdown(section)
-    variants = _variants(trials)
+    variants = [learning_of(variant, group) for variant, group in _variants(trials).items()]
     if len(variants) > 1:
         write_whole(output / TOGETHER, draw_together(variants))
         lines += ["## Learning: all variants", "", f"![all variants]({TOGETHER})", ""]
-    for variant, group in variants.items():
-        picture = output / f"learning-{slug(variant)}.png"
-        write_whole(picture, draw_variant(variant, group))
-        lines += [f"## Learning: {variant}", "", f"![{variant}]({picture.name})", ""]
+    for learning in variants:
+        picture = output / f"learning-{slug(learning.variant)}.png"
+        write_whole(picture, draw_variant(learning))
+        shown = f"![{learning.variant}]({picture.name})"
+        lines += [f"## Learning: {learning.variant}", "", shown, ""]
     lines += [
         "Thin: every seed; bold: the interquartile mean of the seeds. A seed without a lap counts "
         "as infinitely slow, so the mean of the lap times begins when enough seeds have one. "
