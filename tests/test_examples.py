@@ -259,7 +259,9 @@ def test_who_cannot_teach_is_told_so(name, words, message, monkeypatch, tmp_path
 )
 def test_a_wrong_name_ends_a_script_in_a_line(script, words, monkeypatch, tmp_path, game):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit, match=r"^error: there is no model 'ppo-any-raod'.*; did you mean"):
+    with pytest.raises(
+        SystemExit, match=r"^error: there is no model 'ppo-any-raod'.*; did you mean"
+    ):
         run(monkeypatch, script, *words)
 
 
