@@ -386,7 +386,10 @@ def test_without_a_whole_lap_there_are_figures_and_no_report(capsys, tmp_path, p
 
 
 def test_a_video_that_fails_takes_nothing_else_with_it(capsys, tmp_path, monkeypatch):
-    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", "/bin/false")
+    def fail(*_):
+        raise OutputNotWritable("ffmpeg stopped writing")
+
+    monkeypatch.setattr(recording.Recorder, "save_video", fail)
     files = {kind: str(tmp_path / f"one{kind}") for kind in (".mp4", ".png", ".parquet", ".html")}
     options = zip(("--video", "--line", "--telemetry", "--report"), files.values(), strict=True)
     words = ["evaluate", "scripted", *LITE, "--laps", "1", *itertools.chain(*options)]

@@ -19,13 +19,14 @@ from sb3_torcs.agents.robots import race as robots_race
 from sb3_torcs.agents.scripted import ScriptedDriver
 from sb3_torcs.cli import main
 from sb3_torcs.envs.aids import AIDS, aids_named
-from sb3_torcs.errors import InvalidOption
+from sb3_torcs.errors import InvalidOption, OutputNotWritable
 from sb3_torcs.evaluation.comparing import saved_drives
 from sb3_torcs.races import protocol
 from sb3_torcs.races.entrants import find_entrants
 from sb3_torcs.races.protocol import Race, Standing, run_race, run_races
 from sb3_torcs.races.ratings import ratings
 from sb3_torcs.races.standings import driver_figures, mean_interval, wilson
+from sb3_torcs.races.video import Footage
 
 SHORT = "g-track-1"
 
@@ -401,7 +402,10 @@ def test_ctrl_c_keeps_the_races_that_are_over(capsys, game, tmp_path, monkeypatc
 
 
 def test_a_video_that_fails_takes_nothing_else_with_it(capsys, game, tmp_path, monkeypatch):
-    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", "/bin/false")
+    def fail(*_):
+        raise OutputNotWritable("ffmpeg stopped writing")
+
+    monkeypatch.setattr(Footage, "save", fail)
     words = ["race", "scripted", "bt", "--track", SHORT, "--laps", "1", "--races", "1"]
     files = {"--video": "a.mp4", "--picture": "a.png", "--telemetry": "a.parquet"}
     for option, name in files.items():
