@@ -48,12 +48,6 @@ class Lap(NamedTuple):
         return self.rows["brake"].to_numpy()
 
 
-def best_lap(driver):
-    """Take the best flying lap of a driver that was compared."""
-    name, lap = driver.drive.driver, driver.lap
-    return Lap(Path(name).name if Path(name).is_dir() else name, lap.time, lap.rows)
-
-
 def tightest_bends(track):
     """Where the road bends most: distances of the middles, well apart."""
     places = np.arange(0.0, track.length, 5.0)
@@ -132,7 +126,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("laps.png"))
     args = parser.parse_args()
     compared = sb3_torcs.compare(*args.drivers, track=args.track).comparison
-    track, laps = compared.track, [best_lap(driver) for driver in compared.drivers]
+    track = compared.track
+    laps = [Lap(one.drive.driver, one.lap.time, one.lap.rows) for one in compared.drivers]
     bend = sharp_bends(track)
     for lap in laps:
         before, within = where_it_brakes(lap, bend)

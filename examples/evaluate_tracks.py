@@ -1,6 +1,6 @@
 """Let saved models drive three laps of many tracks, and compare them with the game's robots.
 
-On tracks that the game did not bring, as those of random_roads.py, the robots drive first.
+On tracks that the game did not bring, such as those of random_roads.py, the robots drive first.
 """
 
 import argparse

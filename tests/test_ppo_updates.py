@@ -174,7 +174,7 @@ def test_a_deterministic_action_is_the_mean():
     model = make()
     observations = th.rand(5, 29)
     lean = LeanPPO(model)
-    lean.begin_rollout()
+    lean.read_parameters()
     with th.no_grad():
         expected = model.policy.forward(observations, deterministic=True)
     found = lean.forward(observations, deterministic=True)

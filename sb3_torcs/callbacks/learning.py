@@ -166,7 +166,7 @@ class LeanUpdatesCallback(_WhileLearning):
     def _on_rollout_start(self) -> None:
         super()._on_rollout_start()
         if isinstance(self._updates, LeanPPO):
-            self._updates.begin_rollout()
+            self._updates.read_parameters()  # `forward` overlooks a change of `parameter.data`
             self.model.policy.forward = self._updates.forward
 
     def _change(self) -> Callable[..., None] | None:

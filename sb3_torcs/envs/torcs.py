@@ -26,7 +26,7 @@ from sb3_torcs.car import (
 )
 from sb3_torcs.envs.racing import RacingEnv, RenderMode
 from sb3_torcs.envs.torcs_race import make_shared_race
-from sb3_torcs.errors import InvalidOption, UnknownRobot, near_miss
+from sb3_torcs.errors import InvalidOption, UnknownRobot
 from sb3_torcs.rewards import RewardChoice
 from sb3_torcs.sensors import SensorsName
 from sb3_torcs.torcs.installation import find_game
@@ -157,11 +157,7 @@ class TorcsEnv(RacingEnv):
         port: int | None = None,
     ) -> None:
         checked_choice("backend", backend, BACKENDS)
-        if backend != "native":
-            self.metadata = RacingEnv.metadata
         self.picture = _picture(picture, render_mode)
-        if picture == "game":
-            self.metadata = {**self.metadata, "render_modes": ["rgb_array", "game"]}
         self._window = _window(render_size, view, boards, self.picture)
         self.render_size = self._window.size
         if self.picture == "game" and backend != "native":
@@ -180,14 +176,15 @@ class TorcsEnv(RacingEnv):
                 "picture 'above'"
             )
         if guests and backend != "native":
-            robots = find_game().robots()
-            hint = near_miss(guests[0], robots, f"it has {', '.join(robots)}")
-            raise UnknownRobot(
-                f"the game has no robot '{guests[0]}'{hint}; agents are opponents with backend "
-                "'native' only"
-            )
-        if several or guests:
+            try:
+                find_game().parse_robot(guests[0])
+            except UnknownRobot as error:
+                only = "agents are opponents with backend 'native' only"
+                raise UnknownRobot(f"{error}; {only}") from None
+        if backend != "native" or several or guests:
             self.metadata = RacingEnv.metadata  # without "game", which would be refused
+        if picture == "game":
+            self.metadata = {**self.metadata, "render_modes": ["rgb_array", "game"]}
         if self.picture == "game":
             one: Any = track
             game = find_game()

@@ -114,7 +114,7 @@ class LeanPPO:
 
     # ------------------------------------------------------------------------ rollouts
 
-    def begin_rollout(self) -> None:
+    def read_parameters(self) -> None:
         """Take over the parameters of the policy."""
         self._versions = self._policy_versions()
         self._read(self.weights, [own.detach() for own in self.parameters])
@@ -134,7 +134,7 @@ class LeanPPO:
         :return: actions, values of the observations, and logarithms of the actions' probabilities
         """
         if self._policy_versions() != self._versions:
-            self.begin_rollout()
+            self.read_parameters()
         seen, actor, critic = self._seen(obs), self.actor, self.critic
         batch = len(obs)
         noise = np.zeros((batch, len(self.log_std)), np.float32)
@@ -256,7 +256,7 @@ class LeanPPO:
     def _read_state(self) -> None:
         """Take over the parameters and what Adam keeps of them."""
         states = self._states()
-        self.begin_rollout()
+        self.read_parameters()
         self._read(self.mean, [state["exp_avg"] for state in states])
         self._read(self.square, [state["exp_avg_sq"] for state in states])
         self.count = int(states[0]["step"].item())

@@ -247,7 +247,8 @@ class TorcsVecEnv(DummyVecEnv):
             race.ask()
         timestep = batch.step(self.actions)
         for race, members in self._shared.items():
-            race.advance(self._races[next(iter(members.values()))].racing.action_repeat)
+            first = min(members.values())
+            race.advance(self._races[first].racing.action_repeat)
         return timestep
 
     def _end_races(self, over: npt.NDArray[np.bool_]) -> None:
