@@ -20,7 +20,7 @@ import pytest
 PACKAGE = Path(__file__).parent.parent / "sb3_torcs"
 FILES = sorted(PACKAGE.rglob("*.py"))
 
-MAX_MODULES = 14  # at the top of the package
+MAX_MODULES = 15  # at the top of the package
 MAX_FOLDERS = 17  # of Python there; beside them native/, the C++
 MAX_CODE_LINES = 300
 LONGER_FILES = {
@@ -29,7 +29,7 @@ LONGER_FILES = {
 
 # From the ground up. `sb3_torcs/__init__.py` registers the environments and loads nothing.
 FLOORS = (
-    {"_engine", "errors", "signals"},
+    {"_engine", "cores", "errors", "signals"},
     {"car", "files"},
     {"torcs"},
     {"rivals", "tracks"},

@@ -21,7 +21,7 @@ def test_every_figure_is_measured_once_or_empty(monkeypatch):
     measurements = stages(0.01)
     figures = measurements["resets"]()
     assert list(figures) == ["lite_reset_ms"]
-    assert len(set(KEYS)) == len(KEYS) == 26
+    assert len(set(KEYS)) == len(KEYS) == 27
 
 
 def test_the_environments_are_measured_in_the_same_run(monkeypatch):
@@ -156,7 +156,9 @@ def test_an_update_is_counted_by_its_matrix_products():
 
 def test_updates_and_products_are_measured_in_one_run():
     figures = default_updates(0.001)
-    assert list(figures) == ["core_gflops", "ddpg_updates_per_s", "ddpg_update_gflop"]
+    assert list(figures) == [
+        "core_gflops", "ddpg_updates_per_s", "ddpg_update_gflop", "ddpg_two_threads_ratio",
+    ]  # fmt: skip
     assert figures["ddpg_update_gflop"] == pytest.approx(0.177, abs=0.001)
     assert 0.0 < figures["ddpg_updates_per_s"] < figures["core_gflops"] / 0.177
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import subprocess
 import sys
+import threading
+import time
 from copy import deepcopy
 
 import numpy as np
@@ -22,9 +25,11 @@ from sb3_torcs.bench.policy import PlainSplitHeadPolicy, measure, updater
 from sb3_torcs.callbacks import LeanUpdatesCallback
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.policies import SplitHeadPolicy, fast_matmul
+from sb3_torcs.policies import updates as lean_updates
 from sb3_torcs.policies.fused import empty
 from sb3_torcs.policies.mirror import mirror_actions, mirror_image, mirror_observations
 from sb3_torcs.policies.optimizers import LeanAdam
+from sb3_torcs.policies.threads import two_threads
 from sb3_torcs.policies.updates import LeanUpdates
 from sb3_torcs.sensors import View
 
@@ -487,6 +492,81 @@ def test_lean_updates_learn_as_the_algorithm_does(algorithm, kwargs):
         states[-1].append(th.get_rng_state())
     th.testing.assert_close(*states, rtol=1e-5, atol=1e-5)
     assert logs[0] == pytest.approx(logs[1], rel=1e-5)
+
+
+@pytest.mark.parametrize("n_critics", [1, 2, 3])
+@pytest.mark.parametrize("algorithm", [DDPG, TD3])
+def test_one_core_learns_what_two_learn(monkeypatch, algorithm, n_critics):
+    """To the bit; and so does the same seed once more."""
+    found = []
+    for cores in ({0}, {0, 1}, {0, 1}):
+        monkeypatch.setattr(os, "sched_getaffinity", lambda process, cores=cores: cores)
+        model = updater(
+            SplitHeadPolicy, 32, algorithm, net_arch=SMALL, layer_norm=True, n_critics=n_critics
+        )
+        LeanUpdates(model).train(9, 32)
+        found.append([
+            model.policy.state_dict(), dict(model.logger.name_to_value),
+            *(part.optimizer.state_dict() for part in (model.actor, model.critic)),
+        ])  # fmt: skip
+    th.testing.assert_close(found[0], found[1], rtol=0, atol=0)
+    th.testing.assert_close(found[1], found[2], rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("error", [OSError, KeyboardInterrupt])
+def test_an_update_that_ends_early_leaves_no_thread_at_work(monkeypatch, error):
+    """Whatever follows, as saving the model, sees critics that nobody writes to any more."""
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0, 1})
+    model = updater(SplitHeadPolicy, 32, TD3, net_arch=SMALL)
+    updates, begun = LeanUpdates(model), []
+    learn = lean_updates._learn_values
+
+    def slow(*args):
+        begun.append(threading.current_thread())
+        time.sleep(0.2 if begun[-1] is not threading.main_thread() else 0.0)
+        learn(*args)
+        begun.remove(threading.current_thread())
+
+    def fail(*args):
+        raise error
+
+    monkeypatch.setattr(lean_updates, "_learn_values", slow)
+    monkeypatch.setattr(updates, "_update_actor", fail)
+    with pytest.raises(error):
+        updates.train(2, 32)
+    assert begun == []
+    monkeypatch.undo()
+    updates.train(2, 32)
+
+
+def test_an_error_on_the_second_thread_is_told(monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0, 1})
+    updates = LeanUpdates(updater(SplitHeadPolicy, 32, TD3, net_arch=SMALL))
+    learn = lean_updates._learn_values
+
+    def fail(*args):
+        if threading.current_thread() is not threading.main_thread():
+            raise MemoryError("no room")
+        learn(*args)
+
+    monkeypatch.setattr(lean_updates, "_learn_values", fail)
+    with pytest.raises(MemoryError, match="no room"):
+        updates.train(1, 32)
+
+
+def test_a_process_made_by_fork_has_a_second_thread_of_its_own(monkeypatch):
+    """That of the parent does not run in it."""
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0, 1})
+
+    def use():
+        with two_threads() as other:
+            assert other.submit(int, "7").result(timeout=20.0) == 7
+
+    use()
+    child = multiprocessing.get_context("fork").Process(target=use)
+    child.start()
+    child.join(30.0)
+    assert child.exitcode == 0
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

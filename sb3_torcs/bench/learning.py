@@ -11,6 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
+from sb3_torcs import cores
 from sb3_torcs.bench.torcs import Figures
 from sb3_torcs.policies.threads import one_thread
 
@@ -90,7 +91,7 @@ def training_rate(steps: int) -> Figures:
 
 
 def _learn(env_id: str, steps: int) -> _TimedCallbacks:
-    """Learn with a short warm-up and a small replay buffer, on one thread."""
+    """Learn with a short warm-up and a small replay buffer, on one core."""
     from sb3_torcs.training.manager import build
     from sb3_torcs.training.zoo import config_file, read_entry
 
@@ -99,7 +100,7 @@ def _learn(env_id: str, steps: int) -> _TimedCallbacks:
     entry.update(learning_starts=int(entry["batch_size"]), buffer_size=start + steps)
     entry.update(n_timesteps=start + steps)
     entry["callback"] = [own for own in entry["callback"] if AT_THE_BEGINNING not in own]
-    with one_thread():
+    with cores.at_most(1), one_thread():
         model, chosen, _ = build("ddpg", env_id, entry)
         env = _TimedVecEnv(model.env)
         model.env = env

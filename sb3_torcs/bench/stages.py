@@ -40,6 +40,7 @@ KEYS = (
     "core_gflops",
     "ddpg_updates_per_s",
     "ddpg_update_gflop",
+    "ddpg_two_threads_ratio",
     "ddpg_timesteps_per_s",
     "ppo_timesteps_per_s",
     "ppo_dummy_timesteps_per_s",

@@ -11,6 +11,7 @@ import numpy as np
 import torch as th
 from stable_baselines3 import DDPG
 
+from sb3_torcs import cores
 from sb3_torcs.bench.policy import SpacesOnly, fill
 from sb3_torcs.bench.torcs import Figures
 from sb3_torcs.policies import SplitHeadPolicy
@@ -34,19 +35,21 @@ UPDATES_PER_TURN = 20
 
 def default_updates(seconds: float) -> Figures:
     """
-    Measure updates as the default entry makes them, and products, in turns, on one thread.
+    Measure updates as the default entry makes them, and products, in turns, on one core.
 
     :param seconds: [s] processor time to spend in all, at least
     :return: ``core_gflops``, ``ddpg_updates_per_s``, both of the best turn, and
-        ``ddpg_update_gflop``
+        ``ddpg_update_gflop``; and ``ddpg_two_threads_ratio``, the best rate of updates on two
+        threads divided by the best on one, both by the wall clock; ``None`` on a single core
     """
-    with one_thread():
-        return _measure(seconds)
-
-
-def _measure(seconds: float) -> Figures:
     entry = read_entry(config_file("ddpg"), "Torcs-v0")
     model = default_model(entry)
+    with one_thread(), cores.at_most(1):
+        figures = _on_one_core(model, entry, seconds)
+    return {**figures, "ddpg_two_threads_ratio": _gain(model, seconds)}
+
+
+def _on_one_core(model: DDPG, entry: dict[str, Any], seconds: float) -> Figures:
     updates, batch_size = LeanUpdates(model), model.batch_size
     rows, inner, columns = PRODUCT
     a, b, out = th.rand(rows, inner), th.rand(inner, columns), th.empty(rows, columns)
@@ -73,6 +76,21 @@ def _measure(seconds: float) -> Figures:
         "ddpg_updates_per_s": UPDATES_PER_TURN / update,
         "ddpg_update_gflop": 2e-9 * batch_size * products_of_an_update(entry["policy_kwargs"]),
     }
+
+
+def _gain(model: DDPG, seconds: float) -> float | None:
+    """Compare turns of updates on two threads with turns on one."""
+    if cores.number() == 1:
+        return None
+    updates = LeanUpdates(model)
+    spent: dict[int, list[float]] = {1: [], 2: []}
+    while sum(map(sum, spent.values())) < seconds / 2:
+        for number, times in spent.items():
+            with cores.at_most(number):
+                begin = time.perf_counter()
+                updates.train(UPDATES_PER_TURN, model.batch_size)
+                times.append(time.perf_counter() - begin)
+    return min(spent[1]) / min(spent[2])
 
 
 def default_model(entry: dict[str, Any]) -> DDPG:

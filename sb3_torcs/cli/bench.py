@@ -35,6 +35,7 @@ policy_*                  updates of a DDPG with SplitHeadPolicy, batch size 64
 core_gflops               matrix products of 64 x 256 x 256, best turn
 ddpg_updates_per_s        updates of the default DDPG entry of Torcs-v0, best turn
 ddpg_update_gflop         arithmetic of such an update, its matrix products alone
+ddpg_two_threads_ratio    the gain by a second thread in such updates, best turns
 ddpg_timesteps_per_s      timesteps of a training with that entry, after its beginning
 ppo_timesteps_per_s       timesteps of PPO's training with its entry of Torcs-v0 on two cores, in
                           TorcsVecEnv, best rollout with its update
@@ -42,8 +43,8 @@ ppo_dummy_timesteps_per_s the same hyperparameters in DummyVecEnv, with SB3's ow
 training_env_share        share of a DDPG training (shipped hyperparameters) that the environment
                           and the callbacks take
 
-torcs_vector2_ratio, vec_env_two_threads_ratio, ppo_*, scr_* and game_frames_per_s are measured by
-the wall clock, since several processes or threads work. A figure that cannot be measured on this
+torcs_vector2_ratio, *_two_threads_ratio, ppo_*, scr_* and game_frames_per_s are measured by the
+wall clock, since several processes or threads work. A figure that cannot be measured on this
 machine is null.
 """
 

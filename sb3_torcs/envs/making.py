@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import os
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -12,6 +11,7 @@ from typing import Any
 import gymnasium as gym
 from gymnasium.wrappers import TimeLimit
 
+from sb3_torcs import cores
 from sb3_torcs.car import checked_flag, is_count
 from sb3_torcs.envs.racing import RacingEnv
 from sb3_torcs.envs.torcs_race import make_race
@@ -63,7 +63,7 @@ def checked_threads(threads: Any) -> int:
     :raises InvalidOption: if it is no such number
     """
     if threads is None:
-        return len(os.sched_getaffinity(0))
+        return cores.number()
     if not is_count(threads):
         raise InvalidOption(f"threads is {threads!r}; expected a whole number >= 1, or None")
     return int(threads)

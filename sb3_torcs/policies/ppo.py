@@ -6,9 +6,8 @@ The policy and the value function share no layer, so two threads find their grad
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor
+from concurrent.futures import Executor
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -30,7 +29,7 @@ from sb3_torcs.policies.flat import Slot
 from sb3_torcs.policies.fused import array
 from sb3_torcs.policies.layers import compiled
 from sb3_torcs.policies.optimizers import adam_factors, adam_state, is_usual
-from sb3_torcs.policies.threads import one_thread
+from sb3_torcs.policies.threads import two_threads
 
 __all__ = ["LeanPPO", "is_for"]
 
@@ -162,10 +161,9 @@ class LeanPPO:
         self.policy.set_training_mode(True)
         self.model._update_learning_rate(self.policy.optimizer)
         self._read_state()
-        with one_thread():  # for each of the two networks
+        with two_threads() as other:
             try:
-                with ThreadPoolExecutor(1, initializer=th.set_num_threads, initargs=(1,)) as other:
-                    figures = self._epochs(other if len(os.sched_getaffinity(0)) > 1 else None)
+                figures = self._epochs(other)
             finally:
                 self._write_state()
         self._record(figures)

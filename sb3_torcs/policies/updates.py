@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from concurrent.futures import Executor, Future
 from typing import Any, cast
 
 import numpy as np
@@ -16,6 +18,7 @@ from sb3_torcs.policies.layers import compiled
 from sb3_torcs.policies.networks import ActorAverage
 from sb3_torcs.policies.optimizers import LeanAdam, is_usual
 from sb3_torcs.policies.split_head import SplitHeadPolicy
+from sb3_torcs.policies.threads import two_threads
 
 __all__ = ["LeanUpdates", "is_for"]
 
@@ -63,14 +66,16 @@ class LeanUpdates:
         actor_losses, critic_losses = [], []
         assert model.replay_buffer is not None
         rooms = self._rooms(batch_size)
-        for _ in range(gradient_steps):
-            model._n_updates += 1
-            batch = model.replay_buffer.sample(batch_size, env=model._vec_normalize_env)
-            both = model._n_updates % model.policy_delay == 0
-            # The actor's update does not read the critics' targets: these follow before it.
-            critic_losses.append(self._update_critic(batch, rooms, model.tau if both else 0.0))
-            if both:
-                actor_losses.append(self._update_actor(batch, rooms))
+        with two_threads() as other, _Shared(len(self.critics[0]), other) as critics:
+            for _ in range(gradient_steps):
+                model._n_updates += 1
+                batch = model.replay_buffer.sample(batch_size, env=model._vec_normalize_env)
+                both = model._n_updates % model.policy_delay == 0
+                # The actor's update does not read the critics' targets: these follow before it.
+                tau = model.tau if both else 0.0
+                critic_losses.append(self._update_critics(batch, rooms, tau, critics))
+                if both:
+                    actor_losses.append(self._update_actor(batch, rooms))
         for room in rooms:
             give(room)
         model.logger.record("train/n_updates", model._n_updates, exclude="tensorboard")
@@ -86,20 +91,43 @@ class LeanUpdates:
             take(networks, kernels.values_work(self.critic_shape[0], batch_size), dtype=dtype),
         )
 
-    def _update_critic(
-        self, batch: ReplayBufferSamples, rooms: tuple[np.ndarray, np.ndarray], tau: float
-    ) -> float:
-        """Learn from the targets' values, which follow by a share; return the loss."""
-        model, arrays = self.model, tuple(map(array, batch[:5]))
+    def _update_critics(
+        self, batch: ReplayBufferSamples, rooms: tuple[np.ndarray, np.ndarray], tau: float,
+        critics: _Shared,
+    ) -> float:  # fmt: skip
+        """
+        Learn from the targets' values, which follow by a share; return the loss.
+
+        The critics but the first may still learn afterwards: the actor's update reads the first.
+        """
+        model, shape, weights = self.model, self.critic_shape, self.critics[0]
+        arrays, room = tuple(map(array, batch[:5])), rooms[1]
         given = batch.discounts
         discounts = np.full_like(arrays[4], model.gamma) if given is None else array(given)
         # Drawn even if it is clipped to 0, so that later random numbers are the same.
         noise = th.empty(arrays[1].shape).normal_(0, model.target_policy_noise).numpy()
-        adam = cast(LeanAdam, model.critic.optimizer).begin_step(self.critic)
-        loss: float = _update_critic(
-            self.critic_shape, self.critics, self.actor_shape, self.actors[1], arrays, discounts,
-            noise, model.target_noise_clip, rooms, adam, tau,
-        )  # fmt: skip
+        mean, square, *factors = cast(LeanAdam, model.critic.optimizer).begin_step(self.critic)
+        averages = mean.reshape(weights.shape), square.reshape(weights.shape)
+        next_actions = _next_actions(
+            self.actor_shape, self.actors[1], arrays[2], noise, model.target_noise_clip, rooms[0]
+        )
+        values, following, slope = np.empty((3, len(weights), len(noise), 1), weights.dtype)
+
+        def value(own: slice) -> None:
+            networks = [network[own] for network in self.critics]
+            _value(
+                shape, *networks[:2], arrays, next_actions, room[own], values[own], following[own]
+            )
+
+        def learn(own: slice) -> None:
+            networks = tuple(network[own] for network in self.critics)
+            adam = *(average[own].reshape(-1) for average in averages), *factors
+            _learn_values(shape, networks, arrays, room[own], slope[own], adam, tau)
+
+        critics.begin(value)
+        critics.wait()
+        loss: float = kernels.difference(values, following, arrays[4], arrays[3], discounts, slope)
+        critics.begin(learn)
         return loss
 
     def _update_actor(
@@ -115,48 +143,113 @@ class LeanUpdates:
         return loss
 
 
-@compiled
-def _update_critic(
-    shape: Any, critics: Any, actor_shape: Any, actor: Any, batch: Any, discounts: Any, noise: Any,
-    clip: float, rooms: Any, adam: Any, tau: float,
-) -> float:  # fmt: skip
+class _Shared:
     """
-    Learn from the targets' values.
+    Does the same for all critics, for those after the first on a second thread, if there is one.
+
+    :param networks: number of critics
+    :param other: the second thread
+    """
+
+    def __init__(self, networks: int, other: Executor | None) -> None:
+        here = networks if other is None else 1
+        self.here, self.there = slice(here), slice(here, networks)
+        self.other = other if networks > here else None
+        self._running: Future[None] | None = None
+
+    def __enter__(self) -> _Shared:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.wait()
+
+    def begin(self, task: Callable[[slice], None]) -> None:
+        """
+        Do a task for the first critic, or for all, and begin it for the others.
+
+        :param task: takes the critics as a slice
+        """
+        self.wait()
+        if self.other is not None:
+            self._running = self.other.submit(task, self.there)
+        task(self.here)
+
+    def wait(self) -> None:
+        """Wait until the task is done for all critics."""
+        if self._running is not None:
+            self._running.result()
+            self._running = None  # not before: Ctrl-C may come while this waits
+
+
+@compiled
+def _next_actions(
+    shape: Any, weights: Any, following: Any, noise: Any, clip: float, room: Any
+) -> Any:
+    """
+    Let the target actor decide.
+
+    :param shape: sizes of the actor's layers, whether it has norms, its gain
+    :param weights: of the target
+    :param following: (batch, features)
+    :param noise: (batch, actuators)
+    :param clip: its limit
+    :param room: work space of the actor
+    :return: (batch, actuators) in [-1, 1]
+    """
+    sizes, norm, gain = shape
+    actions = np.empty_like(noise)
+    kernels.actor_forward(weights, sizes, norm, following, gain, room, actions)
+    if clip:
+        actions[:] = np.clip(actions + np.clip(noise, -clip, clip), -1, 1)
+    return actions
+
+
+@compiled
+def _value(
+    shape: Any, weights: Any, target: Any, batch: Any, next_actions: Any, room: Any, values: Any,
+    following: Any,
+) -> None:  # fmt: skip
+    """
+    Value what was done, and by the targets what followed.
 
     :param shape: sizes of the critics' layers, and whether they have norms
-    :param critics: weights, those of the targets and their gradient, each (networks, parameters)
-    :param actor_shape: sizes of the actor's layers, whether it has norms, its gain
-    :param actor: weights of the target
-    :param batch: observations, actions, what followed, whether it was an end, rewards
-    :param discounts: (batch, 1)
-    :param noise: of the target's actions
-    :param clip: its limit
-    :param rooms: work spaces of the actor and of the critics
-    :param adam: from ``LeanAdam.begin_step``
-    :param tau: how far the targets follow, 0 to 1
-    :return: the loss
+    :param weights: (networks, parameters)
+    :param target: the same of the targets
+    :param batch: observations, actions, what followed, ...
+    :param next_actions: in what followed
+    :param room: work spaces of the networks
+    :param values: (networks, batch, 1), written
+    :param following: the same of what followed, written
     """
     sizes, norm = shape
-    weights, target, gradient = critics
-    observations, actions, following, dones, rewards = batch
-    next_actions = np.empty_like(actions)
-    actor_sizes, actor_norm, gain = actor_shape
-    kernels.actor_forward(actor, actor_sizes, actor_norm, following, gain, rooms[0], next_actions)
-    if clip:
-        next_actions[:] = np.clip(next_actions + np.clip(noise, -clip, clip), -1, 1)
-    values = np.empty((len(weights), len(actions), 1), weights.dtype)
-    next_values, slope = np.empty_like(values), np.empty_like(values)
-    kernels.values_forward(target, sizes, norm, following, next_actions, rooms[1], next_values)
-    kernels.values_forward(weights, sizes, norm, observations, actions, rooms[1], values)
-    loss = kernels.difference(values, next_values, rewards, dones, discounts, slope)
+    kernels.values_forward(target, sizes, norm, batch[2], next_actions, room, following)
+    kernels.values_forward(weights, sizes, norm, batch[0], batch[1], room, values)
+
+
+@compiled
+def _learn_values(
+    shape: Any, networks: Any, batch: Any, room: Any, slope: Any, adam: Any, tau: float
+) -> None:
+    """
+    Learn from the gradient of the values.
+
+    :param shape: sizes of the critics' layers, and whether they have norms
+    :param networks: weights, those of the targets and their gradient, each (networks, parameters)
+    :param batch: observations, actions, ...
+    :param room: from ``_value``
+    :param slope: gradient of the values, (networks, batch, 1)
+    :param adam: from ``LeanAdam.begin_step``
+    :param tau: how far the targets follow, 0 to 1
+    """
+    sizes, norm = shape
+    weights, target, gradient = networks
     unused = np.empty((0, 0, 0), weights.dtype)
     kernels.values_backward(
-        weights, sizes, norm, observations, actions, rooms[1], slope, gradient, unused, unused
+        weights, sizes, norm, batch[0], batch[1], room, slope, gradient, unused, unused
     )
     kernels.adam(weights.reshape(-1), gradient.reshape(-1), *adam)
     if tau:
         kernels.follow(target.reshape(-1), weights.reshape(-1), weights.dtype.type(tau))
-    return loss
 
 
 @compiled

@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from sb3_torcs import cores
 from sb3_torcs.agents.model_record import BEST_MODEL
 from sb3_torcs.errors import OutputNotWritable, RayUnavailable, StudyError, TrainingDiverged
 from sb3_torcs.signals import answered, handlers_kept
@@ -282,7 +283,8 @@ def _tune(trials: list[Trial], store: StudyFolder, scratch: Path, progress: Prog
     def trainable(config: dict[str, Any]) -> None:
         if scratch.is_dir():  # on this machine: what a killed worker leaves is removed with it
             tempfile.tempdir = str(scratch)
-        _run_or_tell(trials[config["trial"]], _Remote(actor), tune.report)
+        with cores.at_most(1):  # on the others train other trials
+            _run_or_tell(trials[config["trial"]], _Remote(actor), tune.report)
 
     here_only = _HereOnly(progress)
 
