@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from copy import deepcopy
+from functools import partial
 
 import numpy as np
 import pytest
@@ -30,7 +31,7 @@ from sb3_torcs.policies.fused import empty
 from sb3_torcs.policies.mirror import mirror_actions, mirror_image, mirror_observations
 from sb3_torcs.policies.optimizers import LeanAdam
 from sb3_torcs.policies.threads import two_threads
-from sb3_torcs.policies.updates import LeanUpdates
+from sb3_torcs.policies.updates import LeanUpdates, is_for
 from sb3_torcs.sensors import View
 
 SMALL = [16, 24]
@@ -554,19 +555,61 @@ def test_an_error_on_the_second_thread_is_told(monkeypatch):
         updates.train(1, 32)
 
 
+def test_ctrl_c_loses_no_task_of_the_second_thread(monkeypatch):
+    """It may come right after a task was begun, or in a wait for it; all are done at the end."""
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0, 1})
+    done = []
+
+    def slow(number):
+        time.sleep(0.05)
+        done.append(number)
+
+    class Interrupted:
+        def __init__(self, queue, calls):
+            self.queue, self.calls = queue, calls
+
+        def put(self, task):
+            self.queue.put(task)
+            self.calls -= 1
+            if self.calls == 0:
+                raise KeyboardInterrupt
+
+    def use(calls):
+        with two_threads() as other:
+            other._tasks = Interrupted(other._tasks, calls)
+            other.begin(partial(slow, calls))
+            other.wait()
+            raise KeyboardInterrupt
+
+    for calls in (1, 2, 3):
+        with pytest.raises(KeyboardInterrupt):
+            use(calls)
+        assert done[-1] == calls
+
+
 def test_a_process_made_by_fork_has_a_second_thread_of_its_own(monkeypatch):
     """That of the parent does not run in it."""
     monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0, 1})
 
     def use():
+        found = []
         with two_threads() as other:
-            assert other.submit(int, "7").result(timeout=20.0) == 7
+            other.begin(lambda: found.append(threading.current_thread().name))
+        assert found == ["update"]
 
     use()
     child = multiprocessing.get_context("fork").Process(target=use)
     child.start()
     child.join(30.0)
     assert child.exitcode == 0
+
+
+def test_double_precision_learns_as_ever():
+    """The replay buffer holds single precision, which the passes would have to convert."""
+    model = make_model()
+    assert is_for(model)
+    model.policy.double()
+    assert not is_for(model)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from concurrent.futures import Executor
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,7 +27,7 @@ from sb3_torcs.policies.flat import Slot
 from sb3_torcs.policies.fused import array
 from sb3_torcs.policies.layers import compiled
 from sb3_torcs.policies.optimizers import adam_factors, adam_state, is_usual
-from sb3_torcs.policies.threads import two_threads
+from sb3_torcs.policies.threads import Helper, two_threads
 
 __all__ = ["LeanPPO", "is_for"]
 
@@ -168,7 +166,7 @@ class LeanPPO:
                 self._write_state()
         self._record(figures)
 
-    def _epochs(self, other: Executor | None) -> list[list[Figures]]:
+    def _epochs(self, other: Helper) -> list[list[Figures]]:
         """Pass over the rollout so often, and return the figures of the batches."""
         model = self.model
         figures: list[list[Figures]] = []
@@ -180,8 +178,8 @@ class LeanPPO:
             model._n_updates += 1
         return figures
 
-    def _find_gradient(self, batch: RolloutBufferSamples, other: Executor | None) -> Figures:
-        """Find the gradient of the loss, that of the value function in another thread, if any."""
+    def _find_gradient(self, batch: RolloutBufferSamples, other: Helper) -> Figures:
+        """Find the gradient of the loss, that of the value function on the second thread."""
         for_actor, for_critic = self._seen(batch.observations)
         actions, _, chances, advantages, returns = map(array, batch[1:6])
         if self.model.normalize_advantage and len(advantages) > 1:
@@ -190,15 +188,16 @@ class LeanPPO:
         actor, model, gradient = self.actor, self.model, self.gradient
         entropy = float(self.log_std.sum()) + ENTROPY * len(self.log_std)
         clip = model.clip_range(model._current_progress_remaining)  # type: ignore[operator]
-        find_value = partial(self._find_value_gradient, for_critic, returns)
-        running = other.submit(find_value) if other else None
+        value_losses: list[float] = []
+        other.begin(lambda: value_losses.append(self._find_value_gradient(for_critic, returns)))
         policy_loss, clipped, kl = find_policy_gradient(
             self.weights[actor.part], self.log_std, actor.sizes, self.bounds, np.float32(clip),
             (for_actor, actions), (chances, advantages), actor.room(len(actions)),
             gradient[actor.part], gradient[: len(self.log_std)],
         )  # fmt: skip
         gradient[: len(self.log_std)] -= np.float32(model.ent_coef)
-        value_loss = running.result() if running else find_value()
+        other.wait()
+        (value_loss,) = value_losses
         return Figures(policy_loss, clipped, kl, value_loss, -entropy)
 
     def _find_value_gradient(self, observations: np.ndarray, returns: np.ndarray) -> float:

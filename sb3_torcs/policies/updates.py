@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import Executor, Future
+from functools import partial
 from typing import Any, cast
 
 import numpy as np
@@ -18,7 +18,7 @@ from sb3_torcs.policies.layers import compiled
 from sb3_torcs.policies.networks import ActorAverage
 from sb3_torcs.policies.optimizers import LeanAdam, is_usual
 from sb3_torcs.policies.split_head import SplitHeadPolicy
-from sb3_torcs.policies.threads import two_threads
+from sb3_torcs.policies.threads import Helper, two_threads
 
 __all__ = ["LeanUpdates", "is_for"]
 
@@ -66,14 +66,14 @@ class LeanUpdates:
         actor_losses, critic_losses = [], []
         assert model.replay_buffer is not None
         rooms = self._rooms(batch_size)
-        with two_threads() as other, _Shared(len(self.critics[0]), other) as critics:
+        with two_threads() as other:
             for _ in range(gradient_steps):
                 model._n_updates += 1
                 batch = model.replay_buffer.sample(batch_size, env=model._vec_normalize_env)
                 both = model._n_updates % model.policy_delay == 0
                 # The actor's update does not read the critics' targets: these follow before it.
                 tau = model.tau if both else 0.0
-                critic_losses.append(self._update_critics(batch, rooms, tau, critics))
+                critic_losses.append(self._update_critics(batch, rooms, tau, other))
                 if both:
                     actor_losses.append(self._update_actor(batch, rooms))
         for room in rooms:
@@ -93,12 +93,13 @@ class LeanUpdates:
 
     def _update_critics(
         self, batch: ReplayBufferSamples, rooms: tuple[np.ndarray, np.ndarray], tau: float,
-        critics: _Shared,
+        other: Helper,
     ) -> float:  # fmt: skip
         """
         Learn from the targets' values, which follow by a share; return the loss.
 
-        The critics but the first may still learn afterwards: the actor's update reads the first.
+        The first critic learns here. The others do so on the second thread, and may still learn
+        when this returns: the actor's update reads the first one only.
         """
         model, shape, weights = self.model, self.critic_shape, self.critics[0]
         arrays, room = tuple(map(array, batch[:5])), rooms[1]
@@ -124,10 +125,16 @@ class LeanUpdates:
             adam = *(average[own].reshape(-1) for average in averages), *factors
             _learn_values(shape, networks, arrays, room[own], slope[own], adam, tau)
 
-        critics.begin(value)
-        critics.wait()
+        def share(task: Callable[[slice], None]) -> None:
+            other.wait()
+            if len(weights) > 1:
+                other.begin(partial(task, slice(1, None)))
+            task(slice(1))
+
+        share(value)
+        other.wait()
         loss: float = kernels.difference(values, following, arrays[4], arrays[3], discounts, slope)
-        critics.begin(learn)
+        share(learn)
         return loss
 
     def _update_actor(
@@ -141,44 +148,6 @@ class LeanUpdates:
             array(batch.observations), rooms, adam, self.averages, decay, self.model.tau,
         )  # fmt: skip
         return loss
-
-
-class _Shared:
-    """
-    Does the same for all critics, for those after the first on a second thread, if there is one.
-
-    :param networks: number of critics
-    :param other: the second thread
-    """
-
-    def __init__(self, networks: int, other: Executor | None) -> None:
-        here = networks if other is None else 1
-        self.here, self.there = slice(here), slice(here, networks)
-        self.other = other if networks > here else None
-        self._running: Future[None] | None = None
-
-    def __enter__(self) -> _Shared:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.wait()
-
-    def begin(self, task: Callable[[slice], None]) -> None:
-        """
-        Do a task for the first critic, or for all, and begin it for the others.
-
-        :param task: takes the critics as a slice
-        """
-        self.wait()
-        if self.other is not None:
-            self._running = self.other.submit(task, self.there)
-        task(self.here)
-
-    def wait(self) -> None:
-        """Wait until the task is done for all critics."""
-        if self._running is not None:
-            self._running.result()
-            self._running = None  # not before: Ctrl-C may come while this waits
 
 
 @compiled
@@ -311,6 +280,7 @@ def is_for(model: TD3) -> bool:
     return (
         type(model).train is TD3.train
         and policy.fuses
+        and all(own.dtype == th.float32 for own in policy.parameters())
         and type(policy.actor.features_extractor) is FlattenExtractor
         and all(isinstance(own, LeanAdam) and is_usual(own) for own in optimizers)
     )
