@@ -225,6 +225,19 @@ class TestLeavingAndRejoining:
         engine.rejoin(0, 0.0, 0.0, 20.0)
         assert (engine.read(0).laps, engine.laps(0)) == (0, [])
 
+    def test_who_was_too_slow_is_let_back(self, race):
+        """The rules take out a car whose lap takes longer than a stop and its length at 10 m/s."""
+        engine = race([("", 0)])
+        hold(engine, [(0.0, 0.0, 1.0, None)])
+        engine.drive(int((90.0 + engine.track_summary()["length"] / 10.0) / CONTROL_TICK))
+        (out,) = (result[-1] for result in engine.results())
+        engine.rejoin(0, 0.0, 0.0, 20.0)
+        hold(engine, [(0.0, 0.3, 0.0, None)])
+        engine.drive(50)
+        (back,) = (result[-1] for result in engine.results())
+        assert (out, back) == (True, False)
+        assert engine.read(0).distance_raced > 10.0
+
 
 def step_of_script(engine):
     from sb3_torcs.actions import controls_from_action
@@ -418,6 +431,22 @@ class TestVectorEnvironment:
         assert [car.time > was.time for car, was in zip(others, before[1:], strict=True)] == [
             True, True,
         ]  # fmt: skip
+
+    def test_all_cars_of_a_race_end_before_one_begins_anew(self, make):
+        """The next race may be on another road, and the last observation is of this one."""
+        envs = make(1, 2, track=["aalborg", "wheel-2"], sensors=["base", "preview"])
+        envs.seed(0)
+        envs.reset()
+        for _ in range(6):
+            dones = np.zeros(2, bool)
+            while not dones.all():
+                tracks = [env.unwrapped.track.name for env in envs.envs]
+                before = [dict(env.unwrapped.mishaps()) for env in envs.envs]
+                _, _, dones, infos = envs.step(np.array([GAS, GAS], np.float32))
+                for i in np.flatnonzero(dones):
+                    mishaps = envs.envs[i].unwrapped.mishaps()
+                    grown = [name for name in mishaps if mishaps[name] != before[i].get(name)]
+                    assert grown in ([tracks[i]], []), infos[i]["end"]
 
     def test_a_race_is_over_when_all_have_ended_what_they_began_it_with(self, make):
         """Who has rejoined is truncated then, and the next race begins on the grid for all."""

@@ -199,6 +199,22 @@ def test_what_was_returned_stays_as_it_was(env_id, make):
     assert not cars[0].range_finders.flags.writeable
 
 
+def test_an_info_that_is_read_late_is_of_its_own_timestep(env_id, make):
+    """Also if the episode has been ended from outside since."""
+    early, late = (make(2, env_id=env_id) for _ in range(2))
+    found = []
+    for envs in (early, late):
+        envs.seed(0)
+        envs.reset()
+        for _ in range(20):
+            infos = envs.step([GAS, GAS])[3]
+        if envs is late:
+            envs.env_method("reset", indices=0)
+            envs.step([GAS, GAS])
+        found.append([dict(info) for info in infos])
+    assert_same(*found)
+
+
 def test_infos_are_made_when_somebody_asks(make, monkeypatch):
     made = []
     monkeypatch.setattr(
@@ -321,6 +337,29 @@ def test_a_term_that_somebody_adds_is_asked(make, monkeypatch):
     for envs in (ours, theirs):
         envs.seed(0)
     assert_same_drives(ours, theirs, 60)
+
+
+def test_after_a_term_that_fails_each_timestep_is_paid_once(make, monkeypatch):
+    """The cars have driven on, and the next timestep begins where they are."""
+    fails = [False]
+
+    def careless(before, after, controls):
+        return 1 / (not fails[0])
+
+    monkeypatch.setitem(rewards.TERMS, "careless", careless)
+    ours, theirs = (
+        make(2, env_id=LITE, reward={"progress": 1.0, "careless": 1.0}, delay=3) for _ in range(2)
+    )
+    for envs in (ours, theirs):
+        envs.seed(0)
+        envs.reset()
+        envs.step([GAS, GAS])
+    fails[0] = True
+    with pytest.raises(ZeroDivisionError):
+        ours.step([GAS, GAS])
+    fails[0] = False
+    theirs.step([GAS, GAS])
+    assert_same(ours.step([GAS, GAS]), theirs.step([GAS, GAS]))
 
 
 def test_others_make_it_in_the_place_of_a_dummy(env_id, make, tmp_path):

@@ -163,6 +163,10 @@ class Batch:
                     self._in_python.append((race, i, term, weight))
         self._names = [tuple(name for name, _, _ in reward.terms) for reward in self._rewards]
 
+    def begin(self) -> None:
+        """Leave what earlier outcomes look at to them, before races are taken over."""
+        self._cars = self._cars.copy()
+
     def enter(self, race: int) -> None:
         """
         Take the state of a race over from its environment, which has been reset.
@@ -222,6 +226,9 @@ class Batch:
         parts = self._parts(controls)
         failed = self._drive(parts, after)
         after[failed] = before[failed]
+        self._cars, self._controls = after, controls  # driven, even if a term of a reward fails
+        for driven in self._driven:
+            driven.append(parts)
         number = len(self.envs)
         observations = np.empty((number, self._view.size), np.float32)
         values, ended = np.empty_like(self._weights), np.empty(number, np.bool_)
@@ -249,9 +256,6 @@ class Batch:
             values[race, i] = self._ask(term, weight, before[race], after[race], controls[race])
         ended[failed] = True
         terms = values.tolist()
-        self._cars, self._controls = after, controls
-        for driven in self._driven:
-            driven.append(parts)
         return Outcome(
             before,
             after,

@@ -313,6 +313,7 @@ void Race::rejoin(int index, const Start& start) {
     race.penalties.last = &race.penalties.first;
     race.best_lap_time = race.last_lap_time = race.total_time = race.delta_best_lap_time = 0.0;
     race.penalty_time = race.top_speed = 0.0f;
+    race.lap_time = 0.0;  // the rules look at it first
     race.best_lap_counts = true;
     race.remaining_laps = world_->situation.laps;
     const int room = record.laps_room;

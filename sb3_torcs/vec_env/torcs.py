@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, MutableMapping, Sequence
 from functools import partial
 from typing import Any, NoReturn, Self
@@ -222,16 +223,17 @@ class TorcsVecEnv(DummyVecEnv):
         over = timestep.ended | (self._elapsed + 1 >= self._limits)
         self._end_races(over)
         self._elapsed += ~over
+        for i in np.flatnonzero(~over).tolist():
+            self._races[i].append(timestep.rewards[i])
         failures: list[Exception] = []
-        for i, finished in enumerate(over.tolist()):
-            if not finished:
-                self._races[i].append(timestep.rewards[i])
-                continue
-            try:
-                rewards[i], dones[i], infos[i] = self._finish(i, timestep)
-            except Exception as error:  # raised when the other races have been handled
-                error.add_note(f"in race {i} of {self.num_envs}")
-                failures.append(error)
+        last: dict[int, Any] = {}
+        for i in np.flatnonzero(over).tolist():
+            with self._kept(failures, i):
+                last[i] = self._finish(i, timestep)
+        # Only now, since the cars of a race share its track, which a reset may change.
+        for i, answer in last.items():
+            with self._kept(failures, i):
+                timestep.observations[i], rewards[i], dones[i], infos[i] = self._go_on(i, answer)
         if self._watched or failures:
             self._leave()
         for i in self._watched:
@@ -262,24 +264,36 @@ class TorcsVecEnv(DummyVecEnv):
                         self._races[i].racing.end_race()
                     over[i] = True
 
-    def _finish(self, i: int, timestep: Outcome) -> tuple[float, bool, dict[str, Any]]:
-        """Take the last timestep of an episode through all wrappers, and reset."""
+    @contextlib.contextmanager
+    def _kept(self, failures: list[Exception], i: int) -> Iterator[None]:
+        """Keep the error of a race, which is raised when the other races have been handled."""
+        try:
+            yield
+        except Exception as error:
+            error.add_note(f"in race {i} of {self.num_envs}")
+            failures.append(error)
+
+    def _finish(self, i: int, timestep: Outcome) -> Any:
+        """Take the last timestep of an episode through all wrappers; return what they return."""
         assert self._batch is not None
-        race, env = self._races[i], self._envs[i]
-        race.leave(int(self._elapsed[i]))
-        answer = self._batch.finish(i, timestep, partial(env.step, self.actions[i]))
+        self._races[i].leave(int(self._elapsed[i]))
+        return self._batch.finish(i, timestep, partial(self._envs[i].step, self.actions[i]))
+
+    def _go_on(self, i: int, answer: Any) -> tuple[Any, float, bool, dict[str, Any]]:
+        """Begin the next episode; return what a timestep that ends one returns."""
         observation, reward, terminated, truncated, info = answer
         info[TRUNCATED] = truncated and not terminated
         done = terminated or truncated
         if done:
             info["terminal_observation"] = observation
-            observation, self.reset_infos[i] = env.reset()
-        timestep.observations[i] = observation
+            observation, self.reset_infos[i] = self._envs[i].reset()
         self._enter_race(i)
-        return reward, done, info
+        return observation, reward, done, info
 
     def _enter(self) -> None:
         """Take the states of all races over from their environments."""
+        assert self._batch is not None
+        self._batch.begin()
         for i in range(self.num_envs):
             self._enter_race(i)
         self._driving = True
