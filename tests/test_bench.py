@@ -1,4 +1,5 @@
 import os
+import tempfile
 
 import pytest
 import torch as th
@@ -103,10 +104,12 @@ def test_a_race_is_measured_by_its_name():
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("game")
-def test_learning_is_measured_on_two_cores_and_leaves_them_as_they_were(monkeypatch):
+def test_learning_is_measured_on_two_cores_and_leaves_them_as_they_were(monkeypatch, tmp_path):
     cores, threads = os.sched_getaffinity(0), th.get_num_threads()
     monkeypatch.setattr(bench_on_policy, "ROLLOUTS", 2)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     figures = ppo(0.0001)
+    assert list(tmp_path.iterdir()) == []
     assert list(figures) == ["ppo_timesteps_per_s", "ppo_dummy_timesteps_per_s"]
     assert min(figures.values()) > 0.0
     assert set(figures) < set(KEYS)
@@ -164,7 +167,9 @@ def test_updates_and_products_are_measured_in_one_run():
 
 
 @pytest.mark.slow
-def test_environment_and_callbacks_are_a_small_part_of_a_training_timestep():
-    """Whoever trains waits for the networks, not for the simulator."""
+def test_environment_and_callbacks_are_a_small_part_of_a_training_timestep(monkeypatch, tmp_path):
+    """Whoever trains waits for the networks, not for the simulator. No folder stays behind."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     share = training_share(100)["training_env_share"]
+    assert list(tmp_path.iterdir()) == []
     assert 0.0 < share <= 0.3

@@ -9,7 +9,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalC
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNoise
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecCheckNan
 from toy import ToyRace
 
 from sb3_torcs.callbacks import (
@@ -316,6 +316,35 @@ def test_what_an_interrupted_training_left_is_not_taken_for_the_environments_own
         learn(model, 4, *callbacks, Stop())
     learn(model, 4, *callbacks)
     assert model.get_env().env_method("settings") == before
+
+
+@pytest.mark.parametrize("wrapped", [False, True])
+def test_of_several_callbacks_of_a_kind_none_takes_the_setting_of_another_for_the_own(wrapped):
+    """Whichever is undone last, also where an evaluation has the training's environments."""
+    model = make_model()
+    env = model.get_env()
+    if wrapped:
+        model.set_env(VecCheckNan(env))
+    evaluation = EvalCallback(VecCheckNan(env) if wrapped else env, eval_freq=1000, verbose=0)
+    callbacks = [
+        RewardCallback(reward="blog", also_eval=True),
+        RewardCallback(reward="apex", timesteps=4),
+        RandomStartCallback(),
+        RandomStartCallback(),
+        evaluation,
+    ]
+    for _ in range(2):
+        assert learn(model, 8, *callbacks).settings == [("apex", "random")]
+        assert env.env_method("settings") == [("progress", "grid")]
+
+
+def test_an_environment_that_is_in_two_vectors_gets_back_its_own_reward():
+    """SB3 makes a vector of it for the training, and one for the evaluation."""
+    model, race = make_model(), ToyRace()
+    model.set_env(DummyVecEnv([lambda: race]))
+    evaluation = EvalCallback(DummyVecEnv([lambda: race]), eval_freq=1000, warn=False, verbose=0)
+    learn(model, 4, RewardCallback(reward="blog", also_eval=True), evaluation)
+    assert race.settings() == ("progress", "grid")
 
 
 def test_the_reward_changes_after_so_many_timesteps():

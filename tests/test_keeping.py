@@ -243,6 +243,10 @@ def test_a_file_that_cannot_be_written_is_named_and_the_training_goes_on_from_wh
     ("error", "said"),
     [
         ("OSError(28, 'No space left on device')", "cannot write '{folder}': No space left"),
+        (
+            "TrainingDiverged('no numbers')",
+            "(add: -- --hyperparams learning_rate:NUMBER), and go on",
+        ),
         ("EOFError()", "a process with a car of the training has ended; kept: "),
         ("ConnectionResetError(104, 'reset')", "a process with a car of the training has ended"),
     ],

@@ -1,6 +1,8 @@
 """A training that is resumed goes on as it began."""
 
+import dataclasses
 import pickle
+import shlex
 import shutil
 
 import pytest
@@ -10,7 +12,7 @@ from sb3_torcs.agents.model_record import _read_plain
 from sb3_torcs.agents.models import find_model
 from sb3_torcs.cli import main
 from sb3_torcs.training.resuming import recorded_entry
-from sb3_torcs.training.run import OF_ONE_RUN
+from sb3_torcs.training.run import OF_ONE_RUN, Run, TrainOptions, going_on
 
 INTERRUPT = {"test_cli.InterruptingCallback": {"at": 80}}
 METRICS = "sb3_torcs.callbacks.DrivingMetricsCallback"
@@ -58,6 +60,19 @@ def test_what_is_given_replaces_what_was_recorded(run, tmp_path):
     entry = gone_on(run, tmp_path, "--track", "aalborg", "--timesteps", "20")
     assert entry["env_kwargs"] == {"track": "aalborg", "reward": {"progress": 1.0}}
     assert entry["n_envs"] == 2
+
+
+def test_the_command_to_go_on_leaves_out_what_is_recorded(run, tmp_path):
+    """Given again, the learning rate would fall from its beginning."""
+    words = ("--save-freq", "50", "--hyperparams", "learning_rate:'lin_0.001'", "gamma:0.5")
+    options = TrainOptions("ppo", entry="mine", conf_file=run.parents[1] / "own.yml")
+    options = dataclasses.replace(options, folder=tmp_path, progress=False, zoo_args=words)
+    model = run / "TorcsLite-v0.zip"
+    command = shlex.split(going_on(options, Run(run, 80, 100, True, model, {})))
+    assert not {"--entry", "--conf-file"} & set(command)
+    assert command[-5:] == ["--", "--save-freq", "50", "--hyperparams", "gamma:0.5"]
+    entry = gone_on(run, tmp_path, *command[2:])
+    assert (entry["learning_rate"], entry["gamma"]) == ("lin_0.0002", 0.5)
 
 
 def test_a_given_entry_is_all_that_counts(run, tmp_path):

@@ -124,6 +124,18 @@ def test_changes_are_merged_into_an_entry():
     assert entry["kwargs"] == {"a": 1, "b": 2}
 
 
+def test_a_callback_that_is_there_twice_stays_so_and_is_not_changed():
+    """Two rewards, one after the other: a change of one would not say of which."""
+    twice = [{"x.Reward": {"timesteps": 1000}}, "x.First", {"x.Reward": {"timesteps": 5000}}]
+    changed = merged({"callback": twice}, {"callback": {"x.Mirror": {}, "x.First": {"a": 1}}})
+    assert changed["callback"] == [twice[0], {"x.First": {"a": 1}}, twice[2], "x.Mirror"]
+    for change in ({"timesteps": 9}, None):
+        with pytest.raises(StudyError, match=r"'x.Reward', which the entry has 2 times; give the"):
+            merged({"callback": twice}, {"callback": {"x.Reward": change}})
+    with pytest.raises(StudyError, match=r"null takes 'x.None' away, but it is not"):
+        merged({"callback": twice}, {"callback": {"x.None": None}})
+
+
 def test_a_study_is_its_variants_by_its_seeds(tmp_path):
     changes = {"algo": "sac", "n_timesteps": 50, "eval_interval": 25, "gamma": 0.5}
     variants = {"one": {}, "Two!": changes}

@@ -8,13 +8,11 @@ from typing import Any
 
 import gymnasium as gym
 
-from sb3_torcs.bench.torcs import Figures, scripted_actions
+from sb3_torcs.bench.torcs import TICKS_PER_TURN, Figures, scripted_actions
 
 __all__ = ["environments", "resets"]
 
-
 LITE = "sb3_torcs:TorcsLite-v0"
-TICKS_PER_TURN = 3000  # a minute of driving
 RACETRACK_STEPS_PER_TURN = 10
 RESETS = 200
 

@@ -8,6 +8,7 @@ import time
 from typing import Any
 
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
@@ -105,6 +106,7 @@ def _learn(env_id: str, steps: int) -> _TimedCallbacks:
         env = _TimedVecEnv(model.env)
         model.env = env
         callbacks = _TimedCallbacks(chosen, env, start)
+        model.set_logger(Logger(None, []))  # SB3's own leaves an empty folder behind
         with contextlib.redirect_stdout(io.StringIO()):
             model.learn(start + steps, callback=callbacks)
         env.close()

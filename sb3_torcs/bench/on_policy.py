@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_torcs.bench.torcs import Figures
@@ -50,6 +51,7 @@ class _Training:
         from sb3_torcs.training.manager import build
 
         self.model, self.callbacks, _ = build("ppo", ENTRY, entry)
+        self.model.set_logger(Logger(None, []))  # SB3's own leaves an empty folder behind
         self.made = self.model.get_env()
         if plain:
             assert isinstance(self.made, TorcsVecEnv)

@@ -11,11 +11,10 @@ from collections.abc import Callable
 
 import gymnasium as gym
 
-from sb3_torcs.bench.torcs import REPEAT, TORCS, Figures, scripted_actions
+from sb3_torcs.bench.torcs import REPEAT, TICKS_PER_TURN, TORCS, Figures, scripted_actions
 
 __all__ = ["pictures", "resets", "ticks"]
 
-TICKS_PER_TURN = 3000  # a minute of driving
 RESETS = 30  # of each kind
 SIZE = (640, 480)  # [pixels]
 PICTURES = 60

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any
+from weakref import WeakKeyDictionary
 
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv
@@ -23,6 +24,10 @@ from sb3_torcs.rewards import Reward, RewardChoice
 
 __all__ = ["ConditionsCallback", "RandomStartCallback", "RewardCallback"]
 
+_originals: WeakKeyDictionary[VecEnv, dict[str, list[Any]]] = WeakKeyDictionary()
+"""What environments had before any switch, by setter. All callbacks share it: one that looked for
+itself would take what another has set for the environments' own."""
+
 
 class _SwitchUser(BaseCallback):
     """Base of callbacks that change settings of environments, and restore them at the end."""
@@ -36,7 +41,7 @@ class _SwitchUser(BaseCallback):
         return True
 
     def _on_training_end(self) -> None:
-        for switch in self._switches:
+        for switch in reversed(self._switches):
             switch.undo()
 
 
@@ -163,12 +168,19 @@ class _Switch:
 
     def __init__(self, env: VecEnv, setter: str, value: Any) -> None:
         require_method(env, setter)
-        self.env = env
+        self.env = env.unwrapped  # the same one below other wrappers
         self.setter = setter
-        self.previous: list[Any] = env.env_method(setter, value)
+        previous = env.env_method(setter, value)
+        self.original: list[Any] = self._known().setdefault(setter, previous)
+
+    def _known(self) -> dict[str, list[Any]]:
+        return _originals.setdefault(self.env, {})
 
     def undo(self) -> None:
-        """Restore the previous value of every environment."""
-        for index, value in enumerate(self.previous):
+        """Restore the original value of every environment, unless another switch has done so."""
+        known = self._known()
+        # A later training may have made switches of its own, which stay.
+        if known.get(self.setter) is not self.original:
+            return
+        for index, value in enumerate(known.pop(self.setter)):
             self.env.env_method(self.setter, value, indices=[index])
-        self.previous = []

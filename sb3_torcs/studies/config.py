@@ -146,8 +146,7 @@ def merged(entry: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, An
                 raise StudyError(f"null takes '{key}' away, but it is not there; leave it out")
             del result[key]
         elif key == "callback" and isinstance(value, Mapping):
-            by_path = merged(_by_path(result.get(key)), _by_path([value]))
-            result[key] = [{path: kwargs} if kwargs else path for path, kwargs in by_path.items()]
+            result[key] = _merged_callbacks(result.get(key), value)
         elif isinstance(value, Mapping) and isinstance(result.get(key), Mapping):
             result[key] = merged(result[key], value)
         else:
@@ -320,12 +319,33 @@ def _check_keys(mapping: Mapping[str, Any], known: Sequence[str], what: str) -> 
             raise StudyError(f"{what} '{key}'{hint}")
 
 
-def _by_path(callbacks: Any) -> dict[str, Any]:
-    """Turn any of the zoo's forms of a list of callbacks into arguments by dotted path."""
-    result: dict[str, Any] = {}
-    for item in listed(callbacks):
-        result.update({item: {}} if isinstance(item, str) else item)
-    return {path: _with_new_names(path, arguments) for path, arguments in result.items()}
+def _merged_callbacks(callbacks: Any, changes: Mapping[str, Any]) -> list[Any]:
+    """
+    Change a list of callbacks item by item, since a callback may be there twice.
+
+    :param callbacks: of an entry, in any of the zoo's forms
+    :param changes: arguments by dotted path
+    :return: the new list
+    :raises StudyError: if a change is of one that is there twice
+    """
+    pairs = [pair for item in listed(callbacks) for pair in _paths_and_arguments(item)]
+    for path, change in _paths_and_arguments(changes):
+        found = [index for index, (known, _) in enumerate(pairs) if known == path]
+        if len(found) > 1:
+            raise StudyError(
+                f"callback changes '{path}', which the entry has {len(found)} times; give the "
+                "whole list instead: 'callback: [...]'"
+            )
+        at = found[0] if found else len(pairs)
+        changed = merged(dict(pairs[at : at + 1]), {path: change})
+        pairs[at : at + 1] = changed.items()
+    return [{path: arguments} if arguments else path for path, arguments in pairs]
+
+
+def _paths_and_arguments(item: Any) -> list[tuple[Any, Any]]:
+    """Read an item of a list of callbacks; a wrong one is refused with the whole entry."""
+    pairs = item.items() if isinstance(item, Mapping) else [(item, {})]
+    return [(path, _with_new_names(path, arguments)) for path, arguments in pairs]
 
 
 def _with_new_names(path: str, arguments: Any) -> Any:

@@ -17,6 +17,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 from sb3_torcs import cores
@@ -115,6 +116,7 @@ def run_study(
     jobs: int | None = None,
     address: str | None = None,
     progress: Progress | None = None,
+    signals: list[int] | None = None,
 ) -> Path:
     """
     Run a study, or continue it.
@@ -124,6 +126,7 @@ def run_study(
     :param jobs: trials at a time on this machine; by default one per core
     :param address: of a Ray cluster that this machine belongs to; ``None`` uses this machine alone
     :param progress: called with each new result of a trial
+    :param signals: gets the number of each SIGTERM, which ends the study as Ctrl-C does
     :return: the table of the results
     :raises RayUnavailable: if Ray is missing, or the cluster does not answer
     :raises StudyError: if the folder is of another study, or in use, or if a variant cannot be
@@ -147,7 +150,7 @@ def run_study(
         if left:
             # Ray and Tune replace these handlers and never put them back.
             kept = handlers_kept(signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
-            with kept, _ray(store, jobs, address) as scratch:
+            with kept, _ray(store, jobs, address, signals) as scratch:
                 _tune(left, store, scratch, tell)
     return store.results
 
@@ -187,7 +190,9 @@ def require_ray(address: str | None = None) -> None:
 
 
 @contextlib.contextmanager
-def _ray(store: StudyFolder, jobs: int | None, address: str | None) -> Iterator[Path]:
+def _ray(
+    store: StudyFolder, jobs: int | None, address: str | None, signals: list[int] | None
+) -> Iterator[Path]:
     """Start Ray or join a cluster, with a folder for temporary files, and clean up."""
     import ray
 
@@ -195,6 +200,13 @@ def _ray(store: StudyFolder, jobs: int | None, address: str | None) -> Iterator[
     scratch = Path(tempfile.mkdtemp(prefix=SCRATCH))
     enough = threading.Timer(GRACE, _end_by_force, (scratch, session))
     enough.daemon = True
+
+    def end(number: int, frame: FrameType | None) -> None:
+        del frame
+        if signals is not None:
+            signals.append(number)
+        _end(enough)
+
     options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
     if address is None:
         options.update(
@@ -222,7 +234,7 @@ def _ray(store: StudyFolder, jobs: int | None, address: str | None) -> Iterator[
                 "--address out, or start a cluster with `ray start --head`"
             )
         # Tune handles Ctrl-C; Ray would treat SIGTERM as a crash.
-        with answered(lambda *_: _end(enough), signal.SIGTERM):
+        with answered(end, signal.SIGTERM):
             yield scratch
     finally:
         ray.shutdown()

@@ -388,6 +388,8 @@ def _told(
         return kind(f"{why}; {learned}; see it: sb3-torcs evaluate '{result.best_model}'")
     if result.timesteps > 0:
         kept = f"kept: '{result.last_model}', {result.timesteps} of {result.wanted} timesteps"
+        if kind is TrainingDiverged:  # the command goes on with the recorded one
+            remedy += " (add: -- --hyperparams learning_rate:NUMBER)"
         return kind(f"{why}; {kept}; {remedy}, and go on with: {going_on(options, result)}")
     return kind(f"{why}; nothing was kept yet; {remedy}, and start again")
 
@@ -396,11 +398,39 @@ def going_on(options: TrainOptions, result: Run) -> str:
     """
     Compose the command that continues a training.
 
+    What the model's record holds is left out: given again, it would count instead of what is left,
+    and a learning rate that falls over the training would begin anew.
+
     :param options: of the training
     :param result: how far it came
     """
+    from sb3_torcs.agents.models import training_record
+
     left = result.wanted - result.timesteps
-    return _command(dataclasses.replace(options, resume=result.last_model, timesteps=left))
+    after = dataclasses.replace(options, resume=result.last_model, timesteps=left)
+    if result.last_model is not None and result.last_model.is_file():
+        record = training_record(result.last_model)
+        if record.env_id == options.env and "policy" in record.hyperparameters:
+            words = _without_recorded(options.zoo_args, record.hyperparameters)
+            after = dataclasses.replace(after, entry=None, conf_file=None, zoo_args=words)
+    return _command(after)
+
+
+def _without_recorded(
+    zoo_args: Sequence[str], hyperparameters: Mapping[str, Any]
+) -> tuple[str, ...]:
+    """Leave out the changes of an entry that a record holds; it holds no classes, for one."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("-params", "--hyperparams", nargs="+", default=[])
+    known, words = parser.parse_known_args(zoo_args)
+    missing = object()
+    unknown = {
+        key
+        for key, value in _changes(zoo_args).items()
+        if hyperparameters.get(key, missing) != value
+    }
+    kept = [word for word in known.hyperparams if word.partition(":")[0] in unknown]
+    return (*words, *(["--hyperparams", *kept] if kept else []))
 
 
 def _command(options: TrainOptions) -> str:
