@@ -24,7 +24,7 @@ OLDEST_PYTHON = (3, 11)
 PACKAGES = {
     "gymnasium": "gymnasium",
     "highway-env": "highway_env",
-    "imageio": "imageio",
+    "imageio-ffmpeg": "imageio_ffmpeg",
     "matplotlib": "matplotlib",
     "numba": "numba",
     "numpy": "numpy",
@@ -165,7 +165,7 @@ def _video_encoder() -> Check:
 
         return Check("video encoder", True, imageio_ffmpeg.get_ffmpeg_exe(), None)
     except (ImportError, RuntimeError) as error:
-        return Check("video encoder", False, str(error), "pip install 'imageio[ffmpeg]'")
+        return Check("video encoder", False, str(error), "pip install imageio-ffmpeg")
 
 
 def _torcslite() -> Check:
