@@ -62,6 +62,17 @@ def test_for_people_it_prints_three_lines(race, capsys):
     assert re.fullmatch(r"answer ms: median .*, 99 % within .*, longest .*", third)
 
 
+@pytest.mark.parametrize(("name", "instead"), [
+    ("bad;name( Zoe", "bad_name_ Zoe"), ("x" * 32, "x" * 31), ("Zoë", "Zo_"), ("", "Ann Other"),
+])  # fmt: skip
+def test_a_name_that_the_game_cannot_draw_is_refused(name, instead, capsys):
+    assert main(["compete", "scripted", "--name", name]) == 2
+    out, err = capsys.readouterr()
+    assert f"--name is '{name}'; expected 1 to 31 letters, digits, single spaces and -_.:+@" in err
+    assert err.endswith(f"; type --name '{instead}'\n")
+    assert out == ""
+
+
 def test_a_server_that_is_not_there_is_told(monkeypatch, capsys):
     monkeypatch.setattr("sb3_torcs.backends.scr.PATIENCE_WITH_OTHERS", 0.2)
     (bound,) = open_ports(1)

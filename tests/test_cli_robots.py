@@ -14,6 +14,7 @@ import pytest
 from fake_game import write_game
 
 from sb3_torcs.cli import main
+from sb3_torcs.errors import OutputNotWritable
 from sb3_torcs.torcs.race_results import Lap, RobotResult
 
 
@@ -34,13 +35,14 @@ def engine(fake, monkeypatch):
     """An engine that returns what it is told to, and keeps what it was asked."""
     asked = {}
 
-    def race(robots, track, laps, *, session="practice", telemetry=None):
+    def race(robots, track, laps, session="practice", telemetry=None):
         asked.update(robots=robots, track=track, laps=laps, session=session, telemetry=telemetry)
-        return asked["results"]
+        return asked["results"], asked["unwritten"]
 
     module = types.ModuleType("sb3_torcs.agents.robots")
-    module.race = race
+    module.race_to_its_end = race
     monkeypatch.setitem(sys.modules, "sb3_torcs.agents.robots", module)
+    asked["unwritten"] = None
     asked["results"] = [
         RobotResult(
             "racer", 3, "small", [Lap(50.5, 0), Lap(49.25, 7)], 99.75, 1, 7, False, 2, 49.25
@@ -115,6 +117,17 @@ class TestByTheEngine:
         assert list(result) == ["robot", "index", "track", "car", "laps"]
         assert result["laps"] == [{"time": 50.5, "damage": 0}, {"time": 49.25, "damage": 7}]
 
+    @pytest.mark.parametrize("words", [[], ["--json"]])
+    def test_the_results_are_shown_though_the_telemetry_fails(
+        self, engine, capsys, tmp_path, words
+    ):
+        engine["unwritten"] = OutputNotWritable("cannot write 'drive.csv': it is full")
+        words = ["--track", "loop", "--telemetry", str(tmp_path / "drive.csv"), *words]
+        status, out, err = run(capsys, "racer", *words)
+        assert (status, err) == (2, "sb3-torcs: cannot write 'drive.csv': it is full\n")
+        assert "49.25" in out
+        assert "telemetry:" not in out
+
     def test_a_race_is_a_table_of_all(self, engine, capsys):
         engine["results"] = [
             RobotResult("racer", 10, "big", [], 90.0, 1, 0, False, 2, 44.0),
@@ -172,6 +185,7 @@ class TestRefusals:
             (["racer", "--index", "4"], "robot 'racer' has no index 4; it has 3, 10"),
             (["racer", "--track", "lop"], "no track 'lop'; did you mean 'loop'?"),
             (["racer", "--with", "rcaer:3"], "no robot 'rcaer'; did you mean 'racer'?"),
+            (["racer", "--with", "racer:10,racer:10"], "robot 'racer:10' is named twice; name"),
             (["racer", "--game", "--telemetry", "x.csv"], "only; leave out --game"),
             (["racer:3", "--index", "3"], "'racer:3' has an index already; leave out --index 3"),
             ([], "--track is for a robot that drives; name one: robots inferno"),

@@ -80,6 +80,20 @@ def test_a_client_drives_a_race_to_its_end(folder):
     assert f"{client.address}, car1-trb1, a-speedway" in out
 
 
+def test_the_race_goes_on_when_the_reader_leaves(folder):
+    """As of `sb3-torcs serve | head -1`: the clients have come for the race."""
+    port = free_ports()
+    process = serve(folder, port, "--track", "a-speedway", "--laps", "1", "--wait")
+    assert "waiting for SCR clients" in process.stdout.readline()
+    process.stdout.close()
+    with ThirdParty(port) as client:
+        client.identify()
+        assert client.drive() == b"***shutdown***\0"
+    assert process.wait(PATIENCE) == 141
+    assert process.stderr.read() == ""
+    process.stderr.close()
+
+
 def test_two_clients_race_against_a_robot(folder):
     port = free_ports(2)
     words = ("--track", "michigan", "--drivers", "2", "--robots", "inferno", "--laps", "1")
@@ -222,6 +236,7 @@ def test_a_window_shows_the_race(folder):
         (["--host", "::1"], "choose another with --port, or another address with --host"),
         (["--track", "forzza"], "no track 'forzza'; did you mean 'forza'?"),
         (["--robots", ""], "robot '': expected NAME"),
+        (["--robots", "inferno:3,inferno:3"], "robot 'inferno:3' is named twice; name each"),
         (["--robots", "infernal"], "no robot 'infernal'; did you mean 'inferno'?"),
         (["--car", "car1-trb9"], "no car 'car1-trb9'; did you mean"),
         (["--port", "65530", "--drivers", "9"], "ports end at 65535"),

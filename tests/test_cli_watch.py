@@ -178,7 +178,7 @@ def test_without_a_display_it_offers_a_video(monkeypatch, capsys):
         (["inferno", "--video", "lap.mp4", "--fps", "0"], "fps is 0; expected 1 to 500"),
         (["inferno", "--video", "lap.mp4", "--size", "161x120"], "a video needs even numbers"),
         (["inferno", "--video", "lap.mp4", "--track", "forzza"], "did you mean 'forza'?"),
-        (["inferno", "--video", "lap.mp4", "--robots", "inferno"], "none of them twice"),
+        (["inferno", "--video", "lap.mp4", "--robots", "inferno"], "'inferno:3' is named twice"),
         (["inferno", "--video", "lap.mp4", "--robots", ""], "robot '': expected NAME"),
         (["ghost-aalborg", "--laps", "9"], "laps, so it cannot drive 9; ask for no more"),
     ],

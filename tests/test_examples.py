@@ -70,6 +70,17 @@ def test_broken_tracks_are_refused_or_drive_what_is_written(monkeypatch, capsys,
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.usefixtures("game")
+def test_foresight_leaves_hits_out(monkeypatch, capsys):
+    """One lap, from the last place."""
+    found = []
+    for words in (["--blind"], []):
+        run(monkeypatch, "foresight.py", "--races", "1", "--laps", "1", *words)
+        (line,) = capsys.readouterr().out.splitlines()
+        found.append(int(re.fullmatch(r"race 0: place \d+, (\d+) points .*laps", line)[1]))
+    assert found[0] > 100 > found[1]
+
+
 def test_a_racer_is_trained_alone_and_against_robots(monkeypatch, capsys, tmp_path, game):
     budget = [f"--{stage}=1" for stage in ("alone", "robots")]
     run(monkeypatch, "train_racer.py", *budget, "--races", "2", "--folder", str(tmp_path))

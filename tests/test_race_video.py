@@ -116,8 +116,8 @@ def test_the_first_race_is_recorded_and_comes_out_as_if_nobody_looked(
 
 
 @pytest.mark.parametrize(("ends", "said"), [
-    (KeyboardInterrupt, "drawing the video of the first race; Ctrl-C again leaves it out"),
-    (SystemExit, "no video, since the command was told to end"),  # by SIGTERM
+    (KeyboardInterrupt(), "drawing the video of the first race; Ctrl-C again leaves it out"),
+    (SystemExit(143), "no video, since the command was told to end"),  # by SIGTERM
 ])  # fmt: skip
 def test_ctrl_c_draws_what_is_over_and_sigterm_ends(
     ends, said, monkeypatch, capsys, game, tmp_path
@@ -134,9 +134,12 @@ def test_ctrl_c_draws_what_is_over_and_sigterm_ends(
     monkeypatch.setattr(video.Footage, "save", lambda self, path, *_: drawn.append(path))
     words = ["race", "scripted", "bt", "--track", "g-track-1", "--laps", "1", "--json"]
     file = tmp_path / "race.mp4"
-    assert main([*words, "--video", str(file)]) == 130
-    assert said in capsys.readouterr().err
-    assert drawn == ([file] if ends is KeyboardInterrupt else [])
+    by_hand = isinstance(ends, KeyboardInterrupt)
+    assert main([*words, "--video", str(file)]) == (130 if by_hand else 143)
+    told = capsys.readouterr().err
+    assert "sb3-torcs: 1 of 20 races were held\n" in told
+    assert said in told
+    assert drawn == ([file] if by_hand else [])
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import re
+from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
@@ -23,6 +26,7 @@ from sb3_torcs.errors import InvalidOption, OutputNotWritable
 from sb3_torcs.evaluation.comparing import saved_drives
 from sb3_torcs.races import protocol
 from sb3_torcs.races.entrants import find_entrants
+from sb3_torcs.races.picture import draw_race
 from sb3_torcs.races.protocol import Race, Standing, run_race, run_races
 from sb3_torcs.races.ratings import ratings
 from sb3_torcs.races.standings import driver_figures, mean_interval, wilson
@@ -367,6 +371,23 @@ def test_the_command_prints_one_object(capsys, game, tmp_path):
     best = printed["drivers"][0]
     assert (best["driver"], best["races"], best["wins"], best["win_rate"][1]) == ("bt", 2, 2, 1.0)
     assert picture.stat().st_size > 1000
+
+
+def test_a_full_disk_keeps_the_picture_of_before(tmp_path, monkeypatch):
+    race = replace(held("ab")[0], drivers=["a", "b"], distances=np.eye(2), places=np.eye(2))
+    picture = tmp_path / "race.svg"
+    draw_race(race, picture)
+    before = picture.read_bytes()
+    assert before.startswith(b"<?xml")
+
+    def savefig(figure, file):
+        file.write_bytes(b"half")
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", savefig)
+    with pytest.raises(OutputNotWritable, match=rf"{re.escape(str(picture))}': No space left"):
+        draw_race(race, picture)
+    assert [path.read_bytes() for path in tmp_path.iterdir()] == [before]
 
 
 def test_an_agent_without_a_record_is_told(capsys, game, tmp_path):

@@ -139,7 +139,7 @@ def test_rows_that_say_nothing_are_told(tmp_path, capsys, change):
     assert "results.csv cannot be read as results (ValueError" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("text", ["a,b\n1,2\n", "{}\nbase,0\n", "\xff"])
+@pytest.mark.parametrize("text", ["garbage,1\n", "a,b\n1,2\n", "{}\nbase,0\n", "\xff"])
 def test_a_table_that_is_damaged_is_told(tmp_path, capsys, text):
     heading = ",".join(FIELDS)
     (tmp_path / "results.csv").write_bytes(text.format(heading).encode("latin-1"))

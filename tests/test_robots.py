@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import csv
 import itertools
+import resource
 
 import pytest
 
-from sb3_torcs.agents.robots import race
+from sb3_torcs.agents.robots import race, race_to_its_end
 from sb3_torcs.backends.native import make_engine
 from sb3_torcs.car import CONTROL_TICK
 from sb3_torcs.errors import InvalidOption, OutputNotWritable, TrackNotFound, UnknownRobot
@@ -134,6 +135,22 @@ class TestTelemetry:
         with pytest.raises(OutputNotWritable, match="choose another file"):
             race([("bt", 3)], "dirt-1", 1, telemetry=tmp_path / "nowhere" / "drive.csv")
 
+    @pytest.mark.parametrize("ending", ["csv", "parquet"])
+    def test_a_full_disk_does_not_lose_the_results(self, game, tmp_path, ending):
+        robots, file = [("bt", 3)], tmp_path / f"drive.{ending}"
+        usual = race(robots, "dirt-1", 1)
+        most = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, most[1]))
+        try:
+            results, error = race_to_its_end(robots, "dirt-1", 1, telemetry=file)
+            with pytest.raises(OutputNotWritable, match="cannot write"):
+                race(robots, "dirt-1", 1, telemetry=file)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, most)
+        assert results == usual
+        assert f"cannot write '{file}'" in str(error)
+        assert list(tmp_path.iterdir()) == []
+
 
 class TestStartsElsewhere:
     @pytest.mark.parametrize("robot", ROBOTS)
@@ -174,11 +191,11 @@ class TestRefusals:
     @pytest.mark.parametrize(
         ("robots", "laps", "message"),
         [
-            ([], 1, "robots are none; expected at least one, none of them twice"),
+            ([], 1, "no robot is named; name at least one"),
             ([("inferno", slot) for slot in range(21)], 1, "21 cars are named; a grid .* for 20"),
             ([("inferno", 3)], 0, "laps is 0; expected a whole number from 1 to 1073741824"),
             ([("inferno", 3)], 1 << 31, "laps is 2147483648"),
-            ([("inferno", 3)] * 2, 1, "expected at least one, none of them twice"),
+            ([("inferno", 3)] * 2, 1, "robot 'inferno:3' is named twice; name each robot once"),
             ([("inferno", 3)], 1.5, "laps is 1.5"),
             ([("inferno", 3)], True, "laps is True"),
         ],

@@ -167,6 +167,8 @@ def test_what_is_no_drive_is_told(tmp_path, oval):
 @pytest.mark.parametrize(("change", "says"), [
     (lambda frame: frame.assign(driver=None), "who drove where"),
     (lambda frame: frame.assign(distance_from_start=float("nan")), "distance is no number"),
+    (lambda frame: frame.assign(speed_x=float("nan")), "column speed_x has rows without a number"),
+    (lambda frame: frame.assign(x=float("inf")), "column x has rows without a number"),
     (lambda frame: frame.iloc[::-1], "out of order"),
     (lambda frame: frame.assign(driver=7), "world is no text"),
     (lambda frame: frame.assign(lap_time=None), "column lap_time holds no numbers"),
@@ -177,6 +179,14 @@ def test_rows_that_are_no_drive_are_told(tmp_path, oval, change, says):
     change(pd.read_parquet(path)).to_parquet(path)
     with pytest.raises(DriveFileError, match=rf"is damaged: .*{says}; write it anew"):
         read_drives(path)
+
+
+def test_a_car_that_the_physics_lost_is_still_a_drive(tmp_path):
+    """Such a car stands somewhere, but its wheels and its engine may turn at no number."""
+    state = car_state(wheel_speeds=np.full(4, np.nan), engine_speed=np.nan, fuel=np.nan)
+    log = DriveLog()
+    log.add(LABEL, state, Controls(0.0, 0.0, 0.0))
+    assert len(read_drives(written(tmp_path, log))) == 1
 
 
 def test_a_pipe_is_no_drive(tmp_path):

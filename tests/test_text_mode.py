@@ -132,8 +132,8 @@ class TestRefusals:
         ("robots", "changes", "message"),
         [
             ([("racer", 3), ("racer", 10)], {}, r"a practice is for one robot, but 2 are named"),
-            ([], {"session": "race"}, r"robots are none; expected at least one"),
-            ([("racer", 3)] * 2, {"session": "race"}, r"racer:3, racer:3; expected .* twice"),
+            ([], {"session": "race"}, "no robot is named; name at least one"),
+            ([("racer", 3)] * 2, {"session": "race"}, r"robot 'racer:3' is named twice"),
             (
                 [("racer", n) for n in range(21)],
                 {"session": "race"},

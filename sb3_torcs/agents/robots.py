@@ -9,6 +9,7 @@ from typing import Any
 
 from sb3_torcs.backends.native import make_engine
 from sb3_torcs.car import CarState, Controls
+from sb3_torcs.errors import OutputNotWritable
 from sb3_torcs.telemetry import STATE_FIELDS, DriveLabel, DriveLog, write_telemetry
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.race_results import Lap, RobotResult
@@ -16,7 +17,7 @@ from sb3_torcs.torcs.race_setup import RaceSetup, Session
 from sb3_torcs.torcs.track_names import find_track
 from sb3_torcs.tracks.catalogue import lasting_name, load_track
 
-__all__ = ["PARQUET", "drive_log", "race"]
+__all__ = ["PARQUET", "drive_log", "race", "race_to_its_end"]
 
 TICKS_AT_ONCE = 50  # a second of the race
 PARQUET = ".parquet"
@@ -43,18 +44,54 @@ def race(
     :return: one result per robot, the winner first
     :raises InvalidOption: if the session cannot be had
     :raises BackendUnavailable: if the game or the extension is missing
+    :raises OutputNotWritable: if the file cannot be written
     """
+    results, unwritten = race_to_its_end(robots, track, laps, session, telemetry)
+    if unwritten is not None:
+        raise unwritten
+    return results
+
+
+def race_to_its_end(
+    robots: Sequence[tuple[str, int]],
+    track: str,
+    laps: int,
+    session: Session = "practice",
+    telemetry: str | Path | None = None,
+) -> tuple[list[RobotResult], OutputNotWritable | None]:
+    """
+    Let robots drive as :func:`race` does, and keep the results if the file cannot be written.
+
+    :param robots: as of :func:`race`
+    :param track: as of :func:`race`
+    :param laps: as of :func:`race`
+    :param session: as of :func:`race`
+    :param telemetry: as of :func:`race`
+    :return: one result per robot, the winner first; and why there is no file, if there is none
+    :raises InvalidOption: if the session cannot be had
+    :raises BackendUnavailable: if the game or the extension is missing
+    """
+    unwritten = None
     with _engine(robots, track, laps, session) as engine:
-        if telemetry is None:
-            while not engine.ended:
-                engine.advance(TICKS_AT_ONCE)
-        elif (telemetry := Path(telemetry)).suffix.lower() == PARQUET:
-            _log(engine, robots, track).write(telemetry)
-        else:
-            write_telemetry(telemetry, _rows(engine, robots))
-        return [
+        try:
+            if telemetry is not None:
+                _write_drive(engine, robots, track, Path(telemetry))
+        except OutputNotWritable as error:
+            unwritten = error
+        while not engine.ended:  # there is no file, or no more room for it
+            engine.advance(TICKS_AT_ONCE)
+        results = [
             _result(engine, robots, rank, row) for rank, row in enumerate(engine.results(), start=1)
         ]
+    return results, unwritten
+
+
+def _write_drive(engine: Any, robots: Sequence[tuple[str, int]], track: str, file: Path) -> None:
+    """Drive to the end of the race, and write the drive."""
+    if file.suffix.lower() == PARQUET:
+        _log(engine, robots, track).write(file)
+    else:
+        write_telemetry(file, _rows(engine, robots))
 
 
 def drive_log(

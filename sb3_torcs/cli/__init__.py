@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import errno
 import os
 import signal
@@ -30,7 +29,7 @@ from sb3_torcs.cli import (
     train,
     watch,
 )
-from sb3_torcs.cli.common import CACHE_FIX, INTERRUPTED, lacks_cache
+from sb3_torcs.cli.common import CACHE_FIX, INTERRUPTED, READER_LEFT, drop_output, lacks_cache
 from sb3_torcs.cli.parser import Parser
 from sb3_torcs.cli.plain import any_terminal, open_streams
 from sb3_torcs.errors import Sb3TorcsError
@@ -39,7 +38,6 @@ from sb3_torcs.signals import answered
 __all__ = ["main"]
 
 USAGE_ERROR = 2
-READER_LEFT = 141
 VERBS = (
     doctor, install_torcs, tracks, train, evaluate, compare, watch, optimize_lap, study, report,
     robots, race, serve, compete, bench,
@@ -62,17 +60,17 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _parsed(words: list[str]) -> argparse.Namespace | None:
     """Read the command line. Without a verb, print the help and return ``None``."""
-    split = words.index("--") if "--" in words else len(words)
+    # Other verbs read what follows as argparse does: names that may begin with a dash.
+    passes_on = words[:1] == ["train"] and "--" in words
+    split = words.index("--") if passes_on else len(words)
     parser, verbs = _parser()
-    if split > 0:
+    if words:
         parser.check_verb(words[0], verbs)
     args = parser.parse_args(words[:split])
     args.zoo_args = words[split + 1 :]
     if args.verb is None:
         parser.print_help()
         return None
-    if args.zoo_args and args.verb != "train":
-        parser.error(f"{args.verb} takes no arguments after '--'; leave them out")
     return args
 
 
@@ -93,7 +91,7 @@ def _run(args: argparse.Namespace) -> int:
         print(f"sb3-torcs: {error}", file=sys.stderr)
         return USAGE_ERROR
     except BrokenPipeError:  # the reader, e.g. `head`, has ended
-        _drop_output()
+        drop_output()
         return READER_LEFT
     except RuntimeError as error:
         if not lacks_cache(error):
@@ -106,7 +104,7 @@ def _run(args: argparse.Namespace) -> int:
         remedy = "type a shorter name" if too_long else "make room, or choose another folder"
         said = f"{error.strerror or error}: {where}; {remedy}"
         print(f"sb3-torcs: {said}", file=sys.stderr)
-        _drop_output()
+        drop_output()
         return USAGE_ERROR
     except KeyboardInterrupt:
         print("sb3-torcs: interrupted", file=sys.stderr)
@@ -118,12 +116,6 @@ def _end(number: int, frame: FrameType | None) -> None:
     """Let SIGTERM and SIGHUP end the process as an exception does, so that it cleans up."""
     del frame
     raise SystemExit(128 + number)
-
-
-def _drop_output() -> None:
-    """Discard what is still to be written to standard output."""
-    with contextlib.suppress(OSError):  # standard output is not a file
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _parser() -> tuple[Parser, Iterable[str]]:

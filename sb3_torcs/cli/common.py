@@ -6,6 +6,7 @@ import argparse
 import contextlib
 import json
 import math
+import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -22,8 +23,10 @@ __all__ = [
     "CACHE_FIX",
     "INTERRUPTED",
     "MODEL_HELP",
+    "READER_LEFT",
     "TRUST_HELP",
     "asked_files",
+    "drop_output",
     "lacks_cache",
     "natural",
     "parsed_robots",
@@ -32,6 +35,7 @@ __all__ = [
     "quiet_output",
     "seed",
     "setting",
+    "status_of",
     "table",
     "told_record",
     "warn_unless_known",
@@ -39,6 +43,8 @@ __all__ = [
 
 INTERRUPTED = 130
 """The exit status after Ctrl-C, as shells have it."""
+READER_LEFT = 141
+"""The exit status if the reader of standard output, e.g. `head`, has ended before."""
 
 CACHE_FIX = "export NUMBA_CACHE_DIR=/tmp/numba"
 
@@ -61,6 +67,22 @@ def asked_files(args: argparse.Namespace, kinds: Mapping[str, tuple[str, ...]]) 
         for what, suffixes in kinds.items()
         if getattr(args, what) is not None
     }
+
+
+def drop_output() -> None:
+    """Discard what is still to be written to standard output."""
+    with contextlib.suppress(OSError):  # standard output is not a file
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def status_of(ended: BaseException) -> int:
+    """
+    Tell the exit status of work that a signal has ended: 128 and its number.
+
+    :param ended: what the signal has raised: ``KeyboardInterrupt``, or ``SystemExit`` of the status
+    """
+    code = getattr(ended, "code", None)
+    return code if isinstance(code, int) else INTERRUPTED
 
 
 def lacks_cache(error: Exception) -> bool:

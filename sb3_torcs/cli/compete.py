@@ -63,6 +63,8 @@ def run(args: argparse.Namespace) -> int:
     :param args: from the command line
     :return: the exit status
     """
+    if args.name is not None:
+        _check_name(args.name)
     where = f"{args.host}, UDP port {args.port}"
     with quiet_output(args.json):  # said first, because loading takes seconds
         print(f"{args.model} is being loaded for the race at {where}", flush=True)
@@ -100,6 +102,18 @@ def run(args: argparse.Namespace) -> int:
         elif agent.backend.latencies:
             _show(agent)
     return 0
+
+
+def _check_name(name: str) -> None:
+    """Refuse a driver's name that the game cannot draw, instead of changing it."""
+    from sb3_torcs.errors import InvalidOption
+    from sb3_torcs.scr.protocol import LONGEST_NAME, plain_name
+
+    if not name or plain_name(name) != name:
+        raise InvalidOption(
+            f"--name is {name!r:.60}; expected 1 to {LONGEST_NAME} letters, digits, single spaces "
+            f"and -_.:+@; type --name '{plain_name(name) or 'Ann Other'}'"
+        )
 
 
 def _figures(agent: Agent) -> dict[str, Any]:

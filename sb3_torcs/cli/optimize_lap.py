@@ -10,13 +10,13 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from sb3_torcs.cli.common import (
-    INTERRUPTED,
     MODEL_HELP,
     TRUST_HELP,
     positive,
     print_json,
     quiet_output,
     seed,
+    status_of,
     table,
 )
 from sb3_torcs.files import writable_file
@@ -87,16 +87,16 @@ def run(args: argparse.Namespace) -> int:
     out = writable_file(args.out or f"ghost-{name}-{track.removesuffix('.xml')}.npz", (".npz",))
     begun = time.monotonic()
     with quiet_output(args.json):
-        ghost, state, stopped = _search(args, kwargs)
+        ghost, state, status = _search(args, kwargs)
     seconds = time.monotonic() - begun
     if ghost is None:
         why = (
             f"the search ended before its first race of its own was whole ({state.rollouts} "
             f"rollouts, {seconds:.0f} s), so no ghost is kept"
         )
-        if stopped:
+        if status:
             print(f"sb3-torcs: {why}", file=sys.stderr)
-            return INTERRUPTED
+            return status
         raise InvalidOption(f"{why}; give more --seconds or --rollouts")
     standing, *flying = ghost.lap_times
     figures = {
@@ -118,14 +118,14 @@ def run(args: argparse.Namespace) -> int:
     ghost.write(out)
     if not args.json:
         print(f"ghost: {out}")
-    return INTERRUPTED if stopped else 0
+    return status
 
 
-def _search(args: argparse.Namespace, kwargs: dict[str, Any]) -> tuple[Ghost | None, State, bool]:
+def _search(args: argparse.Namespace, kwargs: dict[str, Any]) -> tuple[Ghost | None, State, int]:
     """
     Search until the budget is used up or somebody stops it.
 
-    :return: the best lap, how far the search came, and whether it was stopped
+    :return: the best lap, how far the search came, and the exit status
     """
     from sb3_torcs.training.lap_search.search import Budget, LapSearch
     from sb3_torcs.training.lap_search.starts import find_starts
@@ -141,15 +141,15 @@ def _search(args: argparse.Namespace, kwargs: dict[str, Any]) -> tuple[Ghost | N
     left = math.inf if seconds is None else seconds - (time.monotonic() - begun)
     budget = Budget(left, args.rollouts or math.inf)
     search = LapSearch(args.agent, kwargs, starts, seed=args.seed)
-    stopped = False
+    status = 0
     try:
         for _ in _shown(search, budget):
             pass
-    except (KeyboardInterrupt, SystemExit):  # SIGTERM
-        stopped = True
+    except (KeyboardInterrupt, SystemExit) as stopped:  # Ctrl-C, SIGTERM
+        status = status_of(stopped)
     finally:
         search.close()
-    return search.ghost, search.state(), stopped
+    return search.ghost, search.state(), status
 
 
 def _shown(search: LapSearch, budget: Budget) -> Iterator[State]:

@@ -20,7 +20,8 @@ class Parser(argparse.ArgumentParser):
         :param namespace: to be filled
         :return: the namespace, and no words: what is unknown is an error
         """
-        found, unknown = super().parse_known_args(args, namespace)
+        found, words = super().parse_known_args(args, namespace)
+        unknown = [word for word in words if word != "--"]
         if unknown:
             self._refuse(unknown)
         return found, unknown

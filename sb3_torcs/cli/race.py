@@ -17,6 +17,7 @@ from sb3_torcs.cli.common import (
     print_json,
     quiet_output,
     seed,
+    status_of,
     table,
     warn_unless_known,
 )
@@ -121,13 +122,14 @@ def run(args: argparse.Namespace) -> int:
         entrants = _entrants(args)
         log = DriveLog() if "telemetry" in files or "report" in files else None
         footage = _footage(args)
-        races, at_once = _held(args, entrants, log, footage)
+        races, status = _held(args, entrants, log, footage)
     with held_back():  # to compute the figures takes a while
         _tell(args, races)
     stopped = len(races) < args.races
     if stopped:
+        print(f"sb3-torcs: {len(races)} of {args.races} races were held", file=sys.stderr)
         _drop(files, NEED_THE_LAST, "the last race was not held")
-    if at_once:
+    if status not in (0, INTERRUPTED):
         _drop(files, ("video",), "the command was told to end")
     with quiet_output(args.json):
         _write(files, races[-1], log, entrants[0].name)
@@ -137,7 +139,7 @@ def run(args: argparse.Namespace) -> int:
     if not args.json:
         for what, path in files.items():
             print(f"{what}: {path}")
-    return INTERRUPTED if stopped else 0
+    return status if stopped else 0
 
 
 def _tell(args: argparse.Namespace, races: list[Race]) -> None:
@@ -228,13 +230,13 @@ def _held(
     entrants: Sequence[Entrant],
     log: DriveLog | None,
     footage: Footage | None,
-) -> tuple[list[Race], bool]:
+) -> tuple[list[Race], int]:
     """
     Hold the races behind a progress bar; the first one is recorded, the last one is noted.
 
     Ctrl-C ends them early, and so do SIGTERM and SIGHUP.
 
-    :return: those that are over, and whether the command has to end at once
+    :return: those that are over, and the exit status of what has ended them, or 0
     """
     from tqdm import tqdm
 
@@ -272,8 +274,8 @@ def _held(
         except (KeyboardInterrupt, SystemExit) as ended:
             if not races:
                 raise
-            return races, isinstance(ended, SystemExit)
-    return races, False
+            return races, status_of(ended)
+    return races, 0
 
 
 def _as_json(args: argparse.Namespace, races: list[Race]) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from sb3_torcs.cli.results import results_as_json, show_results
 from sb3_torcs.files import writable_file
 
 if TYPE_CHECKING:
+    from sb3_torcs.errors import OutputNotWritable
     from sb3_torcs.torcs.installation import Game
     from sb3_torcs.torcs.race_results import RobotResult
 
@@ -96,12 +97,14 @@ def run(args: argparse.Namespace) -> int:
     file = find_track(args.track, game)
     track = args.track if file.source == "file" else file.name
     with quiet_output(args.json):
-        results = _drive(game, robots, track, args, telemetry)
+        results, unwritten = _drive(game, robots, track, args, telemetry)
     if args.json:
         print_json(results_as_json(results, robots[0], track))
-        return 0
-    show_results(results, robots[0], track)
-    if telemetry is not None:
+    else:
+        show_results(results, robots[0], track)
+    if unwritten is not None:
+        raise unwritten
+    if telemetry is not None and not args.json:
         print(f"telemetry: {telemetry}")
     return 0
 
@@ -143,7 +146,7 @@ def _drive(
     track: str,
     args: argparse.Namespace,
     telemetry: Path | None,
-) -> list[RobotResult]:
+) -> tuple[list[RobotResult], OutputNotWritable | None]:
     """
     Let the robots drive.
 
@@ -152,7 +155,7 @@ def _drive(
     :param track: ``category/name``, or the path of a file
     :param args: from the command line
     :param telemetry: file for the drive itself
-    :return: one result per robot, the winner first
+    :return: one result per robot, the winner first; and why there is no telemetry, if that failed
     """
     from rich.console import Console
 
@@ -163,7 +166,7 @@ def _drive(
         if args.game:
             from sb3_torcs.races.text_mode import run as run_game
 
-            return run_game(game, track, robots, args.laps, session)
-        from sb3_torcs.agents.robots import race
+            return run_game(game, track, robots, args.laps, session), None
+        from sb3_torcs.agents.robots import race_to_its_end
 
-        return race(robots, track, args.laps, session=session, telemetry=telemetry)
+        return race_to_its_end(robots, track, args.laps, session, telemetry)

@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from sb3_torcs.car import DEFAULT_CAR
-from sb3_torcs.cli.common import parsed_robots, positive
+from sb3_torcs.cli.common import READER_LEFT, drop_output, parsed_robots, positive
 from sb3_torcs.cli.results import show_results
 
 if TYPE_CHECKING:
@@ -110,38 +110,59 @@ def run(args: argparse.Namespace) -> int:
     finally:
         for bound in sockets:
             bound.close()
+    echo = Echo()
     with process:
-        _announce(args)
+        echo.say(_announcement(args))
         try:
-            process.follow(_report)
+            process.follow(echo.report)
         except (KeyboardInterrupt, SystemExit):
-            _interrupt(process, race, cars)
+            _interrupt(process, race, cars, echo)
             raise
         show_results(read_results(process, race, cars), drivers[0], str(args.track))
-    return 0
+    return READER_LEFT if echo.reader_left else 0
 
 
-def _announce(args: argparse.Namespace) -> None:
-    """Print the addresses at which clients may connect."""
+def _announcement(args: argparse.Namespace) -> str:
+    """Say at which addresses clients may connect."""
     last = args.port + args.drivers - 1
     ports = f"port {args.port}" if last == args.port else f"ports {args.port} to {last}"
     time = "the game waits for every answer" if args.wait else f"{args.deadline:g} ms per answer"
-    print(f"{args.track}: waiting for SCR clients at {args.host}, UDP {ports}; {time}", flush=True)
+    return f"{args.track}: waiting for SCR clients at {args.host}, UDP {ports}; {time}"
 
 
-def _report(line: str) -> None:
-    """Print the lines of our drivers."""
-    if line.startswith(REPORT):
-        print(line, flush=True)
+class Echo:
+    """Prints lines at once. Who reads them may leave: the race goes on for its clients."""
+
+    reader_left = False
+
+    def say(self, line: str) -> None:
+        """
+        :param line: to be printed
+        """
+        try:
+            print(line, flush=True)
+        except BrokenPipeError:
+            self.reader_left = True
+            drop_output()
+
+    def report(self, line: str) -> None:
+        """
+        Print what our drivers say.
+
+        :param line: of the game
+        """
+        if line.startswith(REPORT):
+            self.say(line)
 
 
-def _interrupt(process: GameProcess, race: RaceSetup, cars: Sequence[str]) -> None:
+def _interrupt(process: GameProcess, race: RaceSetup, cars: Sequence[str], echo: Echo) -> None:
     """
     End the race for all clients, and print the results.
 
     :param process: of the game
     :param race: who races where
     :param cars: of the drivers, in their order
+    :param echo: of what the drivers say
     """
     from sb3_torcs.errors import GameFailed
     from sb3_torcs.torcs.results import read_results
@@ -149,7 +170,7 @@ def _interrupt(process: GameProcess, race: RaceSetup, cars: Sequence[str]) -> No
     process.end_race()
     # A game that is loading or paused writes no results; a closed terminal cannot show them.
     with suppress(GameFailed, OSError):
-        process.follow(_report)
+        process.follow(echo.report)
         # In a race that was ended early, nobody is out for not having finished it.
         results = [replace(r, out=False) for r in read_results(process, race, cars)]
         print("the race was ended early:")

@@ -68,8 +68,12 @@ def run(args: argparse.Namespace) -> int:
     board = Board(study)
     # Ray Tune handles Ctrl-C itself while it runs.
     interrupted = contextlib.suppress(KeyboardInterrupt)
+    signals: list[int] = []
     with interrupted, quiet_output(args.json), board.shown():
-        run_study(study, folder, jobs=args.jobs, address=args.address, progress=board.update)
+        run_study(
+            study, folder, jobs=args.jobs, address=args.address, progress=board.update,
+            signals=signals,
+        )  # fmt: skip
     store = StudyFolder(folder, study)
     left = [trial for trial in study.trials if not store.ended(trial)]
     failed = board.errors()
@@ -89,7 +93,9 @@ def run(args: argparse.Namespace) -> int:
             print(f"results: {store.results}")
         print("go on with:" if left else "see them:")
         print(f"  {_command(args) if left else shlex.join(['sb3-torcs', 'report', str(folder)])}")
-    return INTERRUPTED if len(left) > len(failed) else int(bool(failed))
+    if len(left) > len(failed):
+        return 128 + signals[0] if signals else INTERRUPTED
+    return int(bool(failed))
 
 
 def _command(args: argparse.Namespace) -> str:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sb3_torcs.files import IN_A_FOLDER, whole_file
 from sb3_torcs.races.protocol import Race
 
 __all__ = ["draw_race"]
@@ -17,6 +18,7 @@ def draw_race(race: Race, path: Path) -> None:
 
     :param race: at least a second of it
     :param path: of the picture; its ending is the format
+    :raises OutputNotWritable: if the file cannot be written; the previous one is kept
     """
     from matplotlib.figure import Figure
 
@@ -32,4 +34,5 @@ def draw_race(race: Race, path: Path) -> None:
     places.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
     gaps.set_ylabel("behind the leader [m]")
     gaps.set_xlabel("distance of the leader [km]")
-    figure.savefig(path)
+    with whole_file(path, IN_A_FOLDER) as aside:
+        figure.savefig(aside)

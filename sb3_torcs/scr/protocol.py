@@ -22,6 +22,7 @@ from sb3_torcs.errors import MessageBroken
 
 __all__ = [
     "IDENTIFIED",
+    "LONGEST_NAME",
     "NO_FOCUS",
     "RESTART",
     "SHUTDOWN",

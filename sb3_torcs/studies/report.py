@@ -13,7 +13,7 @@ import numpy as np
 
 from sb3_torcs.errors import StudyError
 from sb3_torcs.evaluation.ladder import RUNGS
-from sb3_torcs.studies.config import slug
+from sb3_torcs.studies.config import FIELDS, slug
 from sb3_torcs.studies.curves import NO_LAP, learning_of
 from sb3_torcs.studies.estimates import Estimate, estimate
 from sb3_torcs.studies.page import Section, study_page
@@ -43,7 +43,11 @@ def read_results(folder: Path) -> list[Results]:
     file = folder / RESULTS
     try:
         with file.open(newline="", encoding="utf-8") as lines:
-            rows = [_read(row) for row in csv.DictReader(lines, restval="")]
+            reader = csv.DictReader(lines, restval="")
+            missing = [name for name in FIELDS if name not in (reader.fieldnames or FIELDS)]
+            if missing:
+                raise ValueError(f"it has no column {', '.join(missing[:3])}")
+            rows = [_read(row) for row in reader]
         trials = _trials(rows)
     except (FileNotFoundError, NotADirectoryError):
         raise StudyError(

@@ -30,6 +30,7 @@ AT_ONCE = 5000  # rows that are turned into columns together
 
 WHEELS = ("front_right", "front_left", "rear_right", "rear_left")
 WHOLE = {"gear", "laps", "race_position", "gear_asked"}  # columns of whole numbers
+LEFT_BY_PHYSICS = {"engine_speed", "fuel"}  # as wheels: may stay no number in a car that it lost
 OTHER_UNITS = {  # of what the sensor table does not hold
     "time": "s", "x": "m", "y": "m", "yaw": "rad", "yaw_rate": "rad/s", "height": "m",
     "distance_from_axis": "m", "track_width": "m", "distance_from_start": "m",
@@ -197,6 +198,10 @@ def _damage(frame: pd.DataFrame) -> str | None:
             return f"its column {name} holds no numbers"
     if not np.isfinite(frame[["time", "distance_from_start", "lap_time"]].to_numpy()).all():
         return "a time or a distance is no number"
+    finite = np.isfinite(numbers[list(STATE_FIELDS)].to_numpy(float, na_value=np.nan)).all(axis=0)
+    for name, whole in zip(STATE_FIELDS, finite, strict=True):
+        if not whole and name not in LEFT_BY_PHYSICS:
+            return f"its column {name} has rows without a number"
     drives = frame.groupby(list(LABELS), sort=False, observed=True)
     if (drives["time"].diff() < 0.0).any():
         return "its rows are out of order"

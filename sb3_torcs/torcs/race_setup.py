@@ -72,9 +72,14 @@ class RaceSetup:
         checked_choice("session", self.session, SESSIONS)
         checked_laps(self.laps)
         drivers = list(self.drivers)
-        if not drivers or len(set(drivers)) < len(drivers):
-            named = ", ".join(f"{name}:{index}" for name, index in drivers) or "none"
-            raise InvalidOption(f"robots are {named}; expected at least one, none of them twice")
+        if not drivers:
+            raise InvalidOption("no robot is named; name at least one")
+        twice = next((driver for driver in drivers if drivers.count(driver) > 1), None)
+        if twice is not None:
+            raise InvalidOption(
+                f"robot '{twice[0]}:{twice[1]}' is named twice; name each robot once, e.g. "
+                "inferno:3,inferno:4"
+            )
         if self.session == "practice" and len(drivers) != 1:
             raise InvalidOption(
                 f"a practice is for one robot, but {len(drivers)} are named; choose session 'race'"

@@ -1,0 +1,93 @@
+"""Let an agent race with foresight: the engine's snapshots tell which hits are coming."""
+
+import argparse
+
+import gymnasium as gym
+import numpy as np
+
+from sb3_torcs.agents.models import agent_record, load_driver
+from sb3_torcs.torcs.installation import find_game
+
+ROBOTS = ("berniw", "bt", "inferno", "lliaw", "olethros", "tita", "inferno:4", "bt:3", "tita:4")
+LOOK, AHEAD, HELD = 3, 22, 6  # timesteps: between two looks, looked ahead, of a change
+HIT = 15.0  # [points] of damage that are worth a change
+PRICE = 0.1  # [m] per point
+CHANGES = [(turn, pedal) for turn in (0.0, -0.08, 0.08, -0.2, 0.2) for pedal in (None, 0.0, -0.5)]
+CHANGES += [(0.0, -1.0), (0.0, 1.0), (-0.1, 1.0), (0.1, 1.0)]  # the first of all is none
+
+parser = argparse.ArgumentParser(description=__doc__)
+parser.add_argument("agent", nargs="?", default="ppo-racer", help="with a signed pedal")
+parser.add_argument("--races", type=int, default=5, help="seeds 0, 1, ... of the grid; default: 5")
+parser.add_argument("--laps", type=int, default=5)
+parser.add_argument("--blind", action="store_true", help="race without foresight")
+
+
+class Racer:
+    """
+    An agent in a race that can be driven on, and taken back.
+
+    :param driver: of the agent
+    :param env: the race
+    """
+
+    def __init__(self, driver, env):
+        self.driver, self.env, self.world = driver, env, env.backend
+
+    def act(self, change):
+        """Return the agent's action, changed."""
+        seen = self.env.view.encode(self.env.car, self.world)
+        (turn, pedal), action = change, self.driver.predict(seen, deterministic=True)[0].copy()
+        action[0] = np.clip(action[0] + turn, -1.0, 1.0)
+        if pedal is not None:
+            action[1] = pedal if pedal > 0.0 else min(action[1], pedal)
+        return action
+
+    def worth(self, change):
+        """Look ahead, and return the damage that a change brings, and what it is worth [m]."""
+        begin, moment = self.env.car, self.world.save()
+        for timestep in range(AHEAD):
+            action = self.act(change if timestep < HELD else CHANGES[0])
+            ((controls, ticks),) = self.env.begin_step(action)
+            self.env.car = self.world.step(controls, ticks)
+        end, self.env.car = self.env.car, begin
+        self.world.restore(moment)
+        damage = end.damage - begin.damage
+        way = end.distance_raced - begin.distance_raced + 0.5 * min(end.speed_x, 60.0)
+        return damage, way - PRICE * damage
+
+    def best_change(self):
+        """Choose a change if a hit is coming."""
+        if self.worth(CHANGES[0])[0] <= HIT:
+            return CHANGES[0]
+        return max(CHANGES, key=lambda change: self.worth(change)[1])
+
+
+def race(args, seed):
+    """Drive a race from the last place, and return the last info."""
+    order = np.random.default_rng(seed).permutation(len(ROBOTS))
+    kept = agent_record(args.agent, find_game()).env_kwargs
+    race = {"opponents": [ROBOTS[i] for i in order], "laps": args.laps, "max_episode_steps": -1}
+    race |= {"runoff": 30.0, "recovery": 60.0}  # who spins or leaves the road races on
+    env = gym.make("sb3_torcs:Torcs-v0", **{**kept, **race})
+    racer = Racer(load_driver(args.agent, env), env.unwrapped)
+    env.reset(seed=seed)
+    timestep, over, change = 0, False, CHANGES[0]
+    while not over:
+        if timestep % LOOK == 0 and not args.blind:
+            change = racer.best_change()
+        _, _, ended, cut, info = env.step(racer.act(change))
+        timestep, over = timestep + 1, ended or cut
+    env.close()
+    return info
+
+
+def main() -> None:
+    args = parser.parse_args()
+    for seed in range(args.races):
+        end = race(args, seed)
+        place, damage = end["car"].race_position, end["damage"]
+        print(f"race {seed}: place {place}, {damage:.0f} points of damage, ended by {end['end']}")
+
+
+if __name__ == "__main__":
+    main()
