@@ -66,9 +66,9 @@ def race(args, seed):
     """Drive a race from the last place, and return the last info."""
     order = np.random.default_rng(seed).permutation(len(ROBOTS))
     kept = agent_record(args.agent, find_game()).env_kwargs
-    race = {"opponents": [ROBOTS[i] for i in order], "laps": args.laps, "max_episode_steps": -1}
-    race |= {"runoff": 30.0, "recovery": 60.0}  # who spins or leaves the road races on
-    env = gym.make("sb3_torcs:Torcs-v0", **{**kept, **race})
+    options = {"opponents": [ROBOTS[i] for i in order], "laps": args.laps, "max_episode_steps": -1}
+    options |= {"runoff": 30.0, "recovery": 60.0}  # who spins or leaves the road races on
+    env = gym.make("sb3_torcs:Torcs-v0", **{**kept, **options})
     racer = Racer(load_driver(args.agent, env), env.unwrapped)
     env.reset(seed=seed)
     timestep, over, change = 0, False, CHANGES[0]

@@ -3,15 +3,14 @@
 import argparse
 import functools
 import json
-import os
 import time
 from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
-import torch as th
 from matplotlib.figure import Figure
 
+from sb3_torcs import cores
 from sb3_torcs.bench.torcs import scripted_actions
 from sb3_torcs.bench.updates import default_model
 from sb3_torcs.policies.updates import LeanUpdates
@@ -73,17 +72,16 @@ def driving(races, threads, seconds, **env_kwargs):
 
 
 def learning(batch, seconds):
-    """Return the transitions per second of the default DDPG's updates, on one thread."""
-    th.set_num_threads(1)
+    """Return the transitions per second of the default DDPG's updates, on one core."""
     entry = {**read_entry(config_file("ddpg"), "Torcs-v0"), "batch_size": batch}
     updates = LeanUpdates(default_model(entry))
-    return batch * rate(lambda: updates.train(1, batch), seconds)
+    with cores.at_most(1):
+        return batch * rate(lambda: updates.train(1, batch), seconds)
 
 
 def measure(seconds):
     """Measure all three."""
-    cores = len(os.sched_getaffinity(0))
-    threads = [number for number in (1, 2, 4, 8, 16) if number <= cores]
+    threads = [number for number in (1, 2, 4, 8, 16) if number <= cores.number()]
     return {
         "races": {
             str(number): [driving(races, number, seconds) for races in RACES] for number in threads

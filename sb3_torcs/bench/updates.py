@@ -44,13 +44,14 @@ def default_updates(seconds: float) -> Figures:
     """
     entry = read_entry(config_file("ddpg"), "Torcs-v0")
     model = default_model(entry)
-    with one_thread(), cores.at_most(1):
-        figures = _on_one_core(model, entry, seconds)
-    return {**figures, "ddpg_two_threads_ratio": _gain(model, seconds)}
+    updates = LeanUpdates(model)
+    with cores.at_most(1), one_thread():
+        figures = _on_one_core(updates, entry["policy_kwargs"], seconds)
+    return {**figures, "ddpg_two_threads_ratio": _gain(updates, seconds)}
 
 
-def _on_one_core(model: DDPG, entry: dict[str, Any], seconds: float) -> Figures:
-    updates, batch_size = LeanUpdates(model), model.batch_size
+def _on_one_core(updates: LeanUpdates, policy_kwargs: dict[str, Any], seconds: float) -> Figures:
+    batch_size = updates.model.batch_size
     rows, inner, columns = PRODUCT
     a, b, out = th.rand(rows, inner), th.rand(inner, columns), th.empty(rows, columns)
 
@@ -74,21 +75,20 @@ def _on_one_core(model: DDPG, entry: dict[str, Any], seconds: float) -> Figures:
     return {
         "core_gflops": 2e-9 * rows * inner * columns * PRODUCTS_PER_TURN / products,
         "ddpg_updates_per_s": UPDATES_PER_TURN / update,
-        "ddpg_update_gflop": 2e-9 * batch_size * products_of_an_update(entry["policy_kwargs"]),
+        "ddpg_update_gflop": 2e-9 * batch_size * products_of_an_update(policy_kwargs),
     }
 
 
-def _gain(model: DDPG, seconds: float) -> float | None:
+def _gain(updates: LeanUpdates, seconds: float) -> float | None:
     """Compare turns of updates on two threads with turns on one."""
     if cores.number() == 1:
         return None
-    updates = LeanUpdates(model)
     spent: dict[int, list[float]] = {1: [], 2: []}
     while sum(map(sum, spent.values())) < seconds / 2:
         for number, times in spent.items():
             with cores.at_most(number):
                 begin = time.perf_counter()
-                updates.train(UPDATES_PER_TURN, model.batch_size)
+                updates.train(UPDATES_PER_TURN, updates.model.batch_size)
                 times.append(time.perf_counter() - begin)
     return min(spent[1]) / min(spent[2])
 

@@ -161,7 +161,7 @@ def _bundled_tracks() -> Check:
 
 def _video_encoder() -> Check:
     try:
-        import imageio_ffmpeg  # type: ignore[import-untyped]
+        import imageio_ffmpeg
 
         return Check("video encoder", True, imageio_ffmpeg.get_ffmpeg_exe(), None)
     except (ImportError, RuntimeError) as error:

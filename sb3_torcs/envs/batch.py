@@ -163,8 +163,8 @@ class Batch:
                     self._in_python.append((race, i, term, weight))
         self._names = [tuple(name for name, _, _ in reward.terms) for reward in self._rewards]
 
-    def begin(self) -> None:
-        """Leave what earlier outcomes look at to them, before races are taken over."""
+    def renew(self) -> None:
+        """Take an array of its own before races are taken over: earlier outcomes look at this."""
         self._cars = self._cars.copy()
 
     def enter(self, race: int) -> None:

@@ -37,6 +37,7 @@ PLACES = (
     ("-conf", "--conf-file"), ("-uuid", "--uuid"),
 )  # fmt: skip
 """Options of the zoo that decide where things are; ours say the same."""
+CHANGES = ("-params", "--hyperparams")  # the zoo's names of its changes to an entry
 
 
 @dataclasses.dataclass(frozen=True)
@@ -209,7 +210,7 @@ def _changes(zoo_args: Sequence[str]) -> dict[str, Any]:
     from rl_zoo3.utils import StoreDict
 
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
-    parser.add_argument("-params", "--hyperparams", nargs="+", action=StoreDict, default={})
+    parser.add_argument(*CHANGES, nargs="+", action=StoreDict, default={})
     parser.add_argument("--env-kwargs", nargs="+", action=StoreDict)
     parser.add_argument("--n-eval-envs", type=int, default=1)
     for names in PLACES:
@@ -421,7 +422,7 @@ def _without_recorded(
 ) -> tuple[str, ...]:
     """Leave out the changes of an entry that a record holds; it holds no classes, for one."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("-params", "--hyperparams", nargs="+", default=[])
+    parser.add_argument(*CHANGES, nargs="+", default=[])
     known, words = parser.parse_known_args(zoo_args)
     missing = object()
     unknown = {

@@ -293,7 +293,7 @@ class TorcsVecEnv(DummyVecEnv):
     def _enter(self) -> None:
         """Take the states of all races over from their environments."""
         assert self._batch is not None
-        self._batch.begin()
+        self._batch.renew()
         for i in range(self.num_envs):
             self._enter_race(i)
         self._driving = True
