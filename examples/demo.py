@@ -149,7 +149,7 @@ def clear(folder: Path) -> None:
 
 
 def train(folder: Path, wanted: int, done: int, seed: int) -> bool:
-    """Learn from the timesteps that are still wanted; say whether Ctrl-C ended it."""
+    """Learn from the timesteps that are still wanted; say whether Ctrl-C or SIGTERM ended it."""
     before, course = runs(folder), course_of(folder)
     (folder / STATE).write_text(json.dumps({"timesteps": wanted}))
     options = TrainOptions(
@@ -169,7 +169,7 @@ def train(folder: Path, wanted: int, done: int, seed: int) -> bool:
     try:
         # The zoo's tables would break the progress bar.
         with (folder / LOG).open("a", buffering=1) as log, contextlib.redirect_stdout(log):
-            interrupted = train_run(options).interrupted
+            interrupted = train_run(options).signal is not None
     except KeyboardInterrupt:  # before the first timestep, or a third time
         interrupted = True
     return interrupted

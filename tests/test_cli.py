@@ -963,6 +963,14 @@ def test_a_training_in_processes_that_is_ended_from_outside_keeps_what_it_learne
     assert models.find_model(folder, prefer_last=True).name == "TorcsLite-v0.zip"
 
 
+@pytest.mark.parametrize("by", [signal.SIGINT, signal.SIGTERM])
+def test_a_training_that_a_signal_has_ended_says_which(monkeypatch, capsys, tmp_path, by):
+    run = training_run.Run(tmp_path, 80, 100, by, tmp_path / "TorcsLite-v0.zip", {})
+    monkeypatch.setattr("sb3_torcs.cli.train.train_run", lambda _: run)
+    status = main(["train", "--algo", "ddpg"])
+    assert (status, "go on with:" in capsys.readouterr().out) == (128 + by, True)
+
+
 @pytest.mark.slow
 def test_the_shipped_hyperparameters_train(tmp_path):
     run_folder = training_run.train(TrainOptions(timesteps=150, folder=tmp_path, progress=False))

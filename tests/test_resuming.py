@@ -4,6 +4,7 @@ import dataclasses
 import pickle
 import shlex
 import shutil
+import signal
 
 import pytest
 import yaml
@@ -68,7 +69,7 @@ def test_the_command_to_go_on_leaves_out_what_is_recorded(run, tmp_path):
     options = TrainOptions("ppo", entry="mine", conf_file=run.parents[1] / "own.yml")
     options = dataclasses.replace(options, folder=tmp_path, progress=False, zoo_args=words)
     model = run / "TorcsLite-v0.zip"
-    command = shlex.split(going_on(options, Run(run, 80, 100, True, model, {})))
+    command = shlex.split(going_on(options, Run(run, 80, 100, signal.SIGINT, model, {})))
     assert not {"--entry", "--conf-file"} & set(command)
     assert command[-5:] == ["--", "--save-freq", "50", "--hyperparams", "gamma:0.5"]
     entry = gone_on(run, tmp_path, *command[2:])

@@ -196,7 +196,7 @@ class Dashboard:
         _needle(picture, box(178, 54, 150, 10), controls.steering)
         self._small.write(picture, "steering", at(253, 68), MUTED, 0.5)
         for x, label, value, colour in (
-            (348, "gas", controls.throttle, GREEN),
+            (348, "thr", controls.throttle, GREEN),
             (382, "brk", controls.brake, RED),
         ):
             _bar(picture, box(x, 14, 20, 50), value, colour, upright=True)

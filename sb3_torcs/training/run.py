@@ -92,7 +92,7 @@ class Run:
     folder: Path
     timesteps: int  # that it learned from
     wanted: int  # timesteps that were asked for
-    interrupted: bool
+    signal: int | None  # that ended it early, e.g. SIGINT of Ctrl-C
     last_model: Path | None  # None after a search of hyperparameters
     env_kwargs: Mapping[str, Any]  # of its environments
 
@@ -356,20 +356,22 @@ def _run_zoo(
     except (OSError, WorkerLost, TrainingDiverged) as error:
         if not managers:
             raise
-        raise _told(error, _result(managers[0], wanted, env_kwargs, False), options) from error
-    return _result(managers[0], wanted, env_kwargs, bool(seen))
+        raise _told(error, _result(managers[0], wanted, env_kwargs, None), options) from error
+    return _result(managers[0], wanted, env_kwargs, seen[0] if seen else None)
 
 
-def _result(manager: Manager, wanted: int, env_kwargs: Mapping[str, Any], interrupted: bool) -> Run:
+def _result(
+    manager: Manager, wanted: int, env_kwargs: Mapping[str, Any], signal: int | None
+) -> Run:
     """Read the result of a training from its folder."""
     from sb3_torcs.agents.models import saved_timesteps
 
     if manager.optimize_hyperparameters:
-        return Run(Path(manager.log_path), 0, wanted, interrupted, None, env_kwargs)
+        return Run(Path(manager.log_path), 0, wanted, signal, None, env_kwargs)
     folder = Path(manager.save_path)
     last_model = folder / f"{manager.env_name}.zip"
     timesteps = saved_timesteps(last_model) if last_model.is_file() else 0
-    return Run(folder, timesteps, wanted, interrupted, last_model, env_kwargs)
+    return Run(folder, timesteps, wanted, signal, last_model, env_kwargs)
 
 
 def _told(
