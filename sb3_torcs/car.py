@@ -103,22 +103,23 @@ def is_number(value: Any) -> bool:
         return False
 
 
-def is_count(value: Any) -> bool:
-    """Whether a value is a whole number of at least 1, NumPy's included; a bool is none."""
-    return not isinstance(value, bool) and isinstance(value, Integral) and int(value) >= 1
+def is_count(value: Any, least: int = 1) -> bool:
+    """Whether a value is a whole number, NumPy's included, and not too small; a bool is none."""
+    return not isinstance(value, bool) and isinstance(value, Integral) and int(value) >= least
 
 
-def check_count(name: str, value: Any, most: int | None = None) -> None:
+def check_count(name: str, value: Any, most: int | None = None, *, least: int = 1) -> None:
     """
-    Make sure that an option is a whole number of at least 1.
+    Make sure that an option is a whole number within bounds.
 
     :param name: of the option
     :param value: what was given
     :param most: that it may be; ``None`` is any number
+    :param least: that it may be
     :raises InvalidOption: if it is not
     """
-    if not is_count(value):
-        raise InvalidOption(f"{name} is {value!r}; expected a whole number >= 1")
+    if not is_count(value, least):
+        raise InvalidOption(f"{name} is {value!r}; expected a whole number >= {least}")
     if most is not None and value > most:
         raise InvalidOption(f"{name} is {value!r}; expected at most {most}")
 

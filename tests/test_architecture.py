@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ast
 import configparser
+import fnmatch
 import importlib
 import io
 import re
@@ -201,6 +202,26 @@ def test_the_walk_sees_lazy_imports_and_skips_those_for_types():
 
 def test_a_circle_is_found():
     assert in_circle({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}) == ["a", "b", "c"]
+
+
+def floor_plan() -> dict[str, str]:
+    """What docs/architecture.md says of each room."""
+    block = (PACKAGE.parent / "docs/architecture.md").read_text("utf-8").split("```")[1]
+    return {
+        text.split()[0].rstrip("/"): text
+        for text in re.split(r"\n {2}(?=\w)", block)
+        if text.strip()
+    }
+
+
+def test_every_module_stands_in_the_floor_plan():
+    plan = floor_plan()
+    for path in FILES:
+        if path.parent != PACKAGE and not path.stem.startswith("__") and room(path) != "cli":
+            words = re.findall(r"[\w*]+", plan[room(path)])
+            assert any(fnmatch.fnmatch(path.stem, word) for word in words), path
+    rooms = {room(path) for path in FILES} - {"__init__", "progress", "zoo"}  # older places
+    assert set(plan) == rooms
 
 
 def test_each_room_stands_on_one_floor():

@@ -384,7 +384,8 @@ def test_evaluation_keeps_its_reward_unless_asked(also_eval, expected):
     ("callback", "options", "message"),
     [
         (RewardCallback, {"reward": "progres"}, "did you mean 'progress'"),
-        (RewardCallback, {"reward": "blog", "timesteps": -1}, "pass a whole number"),
+        (RewardCallback, {"reward": "blog", "timesteps": -1}, "a whole number >= 0"),
+        (RewardCallback, {"reward": "blog", "timesteps": False}, "a whole number >= 0"),
         (RandomStartCallback, {"start": "rnadom"}, "expected 'grid' or 'random'"),
         (RandomStartCallback, {"speed": "fast"}, "expected 0 to 150 m/s"),
         (RandomStartCallback, {"hard": 50}, "share of hard starts is 50; expected 0 to 1"),

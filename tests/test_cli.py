@@ -856,6 +856,7 @@ def test_the_command_that_goes_on_means_the_same_options():
 
 @pytest.mark.parametrize(("name", "value", "least"), [
     ("timesteps", 0, 1), ("timesteps", -7, 1), ("eval_episodes", 0, 1), ("seed", -1, 0),
+    ("seed", 0.0, 0),
 ])  # fmt: skip
 def test_numbers_of_a_training_from_python_are_checked_too(tmp_path, name, value, least):
     with pytest.raises(
@@ -1096,6 +1097,15 @@ def test_the_doctor_survives_what_is_broken():
     assert (check.name, check.ok, check.found) == ("this", False, "RuntimeError: no luck")
 
 
+def test_the_doctor_finds_something_in_errors_that_name_no_remedy():
+    def check():
+        raise BackendUnavailable("the game will not load")
+
+    assert doctor._guarded(check, "game") == doctor.Check(
+        "game", False, "the game will not load", None
+    )
+
+
 def test_a_cache_that_cannot_be_written_is_told_with_what_to_type(capsys, monkeypatch):
     def refused(*_):
         raise RuntimeError("cannot cache function 'f': no locator available for file 'x.py'")
@@ -1161,11 +1171,14 @@ def test_evaluate_refuses_what_is_no_racing_environment(capsys, words, message):
 
 
 @pytest.mark.parametrize("verb", [["train"], ["evaluate", "scripted"]])
-def test_a_negative_seed_is_refused(capsys, verb):
+@pytest.mark.parametrize(
+    ("seed", "message"), [("-1", ">= 0"), ("²", ">= 0"), (str(2**32), "below 2**32")]
+)
+def test_a_seed_that_numpy_does_not_take_is_refused(capsys, verb, seed, message):
     with pytest.raises(SystemExit) as caught:
-        main([*verb, "--seed", "-1"])
+        main([*verb, "--seed", seed])
     assert caught.value.code == 2
-    assert "expected a whole number >= 0" in capsys.readouterr().err
+    assert f"'{seed}': expected a whole number {message}" in capsys.readouterr().err
 
 
 def test_a_training_without_environments_for_evaluations_is_refused(capsys, tmp_path):

@@ -260,8 +260,10 @@ def test_a_schedule_must_be_one_that_the_zoo_reads(tmp_path):
     ("gamma", "x", "a number from 0 to 1, e.g. 0.005"),
     ("gamma", float("nan"), "a number from 0 to 1, e.g. 0.005"),
     ("tau", "1e-3", "a number from 0 to 1, e.g. 0.005"),
-    ("learning_starts", "1e3", "a whole number >= 1, or 0"),
-    ("learning_starts", -1, "a whole number >= 1, or 0"),
+    ("learning_starts", "1e3", "a whole number >= 0"),
+    ("learning_starts", -1, "a whole number >= 0"),
+    ("learning_starts", False, "a whole number >= 0"),
+    ("gradient_steps", -1.0, "a whole number >= 1, or -1"),
     ("gradient_steps", 0, "a whole number >= 1, or -1"),
     ("env_kwargs", "dict(track='aalborg')", "'{key: value}'"),
 ])  # fmt: skip

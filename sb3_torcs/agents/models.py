@@ -174,11 +174,10 @@ def agent_record(driver: str | Path, game: Game | None) -> TrainingRecord:
         return driver_record(driver)
     except InvalidOption as error:
         if game is None:
-            missing = "there are no robots, since TORCS was not found"
-            raise InvalidOption(f"{error}; and {missing}; type: {INSTALL}") from None
-        what, _, advice = str(error).partition("; ")
-        hint = near_miss(str(driver), game.robots(), advice)
-        raise InvalidOption(f"{what}, and there is no robot '{driver}'{hint}") from None
+            no_robot = f"there are no robots, since TORCS was not found; type: {INSTALL}"
+        else:
+            no_robot = f"there is no robot '{driver}'{near_miss(str(driver), game.robots())}"
+        raise InvalidOption(f"{error}; and {no_robot}") from None
 
 
 def driver_name(driver: str | Path) -> str:

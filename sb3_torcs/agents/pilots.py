@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -54,6 +55,15 @@ class CarOfAnAgent:
         return {**self.record.kept(names), **self._aids}
 
 
+@dataclass
+class _Team:
+    """Agents with the same policy."""
+
+    driver: Any
+    members: list[int]  # their numbers
+    state: Any = None  # of a recurrent policy
+
+
 class Pilots:
     """
     The agents of a race that is loaded.
@@ -66,23 +76,22 @@ class Pilots:
     """
 
     def __init__(self, cars: Sequence[CarOfAnAgent], race: SharedRace, trust: bool = False) -> None:
-        self._race = race
         self._envs = [
             RaceCarEnv(seat, **car.kept(OF_THE_ENV))
             for car, seat in zip(cars, race.seats, strict=True)
         ]
-        self._teams: dict[str, list[int]] = {}
-        self._drivers: dict[str, Any] = {}
-        self._states: dict[str, Any] = {}
+        teams: dict[str, _Team] = {}
         for number, (car, env) in enumerate(zip(cars, self._envs, strict=True)):
-            self._teams.setdefault(car.driver, []).append(number)
-            if car.driver not in self._drivers:
-                if wrapped(env, car.record.hyperparameters, trust=trust) is not env:
-                    raise ModelMismatch(
-                        f"'{car.driver}' was trained behind a wrapper of its environment, which "
-                        "cannot be put around one car of several; race an agent without one"
-                    )
-                self._drivers[car.driver] = load_driver(car.driver, env, trust=trust)
+            if car.driver in teams:
+                teams[car.driver].members.append(number)
+                continue
+            if wrapped(env, car.record.hyperparameters, trust=trust) is not env:
+                raise ModelMismatch(
+                    f"'{car.driver}' was trained behind a wrapper of its environment, which "
+                    "cannot be put around one car of several; race an agent without one"
+                )
+            teams[car.driver] = _Team(load_driver(car.driver, env, trust=trust), [number])
+        self._teams = list(teams.values())
         self.failed: dict[int, str] = {}
         """Agents that were taken out of the race, and why."""
 
@@ -94,7 +103,8 @@ class Pilots:
         """
         for env in self._envs:
             env.reset(seed=seed)
-        self._states = {}
+        for team in self._teams:
+            team.state = None
         self.failed.clear()
 
     def act(self, tick: int) -> int:
@@ -105,28 +115,29 @@ class Pilots:
         :param tick: control ticks that have been driven
         :return: control ticks until the next agent has to be asked
         """
-        for driver, team in self._teams.items():
-            due = tick % self._envs[team[0]].action_repeat == 0
-            if due and any(number not in self.failed for number in team):
-                self._ask(driver, team, np.full(len(team), tick == 0))
+        for team in self._teams:
+            due = tick % self._envs[team.members[0]].action_repeat == 0
+            if due and any(number not in self.failed for number in team.members):
+                self._ask(team, tick == 0)
         return min(env.action_repeat - tick % env.action_repeat for env in self._envs)
 
-    def _ask(self, driver: str, team: list[int], begins: Any) -> None:
-        worlds = [self._race.world(number) for number in team]
+    def _ask(self, team: _Team, race_begins: bool) -> None:
+        """Ask a team's policy once, for all its cars."""
         seen = []
-        for number, world in zip(team, worlds, strict=True):
+        for number in team.members:
             env = self._envs[number]
-            env.car = world.engine.read(world.seat)
-            seen.append(env.view.encode(env.car, self._race.seats[number]))
+            env.car = env.seat.read()
+            seen.append(env.view.encode(env.car, env.seat))
+        begins = np.full(len(team.members), race_begins)
         try:
-            actions, self._states[driver] = self._drivers[driver].predict(
-                np.stack(seen), self._states.get(driver), begins, deterministic=True
+            actions, team.state = team.driver.predict(
+                np.stack(seen), team.state, begins, deterministic=True
             )
         except InvalidAction as error:
-            for number in team:
+            for number in team.members:
                 self._take_out(number, error)
             return
-        for number, world, action in zip(team, worlds, actions, strict=True):
+        for number, action in zip(team.members, actions, strict=True):
             if number in self.failed:
                 continue
             try:
@@ -134,12 +145,12 @@ class Pilots:
             except InvalidAction as error:
                 self._take_out(number, error)
                 continue
-            world.engine.hold(world.seat, *controls)
+            self._envs[number].seat.hold(controls)
 
     def _take_out(self, number: int, error: InvalidAction) -> None:
         """Take a car out of the race, and note why."""
         self.failed.setdefault(number, str(error))
-        self._race.seats[number].retire()
+        self._envs[number].seat.retire()
 
 
 class Crew:

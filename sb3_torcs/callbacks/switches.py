@@ -12,14 +12,13 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_torcs.callbacks.tree import callbacks_in, require_method
 from sb3_torcs.car import (
     StartName,
+    check_count,
     checked_delay,
     checked_factor,
     checked_hard_starts,
     checked_start,
     checked_start_speed,
-    is_count,
 )
-from sb3_torcs.errors import InvalidOption
 from sb3_torcs.rewards import Reward, RewardChoice
 
 __all__ = ["ConditionsCallback", "RandomStartCallback", "RewardCallback"]
@@ -66,8 +65,7 @@ class RewardCallback(_SwitchUser):
     ) -> None:
         super().__init__(verbose)
         Reward(reward)  # checked here, for a message of this process and not of a worker
-        if timesteps != 0 and not is_count(timesteps):
-            raise InvalidOption(f"timesteps is {timesteps!r}; pass a whole number >= 0")
+        check_count("timesteps", timesteps, least=0)
         self.reward = reward
         self.also_eval = also_eval
         self.timesteps = timesteps

@@ -8,7 +8,7 @@ import json
 import math
 import os
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -39,6 +39,7 @@ __all__ = [
     "table",
     "told_record",
     "warn_unless_known",
+    "whole_number",
 ]
 
 INTERRUPTED = 130
@@ -126,43 +127,27 @@ def warn_unless_known(driver: str, record: TrainingRecord) -> None:
         )
 
 
-def positive(text: str) -> int:
+def whole_number(least: int, bits: int | None = None) -> Callable[[str], int]:
     """
-    Read a whole number of at least 1, for argparse.
+    Make a type of argparse that reads a whole number.
 
-    :param text: from the command line
-    :return: the number
+    :param least: that it may be
+    :param bits: that it may have; ``None`` is any number
     """
-    number = int(text) if text.strip().lstrip("-").isdigit() else 0
-    if number < 1:
-        raise argparse.ArgumentTypeError(f"{text!r}: expected a whole number >= 1")
-    return number
+
+    def read(text: str) -> int:
+        number = int(text) if text.strip().isdecimal() else -1
+        if number < least:
+            raise argparse.ArgumentTypeError(f"{text!r}: expected a whole number >= {least}")
+        if bits is not None and number >= 1 << bits:
+            raise argparse.ArgumentTypeError(f"{text!r}: expected a whole number below 2**{bits}")
+        return number
+
+    return read
 
 
-def natural(text: str) -> int:
-    """
-    Read a whole number of at least 0, for argparse.
-
-    :param text: from the command line
-    :return: the number
-    """
-    number = int(text) if text.strip().isdigit() else -1
-    if number < 0:
-        raise argparse.ArgumentTypeError(f"{text!r}: expected a whole number >= 0")
-    return number
-
-
-def seed(text: str) -> int:
-    """
-    Read a seed, for argparse.
-
-    :param text: from the command line
-    :return: the seed, which NumPy takes
-    """
-    number = natural(text)
-    if number >= 2**32:
-        raise argparse.ArgumentTypeError(f"{text!r}: expected a whole number below 2**32")
-    return number
+positive, natural = whole_number(1), whole_number(0)
+seed = whole_number(0, bits=32)  # as NumPy takes
 
 
 def parsed_robots(names: str | None, game: Game) -> list[tuple[str, int]]:

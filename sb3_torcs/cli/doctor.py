@@ -120,9 +120,11 @@ def _guarded(check: Callable[[], Check], name: str | None = None) -> Check:
         return Check(name, False, f"{type(error).__name__}: {error}", fix)
 
 
-def _found_and_fix(error: Sb3TorcsError) -> tuple[str, str]:
-    """Split a message into what was found and what to do."""
-    found, _, remedy = str(error).rpartition("; ")
+def _found_and_fix(error: Sb3TorcsError) -> tuple[str, str | None]:
+    """Split a message into what was found and what to do, if it says that."""
+    found, cut, remedy = str(error).rpartition("; ")
+    if not cut:
+        return remedy, None
     typed = remedy.removeprefix("type: ")
     return found, typed if typed == remedy else typed.strip("`")
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from functools import partial
-from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ import numpy.typing as npt
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
-from sb3_torcs.car import CarState
+from sb3_torcs.car import CarState, check_count
 from sb3_torcs.envs.making import NO_LIMIT, checked_time_limit
 from sb3_torcs.envs.starts import RESET_OPTIONS, read_start
 from sb3_torcs.envs.torcs_race import RaceCarEnv, make_race
@@ -110,14 +109,15 @@ class TorcsParallelEnv(ParallelEnv[str, Observation, Action]):
         :raises EnvClosed: after ``close``
         """
         self._check_open("reset")
-        seed = _checked_seed(seed)
+        if seed is not None:
+            check_count("seed", seed, least=0)
         given = options if isinstance(options, Mapping) else {}
         options = {name: given[name] for name in RESET_OPTIONS if name in given}
         read_start(options, next(iter(self._envs.values())).track.length)  # before anything changes
         self._race.end()
         self.agents = []
         answers = {
-            name: env.reset(seed=None if seed is None else seed + number, options=options)
+            name: env.reset(seed=None if seed is None else int(seed) + number, options=options)
             for number, (name, env) in enumerate(self._envs.items())
         }
         self.agents = list(self.possible_agents)
@@ -189,14 +189,6 @@ class TorcsParallelEnv(ParallelEnv[str, Observation, Action]):
         self.agents = []
         for env in self._envs.values():
             env.close()
-
-
-def _checked_seed(seed: Any) -> int | None:
-    if seed is None:
-        return None
-    if isinstance(seed, bool) or not isinstance(seed, Integral) or seed < 0:
-        raise InvalidOption(f"seed is {seed!r}; expected a whole number >= 0, or None")
-    return int(seed)
 
 
 def _car(env: RaceCarEnv, failure: Exception | None) -> CarState:

@@ -17,7 +17,7 @@ from stable_baselines3.common.policies import BasePolicy
 from torch import nn
 
 from sb3_torcs.errors import ModelMismatch, PackageMissing
-from sb3_torcs.files import whole_file
+from sb3_torcs.files import IN_A_FOLDER, whole_file
 
 __all__ = ["INPUT", "OUTPUT", "export_actor"]
 
@@ -109,7 +109,7 @@ def export_actor(model: Any, path: str | os.PathLike[str]) -> Path:
     policy, statistics = _parts(model)
     _check_policy(policy, statistics)
     path = Path(path)
-    with whole_file(path, "choose a file in an existing folder that you may write to") as part:
+    with whole_file(path, IN_A_FOLDER) as part:
         part.write_bytes(_graph(_RawDriver(policy, statistics), policy.observation_space))
     return path
 

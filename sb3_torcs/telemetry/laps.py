@@ -21,8 +21,6 @@ MOST_SAMPLES = 5000  # of a lap; longer tracks get longer steps
 ROLLING = 10.0  # [m/s] from which a wheel's radius can be measured
 PEDAL_UP = 0.1  # [-] of a pedal's travel; below, a wheel rolls freely
 
-"""What is sampled of a lap besides the time."""
-
 
 @dataclass(frozen=True)
 class Lap:

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sb3_torcs.car import check_count, is_count
+from sb3_torcs.car import check_count
 from sb3_torcs.errors import InvalidOption, OutputNotWritable, TrainingDiverged, WorkerLost
 from sb3_torcs.files import listed, writable_folder
 from sb3_torcs.signals import counted_interrupts
@@ -153,8 +153,7 @@ def _check_numbers(options: TrainOptions) -> None:
     if options.timesteps is not None:
         check_count("timesteps", options.timesteps)
     check_count("eval_episodes", options.eval_episodes)
-    if not is_count(options.seed) and (options.seed != 0 or isinstance(options.seed, bool)):
-        raise InvalidOption(f"seed is {options.seed!r}; expected a whole number >= 0")
+    check_count("seed", options.seed, least=0)
 
 
 def _for_tensorboard(folder: str | Path) -> Path:

@@ -188,12 +188,12 @@ NUMBERS: tuple[tuple[tuple[str, ...], Callable[[Any], bool], str], ...] = (
     (("gamma", "tau", "gae_lambda"), _is_share, "a number from 0 to 1, e.g. 0.005"),
     (
         ("learning_starts",),
-        lambda value: is_count(value) or value == 0,
-        "a whole number >= 1, or 0",
+        lambda value: is_count(value, 0),
+        "a whole number >= 0",
     ),
     (
         ("gradient_steps",),
-        lambda value: is_count(value) or value == -1,
+        lambda value: is_count(value, -1) and value != 0,
         "a whole number >= 1, or -1",
     ),
 )

@@ -194,6 +194,12 @@ class TorcsVecEnv(DummyVecEnv):
         self._envs = envs
         self._driving = False
 
+    @property
+    def _open_batch(self) -> Batch:
+        if self._batch is None:
+            raise EnvClosed("step after close; make a new environment")
+        return self._batch
+
     def reset(self) -> VecEnvObs:
         """
         Begin an episode in each environment.
@@ -212,11 +218,10 @@ class TorcsVecEnv(DummyVecEnv):
         :raises InvalidAction: if there is not one action per environment, or one is invalid; then
             no race has been driven
         """
-        if self._batch is None:
-            raise EnvClosed("step after close; make a new environment")
+        batch = self._open_batch
         if not self._driving:
             self._enter()
-        timestep = self._drive(self._batch)
+        timestep = self._drive(batch)
         rewards = np.array(timestep.rewards, np.float32)
         dones = np.zeros(self.num_envs, np.bool_)
         infos: list[Any] = [RaceInfo(timestep, i) for i in range(self.num_envs)]
@@ -275,9 +280,8 @@ class TorcsVecEnv(DummyVecEnv):
 
     def _finish(self, i: int, timestep: Outcome) -> Any:
         """Take the last timestep of an episode through all wrappers; return what they return."""
-        assert self._batch is not None
         self._races[i].leave(int(self._elapsed[i]))
-        return self._batch.finish(i, timestep, partial(self._envs[i].step, self.actions[i]))
+        return self._open_batch.finish(i, timestep, partial(self._envs[i].step, self.actions[i]))
 
     def _go_on(self, i: int, answer: Any) -> tuple[Any, float, bool, dict[str, Any]]:
         """Begin the next episode; return what a timestep that ends one returns."""
@@ -292,16 +296,14 @@ class TorcsVecEnv(DummyVecEnv):
 
     def _enter(self) -> None:
         """Take the states of all races over from their environments."""
-        assert self._batch is not None
-        self._batch.renew()
+        self._open_batch.renew()
         for i in range(self.num_envs):
             self._enter_race(i)
         self._driving = True
 
     def _enter_race(self, i: int) -> None:
-        assert self._batch is not None
         self._elapsed[i], self._limits[i] = self._races[i].enter()
-        self._batch.enter(i)
+        self._open_batch.enter(i)
 
     def _leave(self) -> None:
         """Give the states of all races back to their environments."""
