@@ -8,9 +8,10 @@ from __future__ import annotations
 import contextlib
 import difflib
 import functools
+import inspect
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 __all__ = [
     "BackendUnavailable",
@@ -55,6 +56,8 @@ __all__ = [
     "ends_in_a_line",
     "near_miss",
     "renamed",
+    "unknown_argument",
+    "with_known_arguments",
     "with_new_names",
 ]
 
@@ -247,6 +250,35 @@ def near_miss(name: str, known: Iterable[str], advice: str = "") -> str:
     suggestion = [f"did you mean '{lowered[close[0]]}'?"] if close else []
     ending = " ".join([*suggestion, advice] if advice else suggestion)
     return f"; {ending}" if ending else ""
+
+
+def with_known_arguments(init: Function) -> Function:
+    """
+    Decorate a constructor: the error for an unknown argument names the one that was probably meant.
+
+    :param init: that takes keyword arguments
+    """
+    known = inspect.signature(init).parameters
+
+    @functools.wraps(init)
+    def checked(self: Any, *positional: Any, **arguments: Any) -> None:
+        for name in arguments:
+            if name not in known:
+                raise unknown_argument(type(self), name, known)
+        init(self, *positional, **arguments)
+
+    return cast("Function", checked)
+
+
+def unknown_argument(kind: type, name: str, known: Iterable[str]) -> TypeError:
+    """
+    Make the error for an argument that a class does not have.
+
+    :param kind: the class
+    :param name: of the argument
+    :param known: the names that it has
+    """
+    return TypeError(f"{kind.__name__} has no argument {name!r}{near_miss(name, known)}")
 
 
 def with_new_names(arguments: Mapping[str, Any], names: Mapping[str, str]) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from sb3_torcs.errors import OutputNotWritable, Sb3TorcsError
 
 __all__ = [
     "IN_A_FOLDER",
+    "import_advice",
     "listed",
     "path_and_arguments",
     "read_yaml",
@@ -30,6 +31,18 @@ IN_A_FOLDER = "choose a file in an existing folder that you may write to"
 MAX_LENGTH = 2**16  # [characters] PyYAML takes about a second for as many
 MAX_BRACKETS = 100  # open at once: PyYAML's time grows with their square
 MAX_NODES = 100_000  # after aliases are expanded
+
+
+def import_advice(module: str) -> str:
+    """
+    Tell what to do about a module that does not import.
+
+    :param module: its dotted path
+    """
+    top = module.partition(".")[0]
+    if Path(f"{top}.py").is_file() or Path(top).is_dir():
+        return f"'{top}' lies in this folder; type PYTHONPATH=. before the command"
+    return "install the package that it is in"
 
 
 def listed(value: Any) -> list[Any]:

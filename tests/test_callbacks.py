@@ -449,7 +449,7 @@ def test_a_training_that_goes_on_is_no_longer_young(reset):
 def test_gradient_steps_need_an_algorithm_with_a_replay():
     """PPO has none to set."""
     model = PPO("MlpPolicy", make_vec_env(ToyRace), n_steps=8, batch_size=8, device="cpu")
-    with pytest.raises(InvalidOption, match="off-policy algorithms, but the model is a PPO"):
+    with pytest.raises(InvalidOption, match="off-policy algorithms, but the model learns by PPO"):
         model.learn(8, callback=GradientStepsCallback(gradient_steps=2, timesteps=10))
 
 

@@ -435,7 +435,7 @@ NOT_IN_THE_PACKAGE = {  # Python's, Gymnasium's, SB3's, PyTorch's, the game's
     "True", "False", "None", "Box", "DDPG", "PPO", "SAC", "TD3", "DummyVecEnv", "SubprocVecEnv",
     "SyncVectorEnv", "RecordVideo", "TimeLimit", "VecNormalize", "Monitor", "MlpPolicy",
     "TD3Policy", "RecurrentPPO", "SCR", "Graphic",
-    "Wrapper", "RewardWrapper", "TimeAwareObservation",
+    "NormalizeObservation", "Wrapper", "RewardWrapper", "TimeAwareObservation",
     "learn", "predict", "render", "reset", "env_method", "make", "load", "set_num_threads",
     "parameters",
 }  # fmt: skip

@@ -8,6 +8,7 @@ from __future__ import annotations
 import inspect
 import os
 import pickle
+import re
 import signal
 import subprocess
 import sys
@@ -313,8 +314,13 @@ def test_the_world_without_a_game_knows_what_is_for_the_other():
         for env in (TorcsEnv, TorcsLiteEnv)
     )
     assert torcs - lite == set(OF_THE_GAME)
-    with pytest.raises(TypeError, match="unexpected keyword argument 'trak'"):
-        TorcsLiteEnv(trak="aalborg")
+
+
+@pytest.mark.parametrize("kind", [TorcsEnv, TorcsLiteEnv])
+def test_the_argument_that_was_meant_is_named(kind):
+    message = f"{kind.__name__} has no argument 'trak'; did you mean 'track'?"
+    with pytest.raises(TypeError, match=re.escape(message)):
+        kind(trak="aalborg")
 
 
 @pytest.mark.parametrize(

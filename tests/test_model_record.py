@@ -5,6 +5,8 @@ from __future__ import annotations
 import io
 import json
 import pickle
+import re
+import sys
 import zipfile
 
 import gymnasium as gym
@@ -23,6 +25,8 @@ from torch import nn
 import sb3_torcs  # noqa: F401  (registers the environments)
 from sb3_torcs.agents import model_file, model_policy, models
 from sb3_torcs.agents.model_writing import RecordCallback, recipe, write_driver
+from sb3_torcs.agents.wrapping import wrapped
+from sb3_torcs.cli import main
 from sb3_torcs.errors import (
     InvalidAction,
     InvalidOption,
@@ -30,6 +34,7 @@ from sb3_torcs.errors import (
     ModelNotTrusted,
     OutputNotWritable,
 )
+from sb3_torcs.evaluation.protocol import evaluate
 from sb3_torcs.policies import BoundedPolicy, SplitHeadPolicy
 from sb3_torcs.tracks.catalogue import load_track
 
@@ -473,3 +478,67 @@ def test_a_driver_keeps_the_statistics_of_what_it_sees(tmp_path):
         driver = models.load_driver(tmp_path / "driver.zip", env)
         found, _ = driver.predict(seen[:, :29], deterministic=True)
     np.testing.assert_array_equal(found, expected)
+
+
+class Sideways(gym.ActionWrapper):
+    """A wrapper of a script, which no command can import."""
+
+    def action(self, action):
+        return action[::-1]
+
+
+class Doubled(gym.RewardWrapper):
+    """A wrapper that changes the reward only, of which a driver needs to know nothing."""
+
+    def reward(self, reward):
+        return 2.0 * reward
+
+
+def behind(*wrappers):
+    """A short race behind wrappers, the innermost first."""
+    env = gym.make("TorcsLite-v0", action="pedal", max_episode_steps=20)
+    for wrapper in wrappers:
+        env = wrapper(env)
+    return env
+
+
+def test_gymnasium_s_wrappers_of_a_script_are_rebuilt(tmp_path):
+    """The innermost first, so that the model drives to the bit as behind them."""
+    wrappers = (
+        lambda env: gym.wrappers.FrameStackObservation(env, 3),
+        gym.wrappers.FlattenObservation,
+        lambda env: gym.wrappers.RescaleAction(env, -2, 3),
+        Doubled,
+    )
+    with behind(*wrappers) as env:
+        model = trained(PPO, "MlpPolicy", env, n_steps=8, batch_size=4)
+        model.save(tmp_path / "m.zip")
+        observation, _ = env.reset(seed=0)
+        for _ in range(20):
+            action, _ = model.predict(observation, deterministic=True)
+            observation, _, terminated, truncated, info = env.step(action)
+    assert terminated or truncated
+    record = models.training_record(tmp_path / "m.zip")
+    names = [
+        path.rpartition(".")[2] for item in record.hyperparameters["env_wrapper"] for path in item
+    ]
+    assert names == ["FrameStackObservation", "FlattenObservation", "RescaleAction"]
+    with behind() as bare:
+        env = wrapped(bare, record.hyperparameters)
+        (race,) = evaluate(env, models.load_driver(tmp_path / "m.zip", env))
+    assert race.distance == info["car"].distance_raced
+
+
+@pytest.mark.parametrize(("wrapper", "says"), [
+    (Sideways, "Sideways, a wrapper of a script, which nothing else can import"),
+    (gym.wrappers.NormalizeObservation, "learns statistics, which no model keeps; train with"),
+    (gym.wrappers.TimeAwareObservation, "a race has another; train without it"),
+])  # fmt: skip
+def test_wrappers_that_cannot_be_rebuilt_are_told(tmp_path, monkeypatch, capsys, wrapper, says):
+    monkeypatch.setattr(Sideways, "__module__", "__main__")
+    monkeypatch.setitem(sys.modules, "__main__", sys.modules[__name__])
+    with behind(wrapper) as env:
+        trained(PPO, "MlpPolicy", env, n_steps=8, batch_size=4).save(tmp_path / "m.zip")
+    status = main(["evaluate", str(tmp_path / "m.zip"), "--laps", "1"])
+    assert status == 2
+    assert re.search(says, capsys.readouterr().err)

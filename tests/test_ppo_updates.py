@@ -255,7 +255,7 @@ def test_no_such_first_factor(factor):
 
 
 def test_only_ppo_tells_a_divergence():
-    with pytest.raises(InvalidOption, match="the model is a A2C; take it out"):
+    with pytest.raises(InvalidOption, match="the model learns by A2C; take it out"):
         A2C("MlpPolicy", ToyRace()).learn(5, callback=AdaptiveLearningRateCallback())
     for kl in (0.0, -1.0, "small"):
         with pytest.raises(InvalidOption, match="pass a divergence above 0"):
@@ -293,5 +293,5 @@ def test_only_the_value_function_learns(others, first):
 
 def test_an_algorithm_without_such_a_value_function_is_told():
     model = SAC("MlpPolicy", ToyRace())
-    with pytest.raises(InvalidOption, match="is for PPO and A2C, but the model is a SAC"):
+    with pytest.raises(InvalidOption, match="is for PPO and A2C, but the model learns by SAC"):
         model.learn(1, callback=ValuesOnlyCallback())

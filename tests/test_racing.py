@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -307,6 +308,19 @@ def test_after_a_reset_that_failed_there_is_no_step(oval, monkeypatch):
         env.reset(options={"distance": 10.0})
     with pytest.raises(EnvClosed, match="call reset first"):
         env.step(GAS)
+
+
+def test_a_timestep_after_the_end_warns_once(oval):
+    """But not one from a moment before it, to which somebody has gone back."""
+    lost, fine = {"distance_from_axis": 20.0}, {}
+    env = RacingEnv(ScriptedBackend(oval, lost, fine, lost, lost, lost))
+    env.reset(seed=0)
+    assert [env.step(GAS)[2] for _ in range(3)] == [True, False, True]
+    with pytest.warns(UserWarning, match="step after the end of an episode"):
+        assert env.step(GAS)[2]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert env.step(GAS)[2]
 
 
 def test_an_environment_out_of_use_says_what_to_do(oval):

@@ -165,6 +165,21 @@ def test_the_table_shows_how_far_everybody_is_and_the_best_so_far(begun, monkeyp
     assert board.errors() == {"small-nets-seed1": "why"}
 
 
+def test_without_a_terminal_trials_that_begin_and_end_print_a_line(begun, capsys):
+    study, _ = begun
+    board = Board(study)
+    row = {"phase": "train", "decisions": 240, "kept": True, "laps": 3, "completes": True}
+    with board.shown():
+        board.update(study.trials[0], {"state": "running"})
+        board.update(study.trials[0], {**row, "best_flying_lap_s": 83.5})
+        board.update(study.trials[0], {"state": "done"})
+        board.update(study.trials[0], {"state": "done"})
+    assert capsys.readouterr().err.splitlines() == [
+        "small-nets-seed0: running, 0 of 1920 timesteps",
+        "small-nets-seed0: done, 240 of 1920 timesteps, laps 3, best lap 83.500 s",
+    ]
+
+
 def test_a_full_disk_is_told_and_leaves_everything_as_it_was(begun, tmp_path, monkeypatch, capsys):
     study, store = begun
     before = store.rows(study.trials[0])

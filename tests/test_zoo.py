@@ -169,7 +169,10 @@ def test_an_argument_of_the_policy_that_it_does_not_have_is_unknown(tmp_path):
 
 def test_a_callback_that_does_not_import_is_told_why(tmp_path):
     said = complaint(tmp_path, {"callback": "nowhere.Callback"})
-    assert said == "callback 'nowhere.Callback' does not import: No module named 'nowhere'"
+    assert said == (
+        "callback 'nowhere.Callback' does not import (No module named 'nowhere'); install the "
+        "package that it is in"
+    )
 
 
 def test_a_callback_that_is_not_in_its_module_is_told_the_near_miss(tmp_path):

@@ -6,6 +6,7 @@ import contextlib
 import io
 import json
 import os
+import sys
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,6 +17,7 @@ import numpy as np
 import stable_baselines3 as sb3
 import torch as th
 from gymnasium import spaces
+from gymnasium.envs.registration import WrapperSpec
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.save_util import data_to_json
@@ -38,6 +40,7 @@ from sb3_torcs.agents.model_record import (
     record_beside,
     record_within,
 )
+from sb3_torcs.agents.wrapping import LEFT_OUT
 from sb3_torcs.errors import InvalidOption, ModelNotTrusted
 from sb3_torcs.files import whole_file
 from sb3_torcs.policies.asymmetric import columns_of
@@ -77,7 +80,7 @@ class RecordCallback(BaseCallback):
     callbacks that save the model.
 
     :param asked: options of the training, of :func:`recipe`; ``None`` reads them from the
-        environment, which keeps the arguments of ``gym.make``
+        environment, which keeps the arguments of ``gym.make`` and Gymnasium's wrappers
     :param verbose: as in ``BaseCallback``
     """
 
@@ -229,6 +232,10 @@ def _recipe_of_environment(model: BaseAlgorithm) -> Recipe:
     seen = _frames_of(env)
     if spec is None:
         return recipe(algo, None, seen)
+    wrappers = [_wrapper_item(wrapper) for wrapper in spec.additional_wrappers]
+    wrappers = [item for item in wrappers if item is not None]
+    if wrappers:
+        seen["env_wrapper"] = wrappers
     kwargs = {name: value for name, value in spec.kwargs.items() if name != "render_mode"}
     tracks = kwargs.get("track")
     if isinstance(tracks, Track):
@@ -238,7 +245,21 @@ def _recipe_of_environment(model: BaseAlgorithm) -> Recipe:
     return recipe(algo, spec.id, {"env_kwargs": kwargs, **seen})
 
 
-def _frames_of(env: VecEnv) -> dict[str, int]:
+def _wrapper_item(spec: WrapperSpec) -> dict[str, Any] | None:
+    """
+    Compose the zoo's item of a wrapper that changes what is seen or done.
+
+    :param spec: what Gymnasium knows of it; own wrappers may not keep their arguments
+    :return: its dotted path with arguments; ``None`` if it changes neither
+    """
+    module, _, name = spec.entry_point.partition(":")
+    kind = getattr(sys.modules.get(module), name, None)
+    if name in LEFT_OUT or (isinstance(kind, type) and issubclass(kind, gym.RewardWrapper)):
+        return None
+    return {f"{module}.{name}": _plain_part(spec.kwargs or {})}
+
+
+def _frames_of(env: VecEnv) -> dict[str, Any]:
     """Tell of a frame stack, but of none within statistics: a driver has it around them."""
     stack, outer = (unwrap_vec_wrapper(env, kind) for kind in (VecFrameStack, VecNormalize))
     if outer is not None and outer.norm_obs and unwrap_vec_wrapper(outer, VecFrameStack):

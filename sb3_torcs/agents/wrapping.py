@@ -16,18 +16,28 @@ from gymnasium import spaces
 
 from sb3_torcs.agents.model_file import as_mismatch
 from sb3_torcs.errors import ModelMismatch, ModelNotTrusted, PackageMissing
-from sb3_torcs.files import listed, path_and_arguments
+from sb3_torcs.files import import_advice, listed, path_and_arguments
 
 __all__ = ["frames_of", "normalizes", "stacked_space", "unrebuilt", "wrapped"]
 
 TRUSTED_PACKAGES = ("sb3_torcs", "gymnasium", "stable_baselines3", "sb3_contrib", "rl_zoo3")
 """Whose wrappers a record may name: importing them, and putting them around, does no harm."""
 
-LEFT_OUT = {"TimeLimit", "Monitor", "RecordVideo", "RecordEpisodeStatistics", "UninterruptedWorker"}
+LEFT_OUT = {
+    "Monitor", "NormalizeReward", "OrderEnforcing", "PassiveEnvChecker", "RecordEpisodeStatistics",
+    "RecordVideo", "TimeLimit", "UninterruptedWorker",
+}  # fmt: skip
 """Wrappers that end or write down a training, and change nothing that is seen or done."""
 
-TIMED = {"TimeAwareObservation"}
-"""Wrappers that show how much of the time limit is over: a race has another one than a training."""
+REFUSED = {
+    "TimeAwareObservation": "shows a training's time limit, and a race has another; train without "
+    "it",
+    "NormalizeObservation": "learns statistics, which no model keeps; train with SB3's "
+    "VecNormalize",
+}
+"""Wrappers that would show something else than in the training, and why."""
+
+SCRIPT = "__main__"
 
 PASSING_ON = {"MirrorVecEnv", "VecMonitor", "VecCheckNan", "VecNormalize", "VecVideoRecorder"}
 """Wrappers of vectors that leave a single car as it is, or whose statistics are kept with the
@@ -58,10 +68,8 @@ def wrapped(
         name = path.rpartition(".")[2]
         if name in LEFT_OUT:
             continue
-        if name in TIMED:
-            raise ModelMismatch(
-                f"{path} shows a training's time limit, and a race has another; train without it"
-            )
+        if name in REFUSED:
+            raise ModelMismatch(f"{path} {REFUSED[name]}")
         wrapper = _imported(path, trust)
         with as_mismatch(f"the training's wrapper {path} does not go around the car", "give"):
             env = wrapper(env, **kwargs)
@@ -144,6 +152,12 @@ def _items(hyperparameters: Mapping[str, Any], key: str) -> Iterator[tuple[str, 
 def _imported(path: str, trust: bool) -> Any:
     """Import a wrapper by its dotted path."""
     module, _, name = path.rpartition(".")
+    if module == SCRIPT:
+        raise ModelMismatch(
+            f"the model was trained behind {name}, a wrapper of a script, which nothing else can "
+            "import; put it into a module, or evaluate the model in the script, by evaluate_policy "
+            "of SB3"
+        )
     if module.partition(".")[0] not in TRUSTED_PACKAGES and not trust:
         raise ModelNotTrusted(
             f"the model was trained behind the wrapper {path}, and importing it runs its code; if "
@@ -154,7 +168,7 @@ def _imported(path: str, trust: bool) -> Any:
     except (ImportError, AttributeError, ValueError) as error:
         raise PackageMissing(
             f"the model was trained behind the wrapper {path}, which does not import ({error}); "
-            "install the package that it is in"
+            f"{import_advice(module)}"
         ) from error
     if not (isinstance(found, type) and issubclass(found, gym.Wrapper)):
         raise ModelMismatch(

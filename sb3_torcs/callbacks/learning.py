@@ -121,7 +121,7 @@ class GradientStepsCallback(_WhileLearning):
         if not isinstance(self.model, OffPolicyAlgorithm):
             raise InvalidOption(
                 f"{type(self).__name__} sets the gradient steps of off-policy algorithms, but the "
-                f"model is a {type(self.model).__name__}; take it out of the callbacks"
+                f"model learns by {type(self.model).__name__}; take it out of the callbacks"
             )
         self._algorithm, self._own = self.model, self.model.gradient_steps
 
@@ -159,8 +159,8 @@ class LeanUpdatesCallback(_WhileLearning):
         else:
             raise InvalidOption(
                 f"{type(self).__name__} updates PPO, and DDPG and TD3 with SplitHeadPolicy, but "
-                f"the model is a {type(model).__name__} with {type(model.policy).__name__}; take "
-                "it out of the callbacks"
+                f"the model learns by {type(model).__name__} with {type(model.policy).__name__}; "
+                "take it out of the callbacks"
             )
 
     def _on_rollout_start(self) -> None:
@@ -228,8 +228,8 @@ class AdaptiveLearningRateCallback(_WhileLearning):
     def _on_training_start(self) -> None:
         if not isinstance(self.model, PPO):
             raise InvalidOption(
-                f"{type(self).__name__} reads the divergence that PPO logs, but the model is a "
-                f"{type(self.model).__name__}; take it out of the callbacks"
+                f"{type(self).__name__} reads the divergence that PPO logs, but the model learns "
+                f"by {type(self.model).__name__}; take it out of the callbacks"
             )
         self._own = self.model.lr_schedule
 
@@ -275,7 +275,7 @@ class ValuesOnlyCallback(BaseCallback):
         policy = self.model.policy
         if not isinstance(policy, ActorCriticPolicy):
             raise InvalidOption(
-                f"{type(self).__name__} is for PPO and A2C, but the model is a "
+                f"{type(self).__name__} is for PPO and A2C, but the model learns by "
                 f"{type(self.model).__name__}; take it out of the callbacks"
             )
         parts = policy.mlp_extractor.value_net, policy.value_net

@@ -5,7 +5,9 @@ from __future__ import annotations
 import argparse
 import contextlib
 import shlex
-from collections.abc import Iterator, Mapping
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -109,13 +111,15 @@ def _command(args: argparse.Namespace) -> str:
 
 class Board:
     """
-    A table with the progress and the best lap of each trial.
+    The progress and the best lap of each trial: a table on a terminal, elsewhere a line for each
+    trial that begins or ends.
 
     :param study: whose trials they are
     """
 
     def __init__(self, study: Study) -> None:
         self._study = study
+        self._tell: Callable[[str], None] | None = None  # where there is no terminal
         self._rows: dict[str, dict[str, Any]] = {
             trial.name: {"state": "waits", "decisions": 0} for trial in study.trials
         }
@@ -128,7 +132,10 @@ class Board:
         :param row: of its results, or its state
         """
         line = self._rows[trial.name]
+        before = line["state"]
         line.update({key: row[key] for key in ("state", "error") if key in row})
+        if self._tell is not None and line["state"] != before:
+            self._tell(_told(trial, line))
         if row.get("phase") == "train":
             line["decisions"] = row["decisions"]
             if row["kept"]:
@@ -156,12 +163,13 @@ class Board:
 
     @contextlib.contextmanager
     def shown(self) -> Iterator[None]:
-        """Keep the table on standard error up to date, if that is a terminal."""
+        """Keep standard error up to date."""
         from rich.console import Console
         from rich.live import Live
 
         console = Console(stderr=True)
         if not console.is_terminal:
+            self._tell = partial(print, file=sys.stderr, flush=True)
             yield
             return
         # Drawn by the clock and not for each row: a continued study reads hundreds of rows at once.
@@ -185,3 +193,13 @@ class Board:
                 row["state"],
             )
         return table
+
+
+def _told(trial: Trial, line: Mapping[str, Any]) -> str:
+    """Compose the line of a trial whose state has changed."""
+    said = f"{trial.name}: {line['state']}, {line['decisions']} of {trial.budget} timesteps"
+    if "laps" in line:
+        said += f", laps {line['laps']}"
+    if line.get("best_flying_lap_s"):
+        said += f", best lap {line['best_flying_lap_s']:.3f} s"
+    return said

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import astuple
+from numbers import Real
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -350,9 +351,10 @@ class Batch:
             if fits and read_actions(np.ascontiguousarray(asked), low, high, controls):
                 return controls
         rows = list(asked) if isinstance(asked, Iterable) else [asked]
-        if len(rows) != len(self.envs):
+        what = "numbers" if all(isinstance(row, Real) for row in rows) else "actions"
+        if what == "numbers" or len(rows) != len(self.envs):
             raise InvalidAction(
-                f"{len(rows)} actions for {len(self.envs)} races; expected shape "
+                f"{len(rows)} {what} for {len(self.envs)} races; expected shape "
                 f"({len(self.envs)}, {len(low)}), as of model.predict(observations)"
             )
         for race, row in enumerate(rows):

@@ -197,6 +197,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         self._controls = Controls(0.0, 0.0, 0.0)
         self._viewer: Any = None
         self._closed = self._race_is_over = False
+        self._over = self._warned = False
 
     def __getstate__(self) -> dict[str, Any]:
         # pygame's surfaces cannot be pickled; a copy makes its own.
@@ -296,7 +297,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         :return: the observation and ``info``
         """
         if self._closed:
-            raise EnvClosed("reset after close; make a new environment with gym.make")
+            raise EnvClosed("reset after close; make a new environment")
         super().reset(seed=seed)
         self.car = None  # if the reset fails, no step is possible
         if self._draw_track is not None:
@@ -318,7 +319,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         grace = STUCK_TICKS if start is not None and start.speed > 0.0 else GRACE_TICKS
         self.patience = max(grace, self.recovery_ticks)
         self.standing = 0
-        self._race_is_over = False
+        self._race_is_over = self._over = False
         if self.render_mode == "human":
             self.render()
         seen = self.view.encode(self.car, self.backend)
@@ -335,8 +336,17 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         :return: observation, reward, terminated, truncated, info
         :raises InvalidAction: if the action has another shape or is not a number
         """
+        was_over = self._over
         parts = self.begin_step(action)
-        return self.finish_step(partial(self._hold, parts))
+        result = self.finish_step(partial(self._hold, parts))
+        # Whoever has gone back to a saved moment may step on.
+        if was_over and self._over and not self._warned:
+            self._warned = True
+            gym.logger.warn(
+                "step after the end of an episode, where rewards mean nothing; call reset when "
+                "terminated or truncated is true"
+            )
+        return result
 
     def _hold(self, parts: list[Part]) -> CarState:
         """Drive what ``begin_step`` returned."""
@@ -379,7 +389,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         :raises EnvClosed: before a reset and after ``close``
         """
         if self._closed:
-            raise EnvClosed(f"{what} after close; make a new environment with gym.make")
+            raise EnvClosed(f"{what} after close; make a new environment")
         if self.car is None:
             raise EnvClosed(f"{what} before reset; call reset first")
 
@@ -415,6 +425,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
             self.render()
         truncated = end in TRUNCATING
         terminated = end is not None and not truncated
+        self._over = end is not None
         seen = self.view.encode(after, self.backend)
         return seen, sum(terms.values()), terminated, truncated, info
 

@@ -26,7 +26,7 @@ from sb3_torcs.car import (
 )
 from sb3_torcs.envs.racing import RacingEnv, RenderMode
 from sb3_torcs.envs.torcs_race import make_shared_race
-from sb3_torcs.errors import InvalidOption, UnknownRobot
+from sb3_torcs.errors import InvalidOption, UnknownRobot, with_known_arguments
 from sb3_torcs.rewards import RewardChoice
 from sb3_torcs.sensors import SensorsName
 from sb3_torcs.torcs.installation import find_game
@@ -122,6 +122,7 @@ class TorcsEnv(RacingEnv):
         "render_modes": [*get_args(GameRenderMode)],
     }
 
+    @with_known_arguments
     def __init__(
         self,
         *,

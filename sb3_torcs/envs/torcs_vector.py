@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from functools import partial
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -103,9 +104,10 @@ class TorcsVectorEnv(SyncVectorEnv):
         if self.closed:
             raise EnvClosed("step after close; make new environments with gym.make_vec")
         rows = list(actions) if isinstance(actions, Iterable) else [actions]
-        if len(rows) != self.num_envs:
+        what = "numbers" if all(isinstance(row, Real) for row in rows) else "actions"
+        if what == "numbers" or len(rows) != self.num_envs:
             raise InvalidAction(
-                f"{len(rows)} actions for {self.num_envs} races; expected shape "
+                f"{len(rows)} {what} for {self.num_envs} races; expected shape "
                 f"{self.action_space.shape}: take them from envs.action_space.sample()"
             )
         anew = self._begin_anew()

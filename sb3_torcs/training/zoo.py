@@ -25,7 +25,7 @@ from sb3_torcs.agents.model_algorithm import SBX, algorithm_class
 from sb3_torcs.agents.wrapping import normalizes, unrebuilt, wrapped
 from sb3_torcs.car import is_count, look_both_ways, range_finder_angles
 from sb3_torcs.errors import InvalidOption, ModelMismatch, ZooConfigError, near_miss
-from sb3_torcs.files import listed, path_and_arguments, read_yaml
+from sb3_torcs.files import import_advice, listed, path_and_arguments, read_yaml
 from sb3_torcs.training.zoo_data import (
     as_data,
     check_class,
@@ -408,7 +408,9 @@ def _imported(path: str, key: str, place: Place) -> Callable[..., Any]:
     try:
         module = importlib.import_module(module_name)
     except (ImportError, ValueError) as error:
-        raise ZooConfigError(f"{place}: {key} '{path}' does not import: {error}") from error
+        raise ZooConfigError(
+            f"{place}: {key} '{path}' does not import ({error}); {import_advice(module_name)}"
+        ) from error
     if not hasattr(module, name):
         raise ZooConfigError(
             f"{place}: {key} '{path}': {module_name} has no '{name}'"
