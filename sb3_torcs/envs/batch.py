@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import astuple
+from functools import partial
 from numbers import Real
 from typing import Any, NamedTuple
 
@@ -21,7 +22,13 @@ from sb3_torcs.backends.seats import SeatWorld
 from sb3_torcs.backends.several import present_world
 from sb3_torcs.car import CAR_RECORD, CarState, Controls, FloatArray, car_from_record
 from sb3_torcs.envs.aids import AIDS
-from sb3_torcs.envs.compiled import COMPILED, aid_cars, read_actions, value_timesteps
+from sb3_torcs.envs.compiled import (
+    COMPILED,
+    RULES,
+    aid_cars,
+    read_actions,
+    value_timesteps,
+)
 from sb3_torcs.envs.racing import RacingEnv, racing_info
 from sb3_torcs.errors import CarLost, InvalidAction, InvalidOption
 from sb3_torcs.rewards import Term
@@ -48,8 +55,7 @@ class Outcome(NamedTuple):
     rewards: list[float]
     terms: list[list[float]]  # of the rewards, in the order of `names`
     names: list[tuple[str, ...]]  # of the terms
-    standing: Counts  # (n,) control ticks for which cars had been standing before
-    patience: Counts  # (n,) control ticks for which they were allowed to stand
+    rules: npt.NDArray[np.void]  # (n,) of RULES, before
     waiting: list[tuple[Controls, ...]]  # controls that had not arrived before, of each race
     ended: npt.NDArray[np.bool_]  # (n,) also if the race has failed; time limits are not known here
     failures: dict[int, Exception]  # the errors of races, by index
@@ -78,31 +84,19 @@ class Outcome(NamedTuple):
         terms["crash"] = 0.0
         return number(race, SPEED_X), number(race, LAST_LAP_TIME) if has_lapped else 0.0, terms
 
+    def car(self, race: int) -> CarState:
+        """
+        Return the car of a race, as the backend's ``step`` does.
+
+        :param race: index of the race
+        :raises Exception: that stopped the race
+        """
+        if race in self.failures:
+            raise self.failures[race]
+        return car_from_record(self.after[race])
+
 
 LAPS, LAST_LAP_TIME, SPEED_X = map(CarState._fields.index, ("laps", "last_lap_time", "speed_x"))
-
-
-class _Driven:
-    """
-    Takes the place of a world while its environment takes a timestep that is already driven.
-
-    :param world: that has been driven
-    :param timestep: the outcome
-    :param race: index of the race
-    """
-
-    def __init__(self, world: Backend, timestep: Outcome, race: int) -> None:
-        self._world, self._timestep, self._race = world, timestep, race
-
-    def step(self, controls: Controls, ticks: int) -> CarState:
-        """Return what the world has come to; see :class:`~sb3_torcs.backends.base.Backend`."""
-        del controls, ticks  # the world has driven with these
-        if self._race in self._timestep.failures:
-            raise self._timestep.failures[self._race]
-        return car_from_record(self._timestep.after[self._race])
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._world, name)
 
 
 class Batch:
@@ -139,11 +133,8 @@ class Batch:
         self._fleet = fleet_of([present_world(env.backend) for env in self.envs], self.threads)
         self._races = np.arange(number)
         self._cars = np.zeros((number, CAR_NUMBERS))
-        self._laps = np.full(number, np.inf)
-        self._runoff = np.zeros(number)
-        self._recovery = np.zeros(number, np.int64)
+        self._rules = np.zeros(number, RULES)
         self._aids = np.zeros((number, len(AIDS)), np.bool_)
-        self._ticks, self._patience, self._standing = np.ones((3, number), np.int64)
         self._driven: list[list[list[Held]]] = [[] for _ in self.envs]
         self._controls = np.zeros((number, len(Controls._fields)))
         self._rewards = [env.reward for env in self.envs]
@@ -178,11 +169,15 @@ class Batch:
         assert env.car is not None, "step raises before the first reset"
         self._fleet.put(race, present_world(env.backend))
         self._cars[race] = np.hstack(env.car)
-        self._laps[race] = np.inf if env.laps is None else env.laps
-        self._runoff[race], self._recovery[race] = env.runoff, env.recovery_ticks
+        self._rules[race] = (
+            math.inf if env.laps is None else env.laps,
+            env.runoff,
+            env.recovery_ticks,
+            env.action_repeat,
+            env.patience,
+            env.standing,
+        )
         self._aids[race] = astuple(env.aids)
-        self._ticks[race] = env.action_repeat
-        self._patience[race], self._standing[race] = env.patience, env.standing
         self._driven[race] = []
         if env.reward is not self._rewards[race]:
             self._rewards[race] = env.reward
@@ -204,10 +199,7 @@ class Batch:
             if ticks[race]
         )
         self._fleet.arrive(race, steps, car)
-        env.arrive(
-            car, _controls(self._controls[race]), int(self._standing[race]),
-            int(self._patience[race]),
-        )  # fmt: skip
+        env.arrive(car, _controls(self._controls[race]), *_clocks(self._rules[race]))
         self._driven[race] = []
 
     def step(self, asked: npt.NDArray[np.floating]) -> Outcome:
@@ -233,19 +225,14 @@ class Batch:
         number = len(self.envs)
         observations = np.empty((number, self._view.size), np.float32)
         values, ended = np.empty_like(self._weights), np.empty(number, np.bool_)
-        standing, patience = self._standing.copy(), self._patience.copy()
+        rules = self._rules.copy()
         value_timesteps(
             before.view(CAR_RECORD)[:, 0],
             after.view(CAR_RECORD)[:, 0],
             controls.view(CONTROLS_RECORD)[:, 0],
             self._choices,
             self._weights,
-            self._laps,
-            self._runoff,
-            self._recovery,
-            self._ticks,
-            self._patience,
-            self._standing,
+            self._rules,
             observations,
             values,
             ended,
@@ -264,8 +251,7 @@ class Batch:
             [sum(row) for row in terms],
             terms,
             self._names,
-            standing,
-            patience,
+            rules,
             waiting,
             ended,
             {race: self._fleet.failure(race) for race in failed},
@@ -286,18 +272,16 @@ class Batch:
         if failure is not None and not isinstance(failure, CarLost):
             self._driven[race].pop()
             env.delay.waiting = timestep.waiting[race]
-            self._standing[race] = timestep.standing[race]
-            self._patience[race] = timestep.patience[race]
+            self._rules[race] = timestep.rules[race]
             raise failure
-        env.car = car_from_record(timestep.before[race])
-        env.standing = int(timestep.standing[race])
-        env.patience = int(timestep.patience[race])
+        before = car_from_record(timestep.before[race])
+        env.arrive(before, env.controls, *_clocks(timestep.rules[race]))
         env.delay.waiting = timestep.waiting[race]
-        world, env.backend = env.backend, _Driven(env.backend, timestep, race)
+        env.driven = partial(timestep.car, race)
         try:
             return act()
         finally:
-            env.backend = world
+            env.driven = None
             self._driven[race] = []
 
     def close(self) -> None:
@@ -312,7 +296,7 @@ class Batch:
         :return: what is held, one part if no controls arrive during the timestep, else two
         """
         if not any(env.delay.ticks for env in self.envs):
-            return [(controls, self._ticks.copy())]
+            return [(controls, self._rules["ticks"].copy())]
         first, second = np.zeros((2, *controls.shape))
         ticks = np.zeros((2, len(self.envs)), np.int64)
         for race, env in enumerate(self.envs):
@@ -373,6 +357,11 @@ class Batch:
         was, car = car_from_record(before), car_from_record(after)
         seconds = car.time - was.time
         return weight * seconds * term(was, car, _controls(controls)) if seconds else 0.0
+
+
+def _clocks(rules: Any) -> tuple[int, int]:
+    """Read for how many control ticks a car has been standing, and how many it may."""
+    return int(rules["standing"]), int(rules["patience"])
 
 
 def _row(controls: Controls) -> tuple[float, ...]:

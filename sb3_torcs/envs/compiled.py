@@ -23,9 +23,19 @@ from sb3_torcs.envs.unstick import freeing_controls, needs_freeing
 from sb3_torcs.rivals import needed_brake, needed_turn
 from sb3_torcs.sensors import encode_record
 
-__all__ = ["COMPILED", "aid_cars", "read_actions", "value_timesteps"]
+__all__ = ["COMPILED", "RULES", "aid_cars", "read_actions", "value_timesteps"]
 
-Counts = npt.NDArray[np.int64]
+RULES = np.dtype(
+    [
+        ("laps", "f8"),  # after which an episode ends
+        ("runoff", "f8"),  # [m] how far a car may be beside the road
+        ("recovery", "i8"),  # [control ticks] without headway, 0 for none backwards
+        ("ticks", "i8"),  # control ticks of a timestep
+        ("patience", "i8"),  # [control ticks] for which a car may stand
+        ("standing", "i8"),  # [control ticks] for which it has been standing
+    ]
+)
+"""When the episode of a race ends."""
 
 COMPILED = rewards.OWN_TERMS
 """The terms of rewards of this package. Terms that a user adds are called in Python."""
@@ -140,14 +150,9 @@ def value_timesteps(
     before: Any,
     after: Any,
     controls: Any,
-    choices: Counts,
+    choices: npt.NDArray[np.int64],
     weights: FloatArray,
-    laps: FloatArray,
-    runoff: FloatArray,
-    recovery: Counts,
-    ticks: Counts,
-    patience: Counts,
-    standing: Counts,
+    rules: Any,
     observations: npt.NDArray[np.float32],
     terms: FloatArray,
     ended: npt.NDArray[np.bool_],
@@ -160,18 +165,13 @@ def value_timesteps(
     :param controls: (n,) that were held
     :param choices: (n, k) indices in :data:`COMPILED`, negative for none
     :param weights: (n, k) of the terms
-    :param laps: (n,) after which an episode ends
-    :param runoff: (n,) how far a car may be beside the road [m]
-    :param recovery: (n,) control ticks for which cars may be without headway, 0 for none backwards
-    :param ticks: (n,) control ticks of a timestep
-    :param patience: (n,) control ticks for which cars may stand, changed
-    :param standing: (n,) control ticks for which they have been standing, changed
+    :param rules: (n,) of :data:`RULES`, whose clocks are changed
     :param observations: (n, size) whose first 29 numbers are filled
     :param terms: (n, k) filled
     :param ended: (n,) filled
     """
     for race in range(len(after)):
-        was, car = before[race], after[race]
+        was, car, rule = before[race], after[race], rules[race]
         encode_record(car, observations[race])
         seconds = car.time - was.time
         for i in range(choices.shape[1]):
@@ -179,10 +179,10 @@ def value_timesteps(
             if choices[race, i] >= 0 and seconds != 0.0:
                 value = _term(choices[race, i], was, car, controls[race])
                 terms[race, i] = weights[race, i] * seconds * value
-        ended[race] = end_of(car, laps[race], runoff[race], recovery[race]) != 0
+        ended[race] = end_of(car, rule.laps, rule.runoff, rule.recovery) != 0
         if not ended[race]:
             if stands(car):
-                standing[race] += ticks[race]
-                ended[race] = standing[race] > patience[race]
+                rule.standing += rule.ticks
+                ended[race] = rule.standing > rule.patience
             else:
-                standing[race], patience[race] = 0, max(STUCK_TICKS, recovery[race])
+                rule.standing, rule.patience = 0, max(STUCK_TICKS, rule.recovery)
