@@ -165,7 +165,7 @@ def make_rollouts(engines: Sequence[Engine]) -> Rollouts:
     :param engines: of the same race, at the same moment
     :return: the rollouts, which begin where the engines stand; see ``native/rollouts.h``
     """
-    rollouts: Rollouts = _extension().Rollouts(list(engines), len(engines))
+    rollouts: Rollouts = _extension().Rollouts(list(engines))
     rollouts.mark()
     return rollouts
 

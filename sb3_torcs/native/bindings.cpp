@@ -158,6 +158,16 @@ std::vector<Waypoint> line_of(const py::array_t<double, py::array::c_style>& row
     return {first, first + rows.shape(0)};
 }
 
+// Makes a method of the engine that reads something of one car.
+template <typename Read>
+auto of_car(Read read) {
+    return [read](Engine& engine, int car) {
+        const Engine::Access race(engine);
+        Engine::check_car(*race, car);
+        return read(*race, car);
+    };
+}
+
 py::tuple follow(Rollouts& rollouts, const py::array_t<double, py::array::c_style>& rows,
                  const std::array<double, 3>& gains,
                  const py::array_t<double, py::array::c_style>& offsets, int ticks) {
@@ -340,63 +350,33 @@ PYBIND11_MODULE(_engine, module) {
             "appearance", [](Engine& engine) { return py::bytes(engine.appearance()); },
             "Return what the game's window needs to draw this moment.")
         .def("close", &Engine::close, "Free the race. A second call does nothing.")
-        .def(
-            "controls",
-            [](Engine& engine, int car) {
-                const Engine::Access race(engine);
-                Engine::check_car(*race, car);
-                const Control& control = race->car(car).control;
-                return py::make_tuple(control.steering, control.throttle, control.brake,
-                                      control.gear, control.clutch);
-            },
-            "car"_a, "Return the controls that a car holds.")
+        .def("controls", of_car([](const Race& race, int car) {
+                 const Control& control = race.car(car).control;
+                 return py::make_tuple(control.steering, control.throttle, control.brake,
+                                       control.gear, control.clutch);
+             }),
+             "car"_a, "Return the controls that a car holds.")
         .def_property_readonly("agents",
                                [](Engine& engine) { return Engine::Access(engine)->agents(); })
-        .def(
-            "lost",
-            [](Engine& engine, int car) {
-                Engine::Access race(engine);
-                Engine::check_car(*race, car);
-                return race->lost(car);
-            },
-            "car"_a, "Whether the game's physics lost a car, which is out of the race then.")
-        .def(
-            "finished",
-            [](Engine& engine, int car) {
-                const Engine::Access race(engine);
-                Engine::check_car(*race, car);
-                return race->finished(car);
-            },
-            "car"_a, "Say whether an agent was flagged off.")
+        .def("lost", of_car([](const Race& race, int car) { return race.lost(car); }), "car"_a,
+             "Whether the game's physics lost a car, which is out of the race then.")
+        .def("finished", of_car([](const Race& race, int car) { return race.finished(car); }),
+             "car"_a, "Say whether an agent was flagged off.")
         .def_property_readonly("ended",
                                [](Engine& engine) { return Engine::Access(engine)->ended(); })
-        .def(
-            "car_name",
-            [](Engine& engine, int car) {
-                const Engine::Access race(engine);
-                Engine::check_car(*race, car);
-                return std::string(race->car(car).info.car);
-            },
-            "car"_a, "Return the name of a car's model.")
-        .def(
-            "gears",
-            [](Engine& engine, int car) {
-                const Engine::Access race(engine);
-                Engine::check_car(*race, car);
-                return race->car(car).priv.gears_number - 1;
-            },
-            "car"_a, "Return the number of a car's forward gears.")
-        .def(
-            "laps",
-            [](Engine& engine, int car) {
-                py::list laps;
-                const Engine::Access race(engine);
-                Engine::check_car(*race, car);
-                for (const LapRecord& lap : race->laps(car))
-                    laps.append(py::make_tuple(lap.time, lap.damage));
-                return laps;
-            },
-            "car"_a, "Return a car's laps so far: time [s] and damage [points].")
+        .def("car_name",
+             of_car([](const Race& race, int car) { return std::string(race.car(car).info.car); }),
+             "car"_a, "Return the name of a car's model.")
+        .def("gears",
+             of_car([](const Race& race, int car) { return race.car(car).priv.gears_number - 1; }),
+             "car"_a, "Return the number of a car's forward gears.")
+        .def("laps", of_car([](const Race& race, int car) {
+                 py::list laps;
+                 for (const LapRecord& lap : race.laps(car))
+                     laps.append(py::make_tuple(lap.time, lap.damage));
+                 return laps;
+             }),
+             "car"_a, "Return a car's laps so far: time [s] and damage [points].")
         .def(
             "results",
             [](Engine& engine) {
@@ -503,10 +483,10 @@ PYBIND11_MODULE(_engine, module) {
              "Wait for all races that have begun to move.");
 
     py::class_<Rollouts>(module, "Rollouts", "Short drives from one moment, at once.")
-        .def(py::init([](const Engines& engines, int threads) {
-                 return std::make_unique<Rollouts>(checked(engines), threads);
+        .def(py::init([](const Engines& engines) {
+                 return std::make_unique<Rollouts>(checked(engines));
              }),
-             "engines"_a, "threads"_a)
+             "engines"_a)
         .def("mark", &Rollouts::mark, py::call_guard<WithoutPython>(),
              "Keep the moment of the first engine, from which all candidates begin.")
         .def(

@@ -158,9 +158,12 @@ void give_speed(const Field& field, CarElement& car, double speed) {
     car.pub.speed = static_cast<float>(speed);
 }
 
-int crossings_of(const CarElement& car, double distance, double track_length, bool lap_has_begun) {
+int count_crossings(CarElement& car, double distance, double track_length, bool lap_has_begun) {
     const double shift = distance - distance_from_start(car);
-    return (lap_has_begun ? 1 : 0) + static_cast<int>(std::lround(shift / track_length));
+    const int ahead = (lap_has_begun ? 1 : 0) + static_cast<int>(std::lround(shift / track_length));
+    car.race.crossings = std::max(ahead, 0);
+    car.race.remaining_laps -= car.race.crossings;
+    return std::max(-ahead, 0);
 }
 
 }  // namespace torcs

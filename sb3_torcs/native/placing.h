@@ -57,8 +57,9 @@ const CarElement* stuck_car(const Field& field);
 
 void give_speed(const Field& field, CarElement& car, double speed);
 
-// How often a car at a distance has crossed the line, counted from the agent's first lap; negative
-// if it has to make up for that. Where the agent starts on the line itself, its lap has begun.
-int crossings_of(const CarElement& car, double distance, double track_length, bool lap_has_begun);
+// Counts how often a car that was put down at a distance has crossed the line, from the agent's
+// first lap on. Returns how often it has to cross it before that counts. Where the agent starts on
+// the line itself, its lap has begun.
+int count_crossings(CarElement& car, double distance, double track_length, bool lap_has_begun);
 
 }  // namespace torcs

@@ -121,10 +121,7 @@ void Race::begin_on_the_way(int index, const Start& start, double distance) {
     record.flying = true;
     record.previous = car.pub.track;  // it may have settled across the line
     manage(car);
-    const int ahead = crossings_of(car, distance, track_->length, start.distance == 0.0);
-    car.race.crossings = std::max(ahead, 0);
-    car.race.remaining_laps -= car.race.crossings;
-    record.backwards = std::max(-ahead, 0);
+    record.backwards = count_crossings(car, distance, track_->length, start.distance == 0.0);
     measure_distance(car);
     record.start_distance = car.race.distance_raced;
 }

@@ -73,8 +73,9 @@ bool on_road(const Waypoint& car, const Race& race) {
 
 }  // namespace
 
-Rollouts::Rollouts(const std::vector<std::shared_ptr<Engine>>& engines, int threads)
-    : places_(engines.size()), pool_(threads, engines.size(), [this](std::size_t i) { work(i); }) {
+Rollouts::Rollouts(const std::vector<std::shared_ptr<Engine>>& engines)
+    : places_(engines.size()),
+      pool_(static_cast<int>(engines.size()), engines.size(), [this](std::size_t i) { work(i); }) {
     for (std::size_t i = 0; i < engines.size(); i++) places_[i].engine = engines[i];
 }
 

@@ -44,7 +44,7 @@ struct Gains {
 class Rollouts {
 public:
     // The engines must be of one race with one agent, at the same moment.
-    Rollouts(const std::vector<std::shared_ptr<Engine>>& engines, int threads);
+    explicit Rollouts(const std::vector<std::shared_ptr<Engine>>& engines);
 
     // Let candidates begin where the engines stand, and forget all other marks.
     void mark();

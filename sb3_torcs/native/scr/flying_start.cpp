@@ -1,6 +1,5 @@
 #include "flying_start.h"
 
-#include <algorithm>
 #include <cstdio>
 #include <utility>
 
@@ -82,12 +81,9 @@ void FlyingStart::drive_off(Situation& situation) {
         const auto place = static_cast<std::size_t>(i);
         car.control = controls_[place];
         give_speed(field_, car, start_.speed);
-        const int ahead =
-            crossings_of(car, distances_[place], ReInfo->track->length, start_.distance == 0.0);
-        car.race.crossings = std::max(ahead, 0);
-        car.race.remaining_laps -= car.race.crossings;
         ReInfo->progress[i].previous = car.pub.track;  // it may have settled across the line
-        ReInfo->progress[i].backwards = std::max(-ahead, 0);
+        ReInfo->progress[i].backwards =
+            count_crossings(car, distances_[place], ReInfo->track->length, start_.distance == 0.0);
     }
 }
 
