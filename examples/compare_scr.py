@@ -15,9 +15,9 @@ from rich.console import Console
 from rich.progress import track as progress
 
 import sb3_torcs  # noqa: F401  (registers the environments)
-from sb3_torcs.agents.model_record import DRIVEN_WITH
 from sb3_torcs.agents.models import driver_record, load_driver
 from sb3_torcs.agents.rollout import Driver, drive
+from sb3_torcs.agents.saved.record import DRIVEN_WITH
 from sb3_torcs.car import Start
 from sb3_torcs.cli.common import table
 from sb3_torcs.errors import ends_in_a_line

@@ -17,11 +17,11 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import nn
 
-from sb3_torcs.agents.model_algorithm import told_algorithm
-from sb3_torcs.agents.model_file import learned_weights, saved_data
-from sb3_torcs.agents.model_record import DRIVEN_WITH
-from sb3_torcs.agents.model_writing import recipe, write_record
 from sb3_torcs.agents.models import driver_record, find_model
+from sb3_torcs.agents.saved.algorithm import told_algorithm
+from sb3_torcs.agents.saved.file import learned_weights, saved_data
+from sb3_torcs.agents.saved.record import DRIVEN_WITH
+from sb3_torcs.agents.saved.writing import recipe, write_record
 from sb3_torcs.errors import ends_in_a_line
 from sb3_torcs.policies import BoundedPolicy
 from sb3_torcs.policies.imitation import Imitation, mean_actions

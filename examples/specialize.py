@@ -14,10 +14,10 @@ import torch as th
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_torcs.agents.model_algorithm import told_algorithm
-from sb3_torcs.agents.model_file import learned_weights, saved_data
-from sb3_torcs.agents.model_writing import RecordCallback, recipe
 from sb3_torcs.agents.models import driver_record, find_model
+from sb3_torcs.agents.saved.algorithm import told_algorithm
+from sb3_torcs.agents.saved.file import learned_weights, saved_data
+from sb3_torcs.agents.saved.writing import RecordCallback, recipe
 from sb3_torcs.callbacks import (
     AdaptiveLearningRateCallback,
     LeanUpdatesCallback,

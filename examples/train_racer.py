@@ -18,9 +18,9 @@ from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
-from sb3_torcs.agents.model_file import learned_weights
-from sb3_torcs.agents.model_writing import RecordCallback, recipe
 from sb3_torcs.agents.models import find_model, training_record
+from sb3_torcs.agents.saved.file import learned_weights
+from sb3_torcs.agents.saved.writing import RecordCallback, recipe
 from sb3_torcs.callbacks import (
     AdaptiveLearningRateCallback,
     LeanUpdatesCallback,

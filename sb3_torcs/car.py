@@ -29,6 +29,7 @@ __all__ = [
     "MANY_LAPS",
     "MAX_DAMAGE",
     "MAX_DELAY",
+    "MAX_START_SPEED",
     "NO_RACE",
     "RANGE_FINDERS",
     "REST_HEIGHT",

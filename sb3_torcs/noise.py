@@ -31,6 +31,7 @@ __all__ = [
     "SetPointNoise",
     "StochasticBrake",
     "bind",
+    "checked_dt",
     "noises_of",
 ]
 

@@ -16,7 +16,16 @@ from sb3_torcs.car import CAR_WIDTH, FIRST_RIVAL, RIVALS, CarState, Controls, is
 from sb3_torcs.errors import InvalidOption, UnknownRewardTerm, near_miss
 from sb3_torcs.rivals import clarity, rival
 
-__all__ = ["CRASHES", "PRESETS", "TERMS", "Reward", "RewardChoice", "RewardName", "safe_speed"]
+__all__ = [
+    "CRASHES",
+    "PRESETS",
+    "TERMS",
+    "Reward",
+    "RewardChoice",
+    "RewardName",
+    "Term",
+    "safe_speed",
+]
 
 BRAKING = 10.0  # [m/s²] a car on asphalt can do twice that, but not while it turns in
 BEND_SPEED = 12.0  # [m/s] in a bend behind which nothing is seen; the tightest hairpins need it

@@ -54,6 +54,7 @@ __all__ = [
     "encode",
     "encode_record",
     "feature_slices",
+    "view_of",
 ]
 
 SensorsName = Literal[

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from sb3_torcs.agents import model_record, models
+from sb3_torcs.agents import models
+from sb3_torcs.agents.saved import record as model_record
 from sb3_torcs.cli import main
 from sb3_torcs.evaluation.ladder import REFERENCE_FILE
 

@@ -21,6 +21,8 @@ import pytest
 PACKAGE = Path(__file__).parent.parent / "sb3_torcs"
 FILES = sorted(PACKAGE.rglob("*.py"))
 
+OLDER_PLACES = {PACKAGE / name for name in ("agents/model_writing.py", "progress.py", "zoo.py")}
+
 MAX_MODULES = 15  # at the top of the package
 MAX_FOLDERS = 17  # of Python there; beside them native/, the C++
 MAX_CODE_LINES = 300
@@ -73,7 +75,7 @@ HAS_THE_GAME_RUN = {  # and nothing else: no world but one needs another process
 USES_A_NETWORK = {"rendering/game_camera.py", "scr/client.py", "scr/server.py", "torcs/display.py"}
 LOADS_THE_ENGINE = {"backends/native.py", "torcs/trial_child.py"}
 ASKS_DRIVERS = {
-    "agents/model_driver.py",  # hands on what it is asked
+    "agents/saved/driver.py",  # hands on what it is asked
     "agents/pilots.py",  # several at once, in one race
     "agents/rollout.py",
     "bench/torcs.py",  # on threads, where nobody looks at what is driven
@@ -217,10 +219,12 @@ def floor_plan() -> dict[str, str]:
 def test_every_module_stands_in_the_floor_plan():
     plan = floor_plan()
     for path in FILES:
-        if path.parent != PACKAGE and not path.stem.startswith("__") and room(path) != "cli":
+        if path in OLDER_PLACES or path.stem.startswith("__"):
+            continue
+        if path.parent != PACKAGE and room(path) != "cli":
             words = re.findall(r"[\w*]+", plan[room(path)])
             assert any(fnmatch.fnmatch(path.stem, word) for word in words), path
-    rooms = {room(path) for path in FILES} - {"__init__", "progress", "zoo"}  # older places
+    rooms = {room(path) for path in FILES if path not in OLDER_PLACES} - {"__init__"}
     assert set(plan) == rooms
 
 
@@ -259,6 +263,8 @@ def test_each_folder_of_python_is_installed():
     "sb3_torcs.callbacks.RewardCallback", "sb3_torcs.callbacks.StochasticBrakeCallback",
     "sb3_torcs.noise.OUNoise", "sb3_torcs.noise.SetPointNoise",
     "sb3_torcs.policies.SplitHeadPolicy", "sb3_torcs.policies.export_actor",
+    "sb3_torcs.agents.model_writing.RecordCallback", "sb3_torcs.callbacks.RecordCallback",
+    "sb3_torcs.agents.model_writing.write_driver",
     "sb3_torcs.progress.RacingProgressCallback", "sb3_torcs.zoo.UninterruptedWorker",
     "sb3_torcs.tracks.load_track", "sb3_torcs.evaluation.evaluate",
 ])  # fmt: skip
@@ -266,6 +272,28 @@ def test_what_files_and_people_name_stays_importable(path):
     """Saved models, records of trainings and hyperparameter files hold these names."""
     module, _, name = path.rpartition(".")
     assert hasattr(importlib.import_module(module), name)
+
+
+def exported(path: Path) -> set[str] | None:
+    """The names in ``__all__``, if there is one."""
+    for node in ast.parse(source(path)).body:
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
+            return set(ast.literal_eval(node.value))
+    return None
+
+
+@pytest.mark.parametrize("path", FILES, ids=str)
+def test_what_other_files_use_is_exported(path):
+    for node in ast.walk(ast.parse(source(path))):
+        module = getattr(node, "module", None) or ""
+        if not isinstance(node, ast.ImportFrom) or not module.startswith("sb3_torcs."):
+            continue
+        whence = PACKAGE.parent.joinpath(*module.split("."))
+        offered = (
+            exported(whence.with_suffix(".py")) if whence.with_suffix(".py").is_file() else None
+        )
+        if offered is not None:
+            assert {alias.name for alias in node.names} <= offered, module
 
 
 TESTS = sorted(Path(__file__).parent.glob("*.py"))

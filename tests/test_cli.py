@@ -22,7 +22,8 @@ from stable_baselines3 import DDPG
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_torcs import __version__
-from sb3_torcs.agents import ScriptedDriver, model_record, models
+from sb3_torcs.agents import ScriptedDriver, models
+from sb3_torcs.agents.saved import record as model_record
 from sb3_torcs.bench.stages import KEYS
 from sb3_torcs.cli import VERBS, common, doctor, evaluate, main, train
 from sb3_torcs.errors import BackendUnavailable, InvalidOption, OutputNotWritable, ZooConfigError

@@ -26,8 +26,8 @@ from stable_baselines3.common.vec_env import VecEnv
 
 import sb3_torcs  # noqa: F401  registers the environments
 from sb3_torcs import cli, rewards
-from sb3_torcs.agents.model_algorithm import SBX
 from sb3_torcs.agents.models import shipped_agents
+from sb3_torcs.agents.saved.algorithm import SBX
 from sb3_torcs.callbacks.metrics import DrivingMetricsCallback
 from sb3_torcs.car import RANGE_FINDERS
 from sb3_torcs.envs.torcs import TorcsEnv

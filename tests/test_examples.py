@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from stable_baselines3 import PPO
 
-from sb3_torcs.agents.model_file import learned_weights, saved_weights
-from sb3_torcs.agents.model_writing import RecordCallback
 from sb3_torcs.agents.models import AGENTS, driver_record, find_model, shipped_agents
+from sb3_torcs.agents.saved.file import learned_weights, saved_weights
+from sb3_torcs.agents.saved.writing import RecordCallback
 from sb3_torcs.callbacks.lines import DrivenLap, driven_laps
 from sb3_torcs.envs.aids import AIDS
 from sb3_torcs.errors import OutputNotWritable

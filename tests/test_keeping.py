@@ -25,7 +25,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from toy import ToyRace
 
 from sb3_torcs.agents import models
-from sb3_torcs.agents.model_record import STATISTICS
+from sb3_torcs.agents.saved.record import STATISTICS
 from sb3_torcs.cli import main
 from sb3_torcs.errors import InvalidOption, TrainingDiverged
 from sb3_torcs.training import manager as zoo_training

@@ -23,8 +23,10 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNorm
 from torch import nn
 
 import sb3_torcs  # noqa: F401  (registers the environments)
-from sb3_torcs.agents import model_file, model_policy, models
-from sb3_torcs.agents.model_writing import RecordCallback, recipe, write_driver
+from sb3_torcs.agents import models
+from sb3_torcs.agents.saved import file as model_file
+from sb3_torcs.agents.saved import policy as model_policy
+from sb3_torcs.agents.saved.writing import RecordCallback, recipe, write_driver
 from sb3_torcs.agents.wrapping import wrapped
 from sb3_torcs.cli import main
 from sb3_torcs.errors import (

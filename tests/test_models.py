@@ -17,7 +17,8 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
 import sb3_torcs  # noqa: F401  registers the environments
-from sb3_torcs.agents import model_record, models
+from sb3_torcs.agents import models
+from sb3_torcs.agents.saved import record as model_record
 from sb3_torcs.agents.scripted import ScriptedDriver
 from sb3_torcs.cli import main
 from sb3_torcs.errors import InvalidOption, ModelMismatch, ModelNotTrusted, PackageMissing

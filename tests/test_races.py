@@ -15,10 +15,10 @@ import pytest
 import torch as th
 from stable_baselines3 import PPO
 
-from sb3_torcs.agents.model_record import RECORD
 from sb3_torcs.agents.models import find_model
 from sb3_torcs.agents.pilots import Crew
 from sb3_torcs.agents.robots import race as robots_race
+from sb3_torcs.agents.saved.record import RECORD
 from sb3_torcs.agents.scripted import ScriptedDriver
 from sb3_torcs.cli import main
 from sb3_torcs.envs.aids import AIDS, aids_named

@@ -9,8 +9,8 @@ import signal
 import pytest
 import yaml
 
-from sb3_torcs.agents.model_record import _read_plain
 from sb3_torcs.agents.models import find_model
+from sb3_torcs.agents.saved.record import _read_plain
 from sb3_torcs.cli import main
 from sb3_torcs.training.resuming import recorded_entry
 from sb3_torcs.training.run import OF_ONE_RUN, Run, TrainOptions, going_on

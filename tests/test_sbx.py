@@ -8,7 +8,7 @@ import sb3_contrib
 from rl_zoo3.utils import ALGOS
 
 from sb3_torcs.agents import models
-from sb3_torcs.agents.model_algorithm import algorithm_class
+from sb3_torcs.agents.saved.algorithm import algorithm_class
 from sb3_torcs.cli import main
 from sb3_torcs.errors import InvalidOption, PackageMissing, StudyError, ZooConfigError
 from sb3_torcs.studies.config import read_study

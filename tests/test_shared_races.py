@@ -13,7 +13,7 @@ import torch as th
 from stable_baselines3 import DDPG, PPO
 
 from sb3_torcs.agents import driver_record
-from sb3_torcs.agents.model_writing import RecordCallback
+from sb3_torcs.agents.saved.writing import RecordCallback
 from sb3_torcs.agents.scripted import ScriptedDriver
 from sb3_torcs.backends.native import Fleet, make_engine
 from sb3_torcs.backends.seats import REJOIN_SPEED

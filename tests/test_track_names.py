@@ -11,7 +11,7 @@ import gymnasium as gym
 import pytest
 from fake_game import write_game
 
-from sb3_torcs.agents.model_writing import recipe
+from sb3_torcs.agents.saved.writing import recipe
 from sb3_torcs.errors import InvalidOption, TrackNotFound
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.track_names import (

@@ -15,8 +15,8 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 
-from sb3_torcs.agents.model_file import BROKEN
 from sb3_torcs.agents.rollout import Timestep, drive
+from sb3_torcs.agents.saved.file import BROKEN
 from sb3_torcs.envs.aids import AIDS
 from sb3_torcs.errors import InvalidOption, ModelMismatch, near_miss
 from sb3_torcs.files import whole_file, writable_file

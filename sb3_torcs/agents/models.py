@@ -15,16 +15,16 @@ from gymnasium import spaces
 
 from sb3_torcs.actions import ACTIONS, action_layout
 from sb3_torcs.agents.ghosts import GhostDriver, check_fits, is_ghost, read_ghost
-from sb3_torcs.agents.model_algorithm import algorithm_of, check_same, is_sbx, told_algorithm
-from sb3_torcs.agents.model_driver import ModelDriver
-from sb3_torcs.agents.model_file import (
+from sb3_torcs.agents.saved.algorithm import algorithm_of, check_same, is_sbx, told_algorithm
+from sb3_torcs.agents.saved.driver import ModelDriver
+from sb3_torcs.agents.saved.file import (
     as_mismatch,
     check_finite,
     saved_data,
     saved_weights,
 )
-from sb3_torcs.agents.model_policy import Spaces, build_policy, readable_policy, readable_space
-from sb3_torcs.agents.model_record import (
+from sb3_torcs.agents.saved.policy import Spaces, build_policy, readable_policy, readable_space
+from sb3_torcs.agents.saved.record import (
     BEST_MODEL,
     DRIVEN_WITH,
     TrainingRecord,

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from sb3_torcs.agents.ghosts import is_ghost
-from sb3_torcs.agents.model_record import DRIVEN_WITH
 from sb3_torcs.agents.models import agent_record, load_driver
+from sb3_torcs.agents.saved.record import DRIVEN_WITH
 from sb3_torcs.agents.wrapping import wrapped
 from sb3_torcs.backends.seats import SeatWorld, SharedRace
 from sb3_torcs.car import FloatArray, range_finder_angles

@@ -14,11 +14,11 @@ from typing import Any
 import gymnasium as gym
 from gymnasium import spaces
 
-from sb3_torcs.agents.model_file import as_mismatch
+from sb3_torcs.agents.saved.file import as_mismatch
 from sb3_torcs.errors import ModelMismatch, ModelNotTrusted, PackageMissing
 from sb3_torcs.files import import_advice, listed, path_and_arguments
 
-__all__ = ["frames_of", "normalizes", "stacked_space", "unrebuilt", "wrapped"]
+__all__ = ["LEFT_OUT", "frames_of", "normalizes", "stacked_space", "unrebuilt", "wrapped"]
 
 TRUSTED_PACKAGES = ("sb3_torcs", "gymnasium", "stable_baselines3", "sb3_contrib", "rl_zoo3")
 """Whose wrappers a record may name: importing them, and putting them around, does no harm."""

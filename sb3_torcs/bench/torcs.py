@@ -18,8 +18,11 @@ import numpy.typing as npt
 from sb3_torcs.car import FloatArray
 
 __all__ = [
+    "RACES",
     "REPEAT",
+    "TICKS_PER_TURN",
     "TORCS",
+    "Actions",
     "Figures",
     "loads",
     "resets",
@@ -81,8 +84,8 @@ def scripted_actions(env: gym.Env[Any, Any], number: int) -> Actions:
     :param env: to drive in
     :param number: of actions, at most
     """
+    from sb3_torcs.agents.rollout import drive
     from sb3_torcs.agents.scripted import ScriptedDriver
-    from sb3_torcs.evaluation.protocol import drive
 
     steps = list(zip(drive(env, ScriptedDriver(), seed=0), range(number), strict=False))
     return [step.action for step, _ in steps if not step.done]

@@ -3,6 +3,7 @@
 So a hyperparameter file can name them, e.g. ``sb3_torcs.callbacks.NoiseCallback: {kind: ou}``.
 """
 
+from sb3_torcs.agents.saved.writing import RecordCallback
 from sb3_torcs.callbacks.exploration import (
     NoiseCallback,
     NoiseDecayCallback,
@@ -33,6 +34,7 @@ __all__ = [
     "NoiseDecayCallback",
     "RacingProgressCallback",
     "RandomStartCallback",
+    "RecordCallback",
     "RewardCallback",
     "StochasticBrakeCallback",
     "ValuesOnlyCallback",

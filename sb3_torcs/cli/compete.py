@@ -70,9 +70,9 @@ def run(args: argparse.Namespace) -> int:
         print(f"{args.model} is being loaded for the race at {where}", flush=True)
 
     from sb3_torcs.agents.ghosts import is_ghost
-    from sb3_torcs.agents.model_record import DRIVEN_WITH
     from sb3_torcs.agents.models import driver_name, one_of
     from sb3_torcs.agents.remote import Agent
+    from sb3_torcs.agents.saved.record import DRIVEN_WITH
     from sb3_torcs.sensors import NEEDS_ROAD
 
     record = told_record(args.model)

@@ -121,7 +121,7 @@ def _trained_before(args: argparse.Namespace) -> dict[str, str]:
 
 def _closing_words(options: TrainOptions, result: Run) -> list[str]:
     """Name the files and the commands to type next."""
-    from sb3_torcs.agents.model_algorithm import SBX
+    from sb3_torcs.agents.saved.algorithm import SBX
 
     if result.last_model is None:
         return [f"the RL Zoo has searched; its reports: {result.folder / 'report_*.csv'}"]

@@ -128,8 +128,8 @@ def _shows(game: Game, names: Sequence[str], args: argparse.Namespace) -> list[S
     :param args: from the command line
     """
     from sb3_torcs.agents.ghosts import check_laps, is_ghost, read_ghost
-    from sb3_torcs.agents.model_record import DRIVEN_WITH, TrainingRecord
     from sb3_torcs.agents.models import one_of
+    from sb3_torcs.agents.saved.record import DRIVEN_WITH, TrainingRecord
     from sb3_torcs.errors import InvalidOption
     from sb3_torcs.evaluation.watching import Show
 

@@ -29,7 +29,8 @@ from sb3_torcs.envs.compiled import (
     read_actions,
     value_timesteps,
 )
-from sb3_torcs.envs.racing import RacingEnv, racing_info
+from sb3_torcs.envs.info import racing_info
+from sb3_torcs.envs.racing import RacingEnv
 from sb3_torcs.errors import CarLost, InvalidAction, InvalidOption
 from sb3_torcs.rewards import Term
 from sb3_torcs.sensors import View

@@ -1,11 +1,11 @@
-"""The loop of all racing environments: reset, step, the end of an episode, info."""
+"""The loop of all racing environments: reset, step, the end of an episode."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, Literal, TypedDict, get_args
+from typing import Any, Literal, get_args
 
 import gymnasium as gym
 import numpy as np
@@ -32,57 +32,19 @@ from sb3_torcs.car import (
 from sb3_torcs.envs.aids import NEED_RIVALS, Aids
 from sb3_torcs.envs.conditions import Conditions, Delay, Part
 from sb3_torcs.envs.ends import ENDS, GRACE_TICKS, STUCK_TICKS, TRUNCATING, end_of, stands
+from sb3_torcs.envs.info import racing_info
 from sb3_torcs.envs.starts import Starts, read_start
 from sb3_torcs.errors import CarLost, EnvClosed, InvalidOption, StartBlocked
 from sb3_torcs.rewards import CRASHES, Reward, RewardChoice
 from sb3_torcs.sensors import NEEDS_CAR, NEEDS_RACE, NEEDS_ROAD, SensorsName, View
 from sb3_torcs.tracks.track import Track
 
-__all__ = ["RacingEnv", "RacingInfo", "RenderMode"]
+__all__ = ["Observation", "RacingEnv", "RenderMode"]
 
 Observation = npt.NDArray[np.float32]
 RenderMode = Literal["rgb_array", "human"]
 
 MAX_ACTION_REPEAT = 50_000  # [-] a timestep of 1,000 s
-
-
-class RacingInfo(TypedDict):
-    """The contents of ``info``, in every timestep. Values that do not exist yet are 0 or empty."""
-
-    laps: int  # whole laps driven in this episode
-    lap_time: float  # [s] of the lap that this timestep has completed, else 0
-    best_lap_time: float  # [s] of the best whole lap, 0 before there is one
-    distance: float  # [m] along the road since the episode began
-    off_track: bool
-    damage: float  # [points]
-    reward_terms: dict[str, float]  # they sum to the reward exactly
-    car: CarState  # everything else
-    end: str  # why the episode ended; empty if the time limit truncated it
-
-
-def racing_info(
-    car: CarState, lap_time: float, terms: dict[str, float], end: str | None = None
-) -> dict[str, Any]:
-    """
-    Make the ``info`` of a timestep.
-
-    :param car: at the end of the timestep
-    :param lap_time: of the lap that the timestep has completed, else 0 [s]
-    :param terms: of the reward
-    :param end: why the episode ended, or ``None``
-    """
-    info: RacingInfo = {
-        "laps": car.laps,
-        "lap_time": lap_time,
-        "best_lap_time": car.best_lap_time,
-        "distance": car.distance_raced,
-        "off_track": car.off_track,
-        "damage": car.damage,
-        "reward_terms": terms,
-        "car": car,
-        "end": end or "",
-    }
-    return info  # type: ignore[return-value]  # Gymnasium says dict, and it is one
 
 
 def _check_tells(world: Backend, view: View, aids: Aids) -> None:

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 
-from sb3_torcs.agents.model_record import DRIVEN_WITH
 from sb3_torcs.agents.rollout import Driver, Timestep, drive
+from sb3_torcs.agents.saved.record import DRIVEN_WITH
 from sb3_torcs.car import CONTROL_TICK, check_count
 from sb3_torcs.errors import InvalidOption, near_miss
 from sb3_torcs.torcs.track_names import RANDOM_TRACK, kind_without_game

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import torch as th
 from torch import nn
 
-__all__ = ["FlatParameters", "keep_plain_state"]
+__all__ = ["FlatParameters", "Slot", "keep_plain_state"]
 
 FEW_OUTPUTS = ("heads.weight", "value.weight")
 """Weights that no matrix product meets: each output's stand together, as in the plain network."""

@@ -7,8 +7,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from sb3_torcs.agents.models import BEST_MODEL, driver_name, find_model, shipped_agents
+from sb3_torcs.agents.models import driver_name, find_model, shipped_agents
 from sb3_torcs.agents.pilots import CarOfAnAgent
+from sb3_torcs.agents.saved.record import BEST_MODEL
 from sb3_torcs.agents.scripted import SCRIPTED
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.torcs.installation import Game

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sb3_torcs.agents.model_record import DRIVEN_WITH
 from sb3_torcs.agents.remote import Agent
+from sb3_torcs.agents.saved.record import DRIVEN_WITH
 from sb3_torcs.envs.aids import NEED_RIVALS
 from sb3_torcs.errors import GameFailed, InvalidOption, ModelMismatch, ServerLost
 from sb3_torcs.races import text_mode

@@ -25,7 +25,7 @@ from rich.progress import (
 from sb3_torcs.errors import InvalidOption, OutputNotWritable
 from sb3_torcs.files import whole_file
 
-__all__ = ["PHOTOGRAPHIC", "write_video"]
+__all__ = ["ENCODING", "PHOTOGRAPHIC", "write_video"]
 
 Frame = npt.NDArray[np.uint8]
 

@@ -20,7 +20,7 @@ from typing import Any
 
 import yaml
 
-from sb3_torcs.agents.model_algorithm import SBX
+from sb3_torcs.agents.saved.algorithm import SBX
 from sb3_torcs.errors import StudyError, near_miss, with_new_names
 from sb3_torcs.files import listed, read_yaml
 from sb3_torcs.torcs.track_names import RANDOM_TRACK
@@ -28,7 +28,7 @@ from sb3_torcs.tracks.catalogue import CATEGORIES, load_track, tracks_of
 from sb3_torcs.training import zoo
 from sb3_torcs.training.zoo_data import as_data
 
-__all__ = ["FIELDS", "Study", "Trial", "merged", "read_study", "track_name", "trial_name"]
+__all__ = ["FIELDS", "Study", "Trial", "merged", "read_study", "slug", "track_name", "trial_name"]
 
 REQUIRED = ("name", "seeds", "eval_interval")
 SOURCE = (

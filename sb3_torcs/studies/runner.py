@@ -21,7 +21,7 @@ from types import FrameType
 from typing import Any
 
 from sb3_torcs import cores
-from sb3_torcs.agents.model_record import BEST_MODEL
+from sb3_torcs.agents.saved.record import BEST_MODEL
 from sb3_torcs.errors import OutputNotWritable, RayUnavailable, StudyError, TrainingDiverged
 from sb3_torcs.signals import answered, handlers_kept
 from sb3_torcs.studies.config import Study, Trial

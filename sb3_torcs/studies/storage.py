@@ -26,7 +26,7 @@ from typing import Any
 
 import yaml
 
-from sb3_torcs.agents.model_record import BEST_MODEL, STATISTICS
+from sb3_torcs.agents.saved.record import BEST_MODEL, STATISTICS
 from sb3_torcs.errors import StudyError
 from sb3_torcs.files import read_yaml, whole_file
 from sb3_torcs.studies.config import FIELDS, Study, Trial, track_name

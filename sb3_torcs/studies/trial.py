@@ -21,9 +21,10 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_torcs.agents.model_record import BEST_MODEL, STATISTICS, TrainingRecord
-from sb3_torcs.agents.model_writing import recipe, write_record
-from sb3_torcs.agents.models import ModelDriver, load_driver
+from sb3_torcs.agents.models import load_driver
+from sb3_torcs.agents.saved.driver import ModelDriver
+from sb3_torcs.agents.saved.record import BEST_MODEL, STATISTICS, TrainingRecord
+from sb3_torcs.agents.saved.writing import recipe, write_record
 from sb3_torcs.agents.wrapping import frames_of
 from sb3_torcs.errors import StudyError
 from sb3_torcs.evaluation.ladder import rung

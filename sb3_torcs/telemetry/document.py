@@ -15,6 +15,7 @@ from sb3_torcs.errors import PackageMissing
 from sb3_torcs.files import whole_file
 
 __all__ = [
+    "FOLDER",
     "OKABE_ITO",
     "Cell",
     "chip",

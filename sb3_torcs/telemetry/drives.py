@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
-__all__ = ["COLUMNS", "LABELS", "DriveLabel", "DriveLog", "read_drives"]
+__all__ = ["COLUMNS", "LABELS", "WHEELS", "DriveLabel", "DriveLog", "read_drives"]
 
 FORMAT = "sb3-torcs drives, version 1"
 AT_ONCE = 5000  # rows that are turned into columns together

@@ -25,7 +25,7 @@ from sb3_torcs.telemetry.laps import Lap
 from sb3_torcs.tracks.plot import edges
 from sb3_torcs.tracks.track import Track
 
-__all__ = ["lap_report"]
+__all__ = ["lap_report", "missing", "summary"]
 
 MOST_SLIP = 0.5  # [-] that is shown; a car that turns round slips by any number
 EQUAL = 0.0005  # [s] less is no difference

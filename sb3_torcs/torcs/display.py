@@ -16,7 +16,7 @@ from typing import IO
 
 from sb3_torcs.errors import DisplayUnavailable
 
-__all__ = ["VirtualDisplay", "find_display"]
+__all__ = ["INSTALL", "PROGRAM", "VirtualDisplay", "find_display"]
 
 PROGRAM = "Xvfb"
 INSTALL = "`sb3-torcs install-torcs --video`, or: `sudo apt install xvfb`"

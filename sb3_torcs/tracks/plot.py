@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.collections import LineCollection
 
-__all__ = ["plot_track"]
+__all__ = ["edges", "plot_track"]
 
 SIZE = 8.0  # [in] of the longer side of the picture
 STEP = 5.0  # [m] between points of the drawn edges, at most

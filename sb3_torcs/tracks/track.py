@@ -20,7 +20,20 @@ import numpy as np
 from sb3_torcs.car import FloatArray
 from sb3_torcs.tracks.profile import RoadProfile, road_profile
 
-__all__ = ["Grid", "Segment", "Surface", "Track", "TrackSummary", "closed", "closing_gap"]
+__all__ = [
+    "CURVATURE",
+    "LENGTH",
+    "START",
+    "WIDTH_END",
+    "WIDTH_START",
+    "Grid",
+    "Segment",
+    "Surface",
+    "Track",
+    "TrackSummary",
+    "closed",
+    "closing_gap",
+]
 
 # Columns of Track.table, one row per segment: plain integers, so that compiled code can use them.
 START = 0  # [m] along the axis from the start line to the segment's beginning

@@ -16,7 +16,7 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_torcs.agents.model_record import STATISTICS
+from sb3_torcs.agents.saved.record import STATISTICS
 from sb3_torcs.car import check_count
 from sb3_torcs.errors import TrainingDiverged
 

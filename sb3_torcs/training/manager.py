@@ -32,9 +32,9 @@ from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback,
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecNormalize
 
 import sb3_torcs  # noqa: F401  registers the environments
-from sb3_torcs.agents.model_algorithm import algorithm_class
-from sb3_torcs.agents.model_record import STATISTICS
-from sb3_torcs.agents.model_writing import RecordCallback, recipe
+from sb3_torcs.agents.saved.algorithm import algorithm_class
+from sb3_torcs.agents.saved.record import STATISTICS
+from sb3_torcs.agents.saved.writing import RecordCallback, recipe
 from sb3_torcs.callbacks import RacingProgressCallback
 from sb3_torcs.errors import (
     InvalidOption,

@@ -11,9 +11,9 @@ import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_torcs.agents.model_algorithm import check_same, told_algorithm
-from sb3_torcs.agents.model_file import as_mismatch, saved_data
 from sb3_torcs.agents.models import check_spaces, saved_spaces, saved_timesteps, training_record
+from sb3_torcs.agents.saved.algorithm import check_same, told_algorithm
+from sb3_torcs.agents.saved.file import as_mismatch, saved_data
 from sb3_torcs.agents.wrapping import frames_of, normalizes
 from sb3_torcs.car import range_finder_angles
 from sb3_torcs.errors import ModelMismatch, ModelNotTrusted

@@ -99,7 +99,7 @@ class Run:
     @property
     def best_model(self) -> Path | None:
         """The best model by evaluation, or the last one if there was no evaluation yet."""
-        from sb3_torcs.agents.model_record import BEST_MODEL
+        from sb3_torcs.agents.saved.record import BEST_MODEL
 
         best = self.folder / BEST_MODEL
         return best if best.is_file() else self.last_model
@@ -252,8 +252,8 @@ def _check_resumed(
     """
     from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-    from sb3_torcs.agents.model_algorithm import algorithm_class
-    from sb3_torcs.agents.model_record import BEST_MODEL
+    from sb3_torcs.agents.saved.algorithm import algorithm_class
+    from sb3_torcs.agents.saved.record import BEST_MODEL
     from sb3_torcs.training.keeping import REPLAY_BUFFER
     from sb3_torcs.training.resuming import check_resumable
 
@@ -278,7 +278,7 @@ def _rollout(algo: str, entry: Mapping[str, Any]) -> int:
     """Return the timesteps between two updates of an algorithm without a replay buffer, else 0."""
     from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-    from sb3_torcs.agents.model_algorithm import algorithm_class
+    from sb3_torcs.agents.saved.algorithm import algorithm_class
 
     kind = algorithm_class(algo)
     if not issubclass(kind, OnPolicyAlgorithm):

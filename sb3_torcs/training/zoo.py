@@ -21,7 +21,7 @@ import gymnasium as gym
 import yaml
 from stable_baselines3.common.policies import ActorCriticPolicy
 
-from sb3_torcs.agents.model_algorithm import SBX, algorithm_class
+from sb3_torcs.agents.saved.algorithm import SBX, algorithm_class
 from sb3_torcs.agents.wrapping import normalizes, unrebuilt, wrapped
 from sb3_torcs.car import is_count, look_both_ways, range_finder_angles
 from sb3_torcs.errors import InvalidOption, ModelMismatch, ZooConfigError, near_miss
@@ -38,11 +38,13 @@ from sb3_torcs.training.zoo_data import (
 )
 
 __all__ = [
+    "OURS",
     "TIME_LIMIT",
     "ZOO_KEYS",
     "Place",
     "UninterruptedWorker",
     "check_entry",
+    "check_env_kwargs",
     "check_racing",
     "check_registered",
     "checked_env",

@@ -19,8 +19,9 @@ from sb3_torcs.backends.seats import Seat, SharedRace
 from sb3_torcs.backends.several import shared_worlds
 from sb3_torcs.car import check_count
 from sb3_torcs.envs.batch import Batch, Outcome
+from sb3_torcs.envs.info import RacingInfo
 from sb3_torcs.envs.making import MANY_RACES, EnvMaker, checked_threads, env_makers
-from sb3_torcs.envs.racing import RacingEnv, RacingInfo
+from sb3_torcs.envs.racing import RacingEnv
 from sb3_torcs.errors import EnvClosed, InvalidOption
 
 __all__ = ["RaceInfo", "TorcsVecEnv", "glance"]

@@ -12,7 +12,7 @@ import numpy as np
 
 from sb3_torcs.car import CarState, Controls, FloatArray
 
-__all__ = ["Line", "blended", "lap_of", "repeated", "waypoint"]
+__all__ = ["PEDAL", "STEERING", "Line", "blended", "lap_of", "repeated", "waypoint"]
 
 TIME, DISTANCE, OFFSET, HEADING, SPEED, STEERING, PEDAL = range(7)
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from sb3_torcs.agents.model_file import referenced_class
+from sb3_torcs.agents.saved.file import referenced_class
 from sb3_torcs.errors import ModelNotTrusted
 
 __all__ = [
@@ -140,7 +140,7 @@ def readable_space(item: Any) -> spaces.Space[Any] | None:
     """
     Build a space from the text that SB3 writes beside its pickle for human readers.
 
-    :param item: of :func:`~sb3_torcs.agents.model_file.saved_data`
+    :param item: of :func:`~sb3_torcs.agents.saved.file.saved_data`
     :return: the space; ``None`` if the text is incomplete
     """
     try:
@@ -159,7 +159,7 @@ def readable_policy(data: Mapping[str, Any]) -> dict[str, Any]:
     """
     Describe the policy of a model that has no record of ours.
 
-    :param data: of :func:`~sb3_torcs.agents.model_file.saved_data`
+    :param data: of :func:`~sb3_torcs.agents.saved.file.saved_data`
     :return: as of :func:`plain_policy`
     """
     name = referenced_class(data.get("policy_class"))

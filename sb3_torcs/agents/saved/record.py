@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 import yaml
 
-from sb3_torcs.agents.model_file import as_mismatch
-from sb3_torcs.agents.model_policy import Spaces, restored_space
+from sb3_torcs.agents.saved.file import as_mismatch
+from sb3_torcs.agents.saved.policy import Spaces, restored_space
 from sb3_torcs.car import DEFAULT_CAR
 from sb3_torcs.envs.aids import AIDS
 from sb3_torcs.errors import ModelMismatch
@@ -88,7 +88,7 @@ class TrainingRecord:
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)
     hyperparameters: Mapping[str, Any] = field(default_factory=dict)  # the entry, as it was read
     spaces: Spaces | None = None  # of observations and actions
-    policy: Mapping[str, Any] | None = None  # as of ``model_policy.plain_policy``
+    policy: Mapping[str, Any] | None = None  # as of ``saved.policy.plain_policy``
     statistics: Statistics | None = None  # of VecNormalize
     statistics_file: Path | None = None  # the same, pickled by the zoo
     driver_only: bool = False  # whether the parts that only learning needs were left out
@@ -119,7 +119,7 @@ def record_within(model: Path, data: Mapping[str, Any]) -> TrainingRecord | None
     Read the record that a model's file holds.
 
     :param model: the file, for messages
-    :param data: of :func:`~sb3_torcs.agents.model_file.saved_data`
+    :param data: of :func:`~sb3_torcs.agents.saved.file.saved_data`
     :return: the record; ``None`` if there is none, or if it is of an earlier training
     :raises ModelMismatch: if it cannot be read
     """

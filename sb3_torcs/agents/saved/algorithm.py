@@ -6,7 +6,7 @@ import importlib
 from pathlib import Path
 from typing import Any
 
-from sb3_torcs.agents.model_file import referenced_class
+from sb3_torcs.agents.saved.file import referenced_class
 from sb3_torcs.errors import InvalidOption, ModelMismatch, PackageMissing, near_miss
 
 __all__ = ["SBX", "algorithm_class", "algorithm_of", "check_same", "is_sbx", "told_algorithm"]
@@ -65,7 +65,7 @@ def told_algorithm(data: dict[str, Any]) -> str | None:
     """
     Infer the algorithm of a model from its saved attributes.
 
-    :param data: of :func:`~sb3_torcs.agents.model_file.saved_data`
+    :param data: of :func:`~sb3_torcs.agents.saved.file.saved_data`
     :return: the zoo's name of it; ``None`` if it cannot be inferred
     """
     from rl_zoo3.utils import ALGOS
@@ -85,7 +85,7 @@ def algorithm_of(name: str | None, data: dict[str, Any], model: Path) -> tuple[s
     Find the algorithm of a saved model.
 
     :param name: the zoo's name of it; ``None`` infers it
-    :param data: of :func:`~sb3_torcs.agents.model_file.saved_data`
+    :param data: of :func:`~sb3_torcs.agents.saved.file.saved_data`
     :param model: the file, for messages
     :return: its name and its class
     :raises ModelMismatch: if it cannot be inferred
@@ -107,7 +107,7 @@ def is_sbx(data: dict[str, Any]) -> bool:
     """
     Check whether a model is of SBX, which has SB3's algorithms in JAX.
 
-    :param data: of :func:`~sb3_torcs.agents.model_file.saved_data`
+    :param data: of :func:`~sb3_torcs.agents.saved.file.saved_data`
     :return: whether it is
     """
     return referenced_class(data.get("policy_class")).startswith("sbx.")

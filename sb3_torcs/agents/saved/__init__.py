@@ -1,0 +1,1 @@
+"""Models in files: what they hold, how they were trained, and who drives with them."""
