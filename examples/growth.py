@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from sb3_torcs import cores
-from sb3_torcs.bench.torcs import scripted_actions
+from sb3_torcs.bench.drives import scripted_actions
 from sb3_torcs.bench.updates import default_model
 from sb3_torcs.policies.updates import LeanUpdates
 from sb3_torcs.training.zoo import config_file, read_entry

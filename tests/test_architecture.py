@@ -78,7 +78,7 @@ ASKS_DRIVERS = {
     "agents/saved/driver.py",  # hands on what it is asked
     "agents/pilots.py",  # several at once, in one race
     "agents/rollout.py",
-    "bench/torcs.py",  # on threads, where nobody looks at what is driven
+    "bench/drives.py",  # on threads, where nobody looks at what is driven
     "callbacks/driven_line.py",  # hands on, for all cars of a vector
     "training/keeping.py",  # only to see whether the answer is a number
 }

@@ -8,7 +8,7 @@ from typing import Any
 
 import gymnasium as gym
 
-from sb3_torcs.bench.torcs import TICKS_PER_TURN, Figures, scripted_actions
+from sb3_torcs.bench.drives import TICKS_PER_TURN, Figures, scripted_actions
 
 __all__ = ["environments", "resets"]
 

@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from sb3_torcs import cores
-from sb3_torcs.bench.torcs import Figures
+from sb3_torcs.bench.drives import Figures
 from sb3_torcs.policies.threads import one_thread
 
 __all__ = ["training_rate", "training_share"]

@@ -14,7 +14,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_torcs.bench.torcs import Figures
+from sb3_torcs.bench.drives import Figures
 from sb3_torcs.callbacks import LeanUpdatesCallback
 from sb3_torcs.policies.threads import one_thread
 from sb3_torcs.vec_env import TorcsVecEnv

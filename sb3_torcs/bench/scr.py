@@ -11,7 +11,14 @@ from collections.abc import Callable
 
 import gymnasium as gym
 
-from sb3_torcs.bench.torcs import REPEAT, TICKS_PER_TURN, TORCS, Figures, scripted_actions
+from sb3_torcs.bench.drives import (
+    REPEAT,
+    TICKS_PER_TURN,
+    TORCS,
+    Figures,
+    mean_reset_ms,
+    scripted_actions,
+)
 
 __all__ = ["pictures", "resets", "ticks"]
 
@@ -46,14 +53,7 @@ def resets() -> Figures:
     :return: ``scr_reset_ms``, the mean of both
     """
     env = gym.make(TORCS, backend="scr")
-    env.reset(seed=0)
-    spent = 0.0
-    for _ in range(RESETS):
-        for start in ("grid", "random"):
-            env.get_wrapper_attr("set_start")(start)
-            spent += _time(env.reset)
-    env.close()
-    return {"scr_reset_ms": 1000.0 * spent / (2 * RESETS)}
+    return {"scr_reset_ms": mean_reset_ms(env, RESETS, time.perf_counter)}
 
 
 def pictures() -> Figures:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from sb3_torcs.bench import scr, torcs
+from sb3_torcs.bench.drives import Figures
 from sb3_torcs.bench.environments import environments, resets
 from sb3_torcs.bench.learning import training_rate, training_share
 from sb3_torcs.bench.on_policy import ppo
 from sb3_torcs.bench.policy import measure
-from sb3_torcs.bench.torcs import Figures
 from sb3_torcs.bench.updates import default_updates
 from sb3_torcs.bench.vec_env import race, vec_env
 from sb3_torcs.errors import BackendUnavailable

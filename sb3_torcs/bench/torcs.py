@@ -15,38 +15,29 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 
+from sb3_torcs.bench.drives import (
+    RACES,
+    REPEAT,
+    TICKS_PER_TURN,
+    TORCS,
+    Actions,
+    Figures,
+    mean_reset_ms,
+    scripted_actions,
+    scripted_batches,
+)
 from sb3_torcs.car import FloatArray
 
-__all__ = [
-    "RACES",
-    "REPEAT",
-    "TICKS_PER_TURN",
-    "TORCS",
-    "Actions",
-    "Figures",
-    "loads",
-    "resets",
-    "scripted_actions",
-    "scripted_batches",
-    "ticks",
-    "vector",
-]
+__all__ = ["loads", "resets", "ticks", "vector"]
 
-TORCS = "sb3_torcs:Torcs-v0"
-REPEAT = 5  # control ticks per timestep, the default
-TICKS_PER_TURN = 3000  # a minute of driving
 PHYSICS_STEPS = 10  # of 0.002 s in a control tick
 STRETCH = 50  # ticks of the drive between two places where the bare physics is measured
 HELD = 25  # ticks for which it goes on there: the car still drives as it did
 RESETS = 100  # of each kind
 SLOWEST_TRACK = "road/spring"  # has by far the most segments
 LOADS = 5
-RACES = 16
 BATCHES = 100  # timesteps of all races per measurement of the threads: a sixth of a second
 SLICE = 0.15  # [s] of wall time per measurement of the processes
-
-Figures = dict[str, float | None]
-Actions = list[npt.NDArray[np.float32]]
 
 
 def ticks(seconds: float) -> Figures:
@@ -75,20 +66,6 @@ def ticks(seconds: float) -> Figures:
     single.close()
     repeated.close()
     return {name: statistics.median(values) for name, values in rates.items()}
-
-
-def scripted_actions(env: gym.Env[Any, Any], number: int) -> Actions:
-    """
-    Let the scripted driver choose actions from the grid on, and end before the episode does.
-
-    :param env: to drive in
-    :param number: of actions, at most
-    """
-    from sb3_torcs.agents.rollout import drive
-    from sb3_torcs.agents.scripted import ScriptedDriver
-
-    steps = list(zip(drive(env, ScriptedDriver(), seed=0), range(number), strict=False))
-    return [step.action for step, _ in steps if not step.done]
 
 
 def _limit(engine: Any, controls: FloatArray) -> float:
@@ -130,17 +107,7 @@ def resets() -> Figures:
 
     :return: ``torcs_reset_ms``, the mean of both
     """
-    env = gym.make(TORCS)
-    env.reset(seed=0)
-    spent = 0.0
-    for _ in range(RESETS):
-        for start in ("grid", "random"):
-            env.get_wrapper_attr("set_start")(start)
-            begin = time.process_time()
-            env.reset()
-            spent += time.process_time() - begin
-    env.close()
-    return {"torcs_reset_ms": 1000.0 * spent / (2 * RESETS)}
+    return {"torcs_reset_ms": mean_reset_ms(gym.make(TORCS), RESETS, time.process_time)}
 
 
 def loads() -> Figures:
@@ -190,23 +157,6 @@ def vector(seconds: float) -> Figures:
     one.close()
     two.close()
     return {"torcs_vector2_ratio": statistics.median(ratios)}
-
-
-def scripted_batches(observations: Any, step: Callable[[Any], Any], number: int) -> Actions:
-    """
-    Let the scripted driver choose actions for many cars at once.
-
-    :param observations: from a reset
-    :param step: of a vector environment; returns the next observations first
-    :param number: of actions
-    """
-    from sb3_torcs.agents.scripted import ScriptedDriver
-
-    driver, actions = ScriptedDriver(), []
-    for _ in range(number):
-        actions.append(driver.predict(observations)[0])
-        observations = step(actions[-1])[0]
-    return actions
 
 
 def _sweep(envs: gym.vector.VectorEnv[Any, Any, Any], actions: Actions) -> float:

@@ -12,8 +12,8 @@ import torch as th
 from stable_baselines3 import DDPG
 
 from sb3_torcs import cores
+from sb3_torcs.bench.drives import Figures
 from sb3_torcs.bench.policy import SpacesOnly, fill
-from sb3_torcs.bench.torcs import Figures
 from sb3_torcs.policies import SplitHeadPolicy
 from sb3_torcs.policies.mirrored_replay import sample_mirrored
 from sb3_torcs.policies.threads import one_thread

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import gymnasium as gym
 import numpy as np
 
-from sb3_torcs.bench.torcs import (
+from sb3_torcs.bench.drives import (
     RACES,
     REPEAT,
     TORCS,
