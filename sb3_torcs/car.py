@@ -32,6 +32,7 @@ __all__ = [
     "MAX_START_SPEED",
     "NO_RACE",
     "RANGE_FINDERS",
+    "RESTING",
     "REST_HEIGHT",
     "RIVALS",
     "RPM",
@@ -133,6 +134,10 @@ class Controls(NamedTuple):
     brake: float  # [-] in [0, 1]
     gear: int | None = None  # [-] -1 reverse, 0 neutral; None leaves it to the gearbox
     clutch: float = 0.0  # [-] in [0, 1], 1 is pressed; any gearbox presses it, too, while it shifts
+
+
+RESTING = Controls(0.0, 0.0, 0.0)
+"""Straight on, no pedal: before the first action."""
 
 
 class Start(NamedTuple):

@@ -189,7 +189,7 @@ PRESETS: dict[RewardName, dict[str, float]] = {
 """``progress``: Lillicrap et al.; ``blog``: the post's; ``apex``: its final update, which leaves
 out the pull to the middle of the road."""
 
-CRASHES = frozenset({"off_track", "backwards", "stuck", "damage", "lost"})
+CRASHES = ("off_track", "backwards", "stuck", "damage", "lost")
 
 
 class Reward:

@@ -45,6 +45,7 @@ __all__ = [
     "OBSERVATION_HIGH",
     "OBSERVATION_LOW",
     "OBSERVATION_SIZE",
+    "SCR_RPM",
     "SENSORS",
     "Sensor",
     "SensorsName",

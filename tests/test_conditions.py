@@ -16,7 +16,8 @@ from vectors import assert_they_see_the_same, both_kinds
 
 import sb3_torcs  # noqa: F401  # registers the ids
 from sb3_torcs.callbacks import ConditionsCallback
-from sb3_torcs.envs.conditions import RESTING, Delay
+from sb3_torcs.car import RESTING
+from sb3_torcs.envs.conditions import Delay
 from sb3_torcs.envs.racing import RacingEnv
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.vec_env import TorcsVecEnv

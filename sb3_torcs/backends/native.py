@@ -29,7 +29,7 @@ from sb3_torcs.car import (
 from sb3_torcs.errors import BackendUnavailable, EnvClosed, InvalidOption, TrackFileError
 from sb3_torcs.torcs.building import build_command
 from sb3_torcs.torcs.installation import Game, find_game
-from sb3_torcs.torcs.race_setup import SCR_SERVER, SESSIONS, RaceSetup, Session, session_for
+from sb3_torcs.torcs.race_setup import SCR_DRIVER, SESSIONS, RaceSetup, Session, session_for
 from sb3_torcs.torcs.starting_list import AGENT, starting_list
 from sb3_torcs.torcs.track_names import TrackFile, find_track
 from sb3_torcs.torcs.trial_child import encoded
@@ -231,7 +231,7 @@ class NativeBackend(EngineWorld):
 
         :raises InvalidOption: if the game cannot run it
         """
-        drivers = [(SCR_SERVER, 0) if entry == AGENT else entry for entry in self._entries]
+        drivers = [SCR_DRIVER if entry == AGENT else entry for entry in self._entries]
         return RaceSetup(
             self._settings["track"],
             drivers,

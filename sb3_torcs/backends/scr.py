@@ -40,7 +40,7 @@ from sb3_torcs.scr.server import SCR_PORT, open_ports, start_server
 from sb3_torcs.sensors import encode
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.process import GameProcess, compiled_library
-from sb3_torcs.torcs.race_setup import SCR_SERVER, RaceSetup
+from sb3_torcs.torcs.race_setup import SCR_DRIVER, RaceSetup
 from sb3_torcs.torcs.starting_list import AGENT, starting_list
 from sb3_torcs.torcs.track_names import find_track, lasting_track
 from sb3_torcs.tracks.catalogue import load_track
@@ -50,7 +50,6 @@ from sb3_torcs.tracks.trial import engine_arguments, load_road
 
 __all__ = ["ScrBackend"]
 
-DRIVER = (SCR_SERVER, 0)
 MAX_PORT = 65535
 HOST = "127.0.0.1"
 PATIENCE = 60.0  # [s] with a game of our own, which also has to load on a busy machine
@@ -137,7 +136,7 @@ class ScrBackend:
             raise InvalidOption(f"port is {port!r}; expected 1 to {MAX_PORT}")
         self._race = RaceSetup(
             self._settings["track"] or "",  # a race elsewhere is not set up here
-            [DRIVER if entry == AGENT else entry for entry in entries],
+            [SCR_DRIVER if entry == AGENT else entry for entry in entries],
             laps=laps if len(entries) > 1 and laps else MANY_LAPS,
             session="race" if len(entries) > 1 else "practice",
             car=car,

@@ -26,6 +26,7 @@ from sb3_torcs.callbacks.driven_line import DrivenLine, drive_lap, line_image
 from sb3_torcs.callbacks.tree import callbacks_in
 from sb3_torcs.car import check_count
 from sb3_torcs.errors import InvalidOption, renamed
+from sb3_torcs.rewards import CRASHES
 from sb3_torcs.vec_env import glance
 
 __all__ = [
@@ -50,7 +51,7 @@ Each episode's row of ``monitor.csv`` then holds these, too. Monitor adds the tw
 default for the first is a tuple: hence the empty list. A ``best_lap_time`` of 0 is no whole lap.
 """
 
-ENDS = ("off_track", "backwards", "stuck", "damage", "lost", "laps", "race", "time_limit")
+ENDS = (*CRASHES, "laps", "race", "time_limit")
 
 SATURATED = 0.01  # [-] of an actuator's range: an action so near to a limit counts as at it
 RECORD_EVERY = 100  # calls between two records of the means over timesteps

@@ -22,6 +22,7 @@ from sb3_torcs.cli.common import (
     warn_unless_known,
 )
 from sb3_torcs.signals import held_back
+from sb3_torcs.torcs.starting_list import GRIDS
 
 if TYPE_CHECKING:
     from sb3_torcs.races.entrants import Entrant
@@ -40,7 +41,6 @@ NEED_THE_LAST = ("telemetry", "report")
 """What is written only if all races were held."""
 
 DRAWING = "sb3-torcs: drawing the video of the first race; Ctrl-C again leaves it out\n"
-GRIDS = ("last", "reverse", "random")
 BAR = "{l_bar}{bar}| {n:.1f}/{total} races [{elapsed}<{remaining}]"
 UNKNOWN = "-"  # in tables
 HEADERS = ("driver", "races", "wins", "win rate", "mean place", "finished", "damage/km", "rating")

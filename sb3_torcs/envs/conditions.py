@@ -8,12 +8,11 @@ from typing import Any
 import numpy as np
 
 from sb3_torcs.backends.base import optional
-from sb3_torcs.car import Controls, checked_delay, checked_factor
+from sb3_torcs.car import RESTING, Controls, checked_delay, checked_factor
 from sb3_torcs.errors import InvalidOption
 
 __all__ = ["Conditions", "Delay", "Part"]
 
-RESTING = Controls(0.0, 0.0, 0.0)  # held until the first action arrives
 
 Part = tuple[Controls, int]
 """Controls, and the control ticks for which they are held."""

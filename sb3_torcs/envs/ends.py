@@ -7,8 +7,8 @@ import math
 from sb3_torcs.car import KMH, MAX_DAMAGE, CarState
 
 __all__ = [
-    "ENDS",
     "GRACE_TICKS",
+    "REASONS",
     "STUCK_SPEED",
     "STUCK_TICKS",
     "TRUNCATING",
@@ -24,7 +24,7 @@ BACKWARDS_ANGLE = 0.5 * math.pi  # [rad] to the road from which the car faces ba
 TRUNCATING = ("laps", "race")
 """The ends of an episode that are no fault of the driver's."""
 
-ENDS = ("", "laps", "off_track", "backwards", "damage")
+REASONS = ("", "laps", "off_track", "backwards", "damage")
 """Why an episode ends because of the state of the car, by the index that :func:`end_of` returns."""
 
 
@@ -37,7 +37,7 @@ def end_of(car: CarState, laps: float, runoff: float, recovery: float) -> int:
     :param runoff: how far the car may be beside the road [m]
     :param recovery: how long a car may be without headway [control ticks]; 0 ends the episode of
         one that faces backwards at once
-    :return: the index of the reason in :data:`ENDS`, 0 if the episode goes on
+    :return: the index of the reason in :data:`REASONS`, 0 if the episode goes on
     """
     if car.laps >= laps:
         return 1

@@ -16,6 +16,7 @@ from sb3_torcs.actions import ActionName, action_layout, controls_from_action
 from sb3_torcs.backends.base import Backend, optional
 from sb3_torcs.car import (
     CONTROL_TICK,
+    RESTING,
     CarState,
     Controls,
     FloatArray,
@@ -31,7 +32,7 @@ from sb3_torcs.car import (
 )
 from sb3_torcs.envs.aids import NEED_RIVALS, Aids
 from sb3_torcs.envs.conditions import Conditions, Delay, Part
-from sb3_torcs.envs.ends import ENDS, GRACE_TICKS, STUCK_TICKS, TRUNCATING, end_of, stands
+from sb3_torcs.envs.ends import GRACE_TICKS, REASONS, STUCK_TICKS, TRUNCATING, end_of, stands
 from sb3_torcs.envs.info import racing_info
 from sb3_torcs.envs.starts import Starts, read_start
 from sb3_torcs.errors import CarLost, EnvClosed, InvalidOption, StartBlocked
@@ -156,7 +157,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         self.conditions.check(backend)
         self.delay = Delay(0, self.action_repeat)
         self.car: CarState | None = None
-        self._controls = Controls(0.0, 0.0, 0.0)
+        self._controls = RESTING
         self._viewer: Any = None
         self._closed = self._race_is_over = False
         self._over = self._warned = False
@@ -279,7 +280,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
             # A wall stands where a start was drawn: rare, but a training draws thousands.
             start = None
             self.car = self.backend.reset(self.np_random, start)
-        self._controls = Controls(0.0, 0.0, 0.0)
+        self._controls = RESTING
         grace = STUCK_TICKS if start is not None and start.speed > 0.0 else GRACE_TICKS
         self.patience = max(grace, self.recovery_ticks)
         self.standing = 0
@@ -446,7 +447,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         laps = math.inf if self.laps is None else self.laps
         reason = end_of(car, laps, self.runoff, self.recovery_ticks)
         if reason:
-            return ENDS[reason]
+            return REASONS[reason]
         if not stands(car):
             self.standing, self.patience = 0, max(STUCK_TICKS, self.recovery_ticks)
             return self._end_of_race()

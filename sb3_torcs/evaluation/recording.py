@@ -11,7 +11,7 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 
-from sb3_torcs.car import CarState, Controls
+from sb3_torcs.car import RESTING, CarState, Controls
 from sb3_torcs.evaluation.ticks import TickedWorld
 from sb3_torcs.telemetry import CONTROL_FIELDS, STATE_FIELDS, write_telemetry
 from sb3_torcs.tracks.track import Track
@@ -28,7 +28,7 @@ class Recorded(NamedTuple):
     action: npt.NDArray[np.float32]
     car: CarState
     lap_time: float  # [s] if it completed a lap, else 0
-    controls: Controls = Controls(0.0, 0.0, 0.0)  # that the action stands for
+    controls: Controls = RESTING  # that the action stands for
 
 
 class Stretch(NamedTuple):

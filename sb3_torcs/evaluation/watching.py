@@ -27,7 +27,7 @@ from sb3_torcs.telemetry import DriveLog
 from sb3_torcs.torcs.installation import Game
 from sb3_torcs.torcs.process import GameProcess
 from sb3_torcs.torcs.race_results import RobotResult
-from sb3_torcs.torcs.race_setup import SCR_SERVER, RaceSetup, session_for
+from sb3_torcs.torcs.race_setup import SCR_DRIVER, RaceSetup, session_for
 from sb3_torcs.torcs.results import read_results
 from sb3_torcs.torcs.window import ViewName, Window, window_arguments
 from sb3_torcs.tracks.trial import check_track
@@ -35,7 +35,6 @@ from sb3_torcs.tracks.trial import check_track
 __all__ = ["Show", "drive_logs", "record_shows", "show_in_window"]
 
 AFTERMATH = 2.0  # [s] of the race that are shown after an agent's drive has ended
-SCR_DRIVER = (SCR_SERVER, 0)
 
 
 @dataclass

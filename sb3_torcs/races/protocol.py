@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any, Literal, Protocol, get_args
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from sb3_torcs.car import CONTROL_TICK, Controls, FloatArray, checked_choice, ch
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.races.entrants import Entrant
 from sb3_torcs.telemetry import DriveLabel, DriveLog
-from sb3_torcs.torcs.starting_list import GRID_SLOTS
+from sb3_torcs.torcs.starting_list import GRID_SLOTS, GRIDS, GridName
 from sb3_torcs.tracks.catalogue import lasting_name
 from sb3_torcs.tracks.track import Track
 
@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from sb3_torcs._engine import Engine
 
 __all__ = [
-    "GRIDS",
-    "GridName",
     "Notes",
     "Race",
     "Standing",
@@ -34,8 +32,6 @@ __all__ = [
     "run_races",
 ]
 
-GridName = Literal["last", "reverse", "random"]
-GRIDS = get_args(GridName)
 
 LOOK = 50  # [control ticks] a second, after which the race is looked at
 SLOWEST = 10.0  # [m/s] below which the game takes a car out, for a lap and ...

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 from sb3_torcs.car import KMH, FloatArray, Start
 from sb3_torcs.errors import MessageBroken
+from sb3_torcs.sensors import SCR_RPM
 
 __all__ = [
     "IDENTIFIED",
@@ -49,7 +50,6 @@ SHUTDOWN = b"***shutdown***"
 
 NO_FOCUS = 360.0  # [degrees] outside the range of any server
 CLIENT = b"SCR"  # beginning of a client's first message; servers check no more of it
-RPM = 10.0  # the server's "rpm" per rad/s
 DIGITS = 6  # of the server's numbers
 EXACT_DIGITS = 17  # that identify a double
 HIGHEST_GEAR = 8  # the game has room for no more
@@ -132,7 +132,7 @@ _TAGS = (
     _Tag(b"lastLapTime", 1),
     _Tag(b"opponents", 36),
     _Tag(b"racePos", 1, whole=True),
-    _Tag(b"rpm", 1, RPM),
+    _Tag(b"rpm", 1, SCR_RPM),
     _Tag(b"speedX", 1, KMH),
     _Tag(b"speedY", 1, KMH),
     _Tag(b"speedZ", 1, KMH),
@@ -200,7 +200,7 @@ def parse_motor(message: bytes) -> MotorReading:
             words.append(message[begin : message.index(b")", begin)])
         lap_time, gear, revs, speed = map(float, words)
         if math.isfinite(lap_time + revs + speed) and gear.is_integer() and b"_" not in message:
-            return MotorReading(lap_time, int(gear), revs / RPM, speed / KMH)
+            return MotorReading(lap_time, int(gear), revs / SCR_RPM, speed / KMH)
     state = parse_state(message)
     return MotorReading(state.lap_time, state.gear, state.engine_speed, state.speed_x)
 
@@ -364,7 +364,7 @@ def _parse_ordered(text: bytes) -> ScrState | None:
     ):
         return None
     state = (
-        *n[:6], int(gear), n[7], n[8:44], int(position), n[45] / RPM,
+        *n[:6], int(gear), n[7], n[8:44], int(position), n[45] / SCR_RPM,
         n[46] / KMH, n[47] / KMH, n[48] / KMH, n[49:68], n[68], n[69:73], n[73], n[74:], yaw_rate,
     )  # fmt: skip
     return tuple.__new__(ScrState, state)

@@ -17,6 +17,7 @@ from sb3_torcs.torcs.starting_list import GRID_SLOTS
 
 __all__ = [
     "RACE_FILE",
+    "SCR_DRIVER",
     "SCR_DRIVERS",
     "SCR_SERVER",
     "SESSIONS",
@@ -34,6 +35,7 @@ RACE_FILE = "race.xml"  # names the folder of the results, too
 ENGINE_SETTINGS = "config/raceengine.xml"
 
 SCR_SERVER = "scr_server"
+SCR_DRIVER = (SCR_SERVER, 0)  # the first driver of our own module
 """The module whose drivers are clients of the SCR protocol."""
 SCR_DRIVERS = 10  # of the module, as that of the championship had
 

@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from typing import Literal, get_args
 
 from sb3_torcs.car import is_count
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.torcs.installation import Game
 
-__all__ = ["AGENT", "GRID_SLOTS", "guests_of", "starting_list"]
+__all__ = ["AGENT", "GRIDS", "GRID_SLOTS", "GridName", "guests_of", "starting_list"]
 
 AGENT = ("", 0)
 """The entry of the first agent in a starting list; robots have a name and an index."""
 
 GRID_SLOTS = 20
 """[-] For which the grids of the game's tracks have room."""
+
+GridName = Literal["last", "reverse", "random"]
+"""Who starts where: see :func:`~sb3_torcs.races.protocol.run_races`."""
+GRIDS = get_args(GridName)
 
 
 def starting_list(

@@ -18,7 +18,7 @@ import numpy as np
 
 from sb3_torcs.agents.ghosts import Ghost
 from sb3_torcs.backends.native import make_engine, make_rollouts
-from sb3_torcs.car import CONTROL_TICK, DEFAULT_CAR, Controls, FloatArray
+from sb3_torcs.car import CONTROL_TICK, DEFAULT_CAR, RESTING, FloatArray
 from sb3_torcs.envs.making import checked_threads
 from sb3_torcs.evaluation.protocol import RACE_LAPS
 from sb3_torcs.torcs.installation import find_game
@@ -32,7 +32,7 @@ from sb3_torcs.training.lap_search.line import (
     repeated,
     waypoint,
 )
-from sb3_torcs.training.lap_search.starts import Start
+from sb3_torcs.training.lap_search.starts import FirstDrive
 
 __all__ = ["Budget", "LapSearch", "State"]
 
@@ -50,7 +50,6 @@ MOST_DEAD_ENDS = 30  # per race
 SPREAD = np.array([0.15, 0.8, 1.5])  # of steering [-], pedal [-] and place [m]
 SHORTEST, LONGEST = 0.2, 2.0  # [s] of one change
 SMALLEST = 0.1  # of the spread: how small changes can be
-STANDING = Controls(0.0, 0.0, 0.0)  # of a car that has just arrived
 FAILED = -100.0  # [s] that a candidate has won that leaves the road
 
 
@@ -99,7 +98,7 @@ class LapSearch:
         self,
         agent: str,
         env_kwargs: Mapping[str, Any],
-        starts: Sequence[Start],
+        starts: Sequence[FirstDrive],
         *,
         seed: int = 0,
         threads: int | None = None,
@@ -180,7 +179,7 @@ class LapSearch:
         stride, steps = self._timesteps(STRIDE), self._timesteps(HORIZON)
         mean, careful, dead_ends, lap = np.zeros((steps, 3)), 0, 0, -1
         while (car := self._engines[0].read(0)).laps < RACE_LAPS:
-            here = np.array(waypoint(car, STANDING))
+            here = np.array(waypoint(car, RESTING))
             if car.laps != lap:
                 lap = car.laps
                 self._note_laps([*rows, here])
@@ -203,7 +202,7 @@ class LapSearch:
             self._rollouts.go_back(back)
             del rows[len(rows) - back * stride :]
             mean, careful = np.zeros((ahead, 3)), CAREFUL
-        rows.append(np.array(waypoint(car, STANDING)))
+        rows.append(np.array(waypoint(car, RESTING)))
 
     def _timesteps(self, seconds: float) -> int:
         return max(round(seconds / (self._ticks * CONTROL_TICK)), 1)

@@ -21,10 +21,10 @@ from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.track_names import lasting_track
 from sb3_torcs.training.lap_search.line import waypoint
 
-__all__ = ["Start", "find_starts", "ghost_environment"]
+__all__ = ["FirstDrive", "find_starts", "ghost_environment"]
 
 
-class Start(NamedTuple):
+class FirstDrive(NamedTuple):
     """A drive of three laps."""
 
     driver: str
@@ -61,7 +61,7 @@ def ghost_environment(agent: str, track: str | None, car: str | None) -> dict[st
 
 def find_starts(
     agent: str, env_kwargs: Mapping[str, Any], *, alone: bool = False, trust: bool = False
-) -> list[Start]:
+) -> list[FirstDrive]:
     """
     Find drives of three laps to begin a search with.
 
@@ -89,7 +89,7 @@ def find_starts(
     return sorted(whole, key=lambda start: start.seconds)
 
 
-def agents_start(agent: str, env_kwargs: Mapping[str, Any], trust: bool) -> Start:
+def agents_start(agent: str, env_kwargs: Mapping[str, Any], trust: bool) -> FirstDrive:
     """
     Let an agent drive.
 
@@ -111,10 +111,10 @@ def agents_start(agent: str, env_kwargs: Mapping[str, Any], trust: bool) -> Star
             laps += [step.info["lap_time"]] if step.info["lap_time"] else []
     finally:
         bare.close()
-    return Start(agent, _rows(cars, controls), tuple(laps))
+    return FirstDrive(agent, _rows(cars, controls), tuple(laps))
 
 
-def scripted_start(env_kwargs: Mapping[str, Any]) -> Start:
+def scripted_start(env_kwargs: Mapping[str, Any]) -> FirstDrive:
     """
     Let the scripted driver drive.
 
@@ -124,7 +124,7 @@ def scripted_start(env_kwargs: Mapping[str, Any]) -> Start:
     return agents_start(SCRIPTED, {**plain, "action_repeat": env_kwargs["action_repeat"]}, False)
 
 
-def robots_starts(track: str, car: str, ticks: int) -> Iterator[Start]:
+def robots_starts(track: str, car: str, ticks: int) -> Iterator[FirstDrive]:
     """
     Let all robots drive that have a driver of the car.
 
@@ -146,7 +146,7 @@ def robots_starts(track: str, car: str, ticks: int) -> Iterator[Start]:
             break
 
 
-def _robots_start(track: str, robot: tuple[str, int], ticks: int) -> Start:
+def _robots_start(track: str, robot: tuple[str, int], ticks: int) -> FirstDrive:
     engine = make_engine(find_game(), track, [robot], laps=RACE_LAPS)
     try:
         engine.start()
@@ -160,7 +160,7 @@ def _robots_start(track: str, robot: tuple[str, int], ticks: int) -> Start:
         laps = tuple(time for time, _ in engine.laps(0))
     finally:
         engine.close()
-    return Start(f"{robot[0]}:{robot[1]}", _rows(cars, controls), laps)
+    return FirstDrive(f"{robot[0]}:{robot[1]}", _rows(cars, controls), laps)
 
 
 def _rows(cars: list[CarState], controls: list[Controls]) -> FloatArray:
