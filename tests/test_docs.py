@@ -547,7 +547,7 @@ def slug(heading):
 
 LINKS = [
     (page, target)
-    for page in PAGES
+    for page in [*PAGES, *PACKAGE.glob("agents/*/README.md")]
     for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text("utf-8"))
     if not target.startswith(("http://", "https://"))
 ]

@@ -113,6 +113,9 @@ def test_a_broken_file_is_named_with_its_line(tmp_path, text, message):
 
 
 def test_an_entry_that_is_not_there_is_told_the_near_miss():
+    message = r"no entry 'open'; it has: .*; ppo\.yml has it, so add: --algo ppo$"
+    with pytest.raises(ZooConfigError, match=message):
+        zoo.read_entry(zoo.config_file("ddpg"), "open")
     with pytest.raises(ZooConfigError, match=r"no entry 'TorcsLight-v0'; did you mean 'TorcsLite"):
         zoo.read_entry(zoo.config_file("ddpg"), "TorcsLight-v0")
 

@@ -8,6 +8,7 @@ import copy
 import importlib
 import re
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -28,6 +29,7 @@ __all__ = [
     "check_sight",
     "plain_python",
     "policy_arguments",
+    "told_where",
 ]
 
 EVALUATED = (
@@ -298,3 +300,18 @@ def _value(node: ast.expr) -> Any:
         if None not in named:  # of ``**``
             return {str(name): _value(value) for name, value in named.items()}
     return ast.literal_eval(node)
+
+
+def told_where(entry: str, path: Path) -> str:
+    """
+    Tell which of the files beside a hyperparameter file has an entry.
+
+    :param entry: that the file lacks
+    :param path: of the file
+    :return: e.g. ``"; ppo.yml has it, so add: --algo ppo"``; empty if none has
+    """
+    for other in sorted(path.parent.glob("*.yml")):
+        with contextlib.suppress(OSError, UnicodeDecodeError):
+            if re.search(rf"^{re.escape(entry)}:", other.read_text(encoding="utf-8"), re.MULTILINE):
+                return f"; {other.name} has it, so add: --algo {other.stem}"
+    return ""
