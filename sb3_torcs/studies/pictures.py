@@ -23,10 +23,6 @@ def draw_variant(learning: Learning) -> bytes:
         for curves in learning.seeds:
             own = curves["timesteps"] / 1000.0, _drawable(curves[name])
             panels[name].plot(*own, color="tab:blue", alpha=0.35, linewidth=0.8)
-    if not any(np.isfinite(curves["lap"]).any() for curves in learning.seeds):
-        laps = panels["lap"]
-        laps.set_yticks([])
-        laps.text(0.5, 0.5, "no seed has one", ha="center", transform=laps.transAxes)
     _bands(panels, learning, "tab:red")
     panels[COMPLETES].plot(
         learning.timesteps / 1000.0, learning.so_far, color="tab:blue", linestyle="--"
@@ -63,6 +59,11 @@ def _figure(variants: Sequence[Learning]) -> tuple[Any, dict[str, Any]]:
         panel.set_xlim(0.0, 1.02 * max(trial.train[-1]["decisions"] for trial in trials) / 1000.0)
         panel.grid(alpha=0.3)
     panels[COMPLETES].set_ylim(-0.03, 1.03)
+    seeds = [curves for learning in variants for curves in learning.seeds]
+    if not any(np.isfinite(curves["lap"]).any() for curves in seeds):
+        laps = panels["lap"]
+        laps.set_yticks([])
+        laps.text(0.5, 0.5, "no seed has one", ha="center", transform=laps.transAxes)
     return figure, panels
 
 
@@ -82,7 +83,8 @@ def _as_png(figure: Any) -> bytes:
 def _band(panel: Any, timesteps: Array, figure: Estimate, colour: Any) -> None:
     """Draw a figure and its interval, which ends where the axes do if it has no end."""
     value = _drawable(figure.value)
-    panel.plot(timesteps, value, color=colour, linewidth=2.0)
+    alone = "o" if np.isfinite(value).sum() == 1 else ""  # a line needs two points
+    panel.plot(timesteps, value, color=colour, linewidth=2.0, marker=alone)
     top = np.where(np.isfinite(figure.high), figure.high, panel.get_ylim()[1])
     shown = np.isfinite(value) & np.isfinite(figure.low)
     panel.fill_between(
