@@ -622,8 +622,8 @@ def test_work_spaces_begin_at_a_cache_line(dtype):
 
 
 @pytest.mark.parametrize(("make", "found"), [
-    (lambda: SAC("MlpPolicy", ToyRace(), buffer_size=10), "a SAC with SACPolicy"),
-    (lambda: DDPG("MlpPolicy", ToyRace(), buffer_size=10), "a DDPG with TD3Policy"),
+    (lambda: SAC("MlpPolicy", ToyRace(), buffer_size=10), "by SAC with SACPolicy"),
+    (lambda: DDPG("MlpPolicy", ToyRace(), buffer_size=10), "by DDPG with TD3Policy"),
 ])  # fmt: skip
 def test_a_model_without_the_policy_has_no_lean_updates(make, found):
     with pytest.raises(InvalidOption, match=found):

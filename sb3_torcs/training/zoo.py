@@ -35,7 +35,7 @@ from sb3_torcs.training.zoo_data import (
     check_numbers,
     check_sight,
     policy_arguments,
-    told_where,
+    told_entries,
 )
 
 __all__ = [
@@ -179,8 +179,7 @@ def read_entry(path: Path, name: str) -> Entry:
     if name not in entries and "default" in entries:
         name = "default"
     if name not in entries:
-        advice = f"it has: {', '.join(entries)}{told_where(name, path)}"
-        raise ZooConfigError(f"{path} has no entry '{name}'{near_miss(name, entries, advice)}")
+        raise ZooConfigError(f"{path} has no entry '{name}'{told_entries(name, entries, path)}")
     return as_data(entries[name])
 
 

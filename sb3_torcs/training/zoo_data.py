@@ -7,7 +7,7 @@ import contextlib
 import copy
 import importlib
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ import gymnasium as gym
 from torch.nn.modules import activation
 
 from sb3_torcs.car import is_count, is_number
-from sb3_torcs.errors import ZooConfigError
+from sb3_torcs.errors import ZooConfigError, near_miss
 
 __all__ = [
     "EVALUATED",
@@ -29,7 +29,7 @@ __all__ = [
     "check_sight",
     "plain_python",
     "policy_arguments",
-    "told_where",
+    "told_entries",
 ]
 
 EVALUATED = (
@@ -302,16 +302,18 @@ def _value(node: ast.expr) -> Any:
     return ast.literal_eval(node)
 
 
-def told_where(entry: str, path: Path) -> str:
+def told_entries(name: str, known: Iterable[str], path: Path) -> str:
     """
-    Tell which of the files beside a hyperparameter file has an entry.
+    Complete a message about an entry that a hyperparameter file lacks.
 
-    :param entry: that the file lacks
-    :param path: of the file
-    :return: e.g. ``"; ppo.yml has it, so add: --algo ppo"``; empty if none has
+    :param name: of the entry
+    :param known: the names of those that the file has
+    :param path: of the file, beside which others may have it
+    :return: e.g. ``"; it has: Torcs-v0; ppo.yml has it, so add: --algo ppo"``
     """
+    elsewhere = ""
     for other in sorted(path.parent.glob("*.yml")):
         with contextlib.suppress(OSError, UnicodeDecodeError):
-            if re.search(rf"^{re.escape(entry)}:", other.read_text(encoding="utf-8"), re.MULTILINE):
-                return f"; {other.name} has it, so add: --algo {other.stem}"
-    return ""
+            if re.search(rf"^{re.escape(name)}:", other.read_text(encoding="utf-8"), re.MULTILINE):
+                elsewhere = f"; {other.name} has it, so add: --algo {other.stem}"
+    return near_miss(name, known, f"it has: {', '.join(known)}{elsewhere}")
