@@ -1,5 +1,6 @@
 """Studies run on Ray Tune, and come to the same results whatever happens to the machines."""
 
+import contextlib
 import csv
 import errno
 import json
@@ -178,6 +179,20 @@ def test_without_a_terminal_trials_that_begin_and_end_print_a_line(begun, capsys
         "small-nets-seed0: running, 0 of 1920 timesteps",
         "small-nets-seed0: done, 240 of 1920 timesteps, laps 3, best lap 83.500 s",
     ]
+
+
+def test_who_reads_what_trials_print_may_leave(begun, monkeypatch):
+    reader, writer = os.pipe()
+    os.close(reader)
+    study, _ = begun
+    board = Board(study)
+    with os.fdopen(writer, "w", buffering=1) as gone, monkeypatch.context() as patch:
+        patch.setattr(sys, "stderr", gone)
+        with board.shown():
+            board.update(study.trials[0], {"state": "failed", "error": "why"})
+        with contextlib.suppress(BrokenPipeError):
+            gone.close()
+    assert board.errors() == {"small-nets-seed0": "why"}
 
 
 def test_a_full_disk_is_told_and_leaves_everything_as_it_was(begun, tmp_path, monkeypatch, capsys):

@@ -163,13 +163,15 @@ class Board:
 
     @contextlib.contextmanager
     def shown(self) -> Iterator[None]:
-        """Keep standard error up to date."""
+        """Keep standard error up to date. Who reads it may leave: the study goes on."""
         from rich.console import Console
         from rich.live import Live
 
+        from sb3_torcs.callbacks.display import Unbroken
+
         console = Console(stderr=True)
         if not console.is_terminal:
-            self._tell = partial(print, file=sys.stderr, flush=True)
+            self._tell = partial(print, file=Unbroken(sys.stderr), flush=True)
             yield
             return
         # Drawn by the clock and not for each row: a continued study reads hundreds of rows at once.
