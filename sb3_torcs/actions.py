@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from numbers import Real
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -29,6 +30,7 @@ __all__ = [
     "GearboxName",
     "action_layout",
     "action_rows",
+    "actions_of_races",
     "automatic_gear",
     "checked_gearbox",
     "controls_from_action",
@@ -244,6 +246,26 @@ def action_rows(actions: Any, shape: tuple[int, ...]) -> npt.NDArray[np.floating
     if np.isnan(rows).any():
         place = int(np.argwhere(np.isnan(rows))[0, 0])
         raise InvalidAction(f"the action of environment {place} has nan; {_DIVERGED}")
+    return rows
+
+
+def actions_of_races(actions: Any, shape: tuple[int, ...], advice: str) -> list[Any]:
+    """
+    Make sure that there is an action for each of several races, which read their own.
+
+    :param actions: one per race, each as of :func:`controls_from_action`
+    :param shape: (races, numbers of an action)
+    :param advice: where to take them from, for the error
+    :return: them
+    :raises InvalidAction: if there are more or fewer, or numbers instead of actions
+    """
+    rows = list(actions) if isinstance(actions, Iterable) else [actions]
+    bare = all(isinstance(row, Real) for row in rows)
+    if bare or len(rows) != shape[0]:
+        raise InvalidAction(
+            f"{len(rows)} {'numbers' if bare else 'actions'} for {shape[0]} races; expected shape "
+            f"{shape}{advice}"
+        )
     return rows
 
 

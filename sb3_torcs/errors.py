@@ -259,26 +259,27 @@ def with_known_arguments(init: Function) -> Function:
     :param init: that takes keyword arguments
     """
     known = inspect.signature(init).parameters
+    owner = init.__qualname__.partition(".")[0]  # also for a class that is made from it
 
     @functools.wraps(init)
     def checked(self: Any, *positional: Any, **arguments: Any) -> None:
         for name in arguments:
             if name not in known:
-                raise unknown_argument(type(self), name, known)
+                raise unknown_argument(owner, name, known)
         init(self, *positional, **arguments)
 
     return cast("Function", checked)
 
 
-def unknown_argument(kind: type, name: str, known: Iterable[str]) -> TypeError:
+def unknown_argument(owner: str, name: str, known: Iterable[str]) -> TypeError:
     """
     Make the error for an argument that a class does not have.
 
-    :param kind: the class
+    :param owner: name of the class
     :param name: of the argument
     :param known: the names that it has
     """
-    return TypeError(f"{kind.__name__} has no argument {name!r}{near_miss(name, known)}")
+    return TypeError(f"{owner} has no argument {name!r}{near_miss(name, known)}")
 
 
 def with_new_names(arguments: Mapping[str, Any], names: Mapping[str, str]) -> dict[str, Any]:

@@ -323,6 +323,11 @@ def test_the_argument_that_was_meant_is_named(kind):
         kind(trak="aalborg")
 
 
+def test_it_is_named_of_several_races_too():
+    with pytest.raises(TypeError, match=r"^TorcsEnv has no argument 'trak'; did you mean 'track'"):
+        gym.make_vec("Torcs-v0", num_envs=2, trak="aalborg")
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -37,8 +37,6 @@ REFUSED = {
 }
 """Wrappers that would show something else than in the training, and why."""
 
-SCRIPT = "__main__"
-
 PASSING_ON = {"MirrorVecEnv", "VecMonitor", "VecCheckNan", "VecNormalize", "VecVideoRecorder"}
 """Wrappers of vectors that leave a single car as it is, or whose statistics are kept with the
 model."""
@@ -152,7 +150,7 @@ def _items(hyperparameters: Mapping[str, Any], key: str) -> Iterator[tuple[str, 
 def _imported(path: str, trust: bool) -> Any:
     """Import a wrapper by its dotted path."""
     module, _, name = path.rpartition(".")
-    if module == SCRIPT:
+    if module == "__main__":
         raise ModelMismatch(
             f"the model was trained behind {name}, a wrapper of a script, which nothing else can "
             "import; put it into a module, or evaluate the model in the script, by evaluate_policy "

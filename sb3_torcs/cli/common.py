@@ -39,7 +39,6 @@ __all__ = [
     "table",
     "told_record",
     "warn_unless_known",
-    "whole_number",
 ]
 
 INTERRUPTED = 130
@@ -127,7 +126,7 @@ def warn_unless_known(driver: str, record: TrainingRecord) -> None:
         )
 
 
-def whole_number(least: int, bits: int | None = None) -> Callable[[str], int]:
+def _whole_number(least: int, bits: int | None = None) -> Callable[[str], int]:
     """
     Make a type of argparse that reads a whole number.
 
@@ -146,8 +145,8 @@ def whole_number(least: int, bits: int | None = None) -> Callable[[str], int]:
     return read
 
 
-positive, natural = whole_number(1), whole_number(0)
-seed = whole_number(0, bits=32)  # as NumPy takes
+positive, natural = _whole_number(1), _whole_number(0)
+seed = _whole_number(0, bits=32)  # as NumPy takes
 
 
 def parsed_robots(names: str | None, game: Game) -> list[tuple[str, int]]:

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import astuple
 from functools import partial
-from numbers import Real
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from sb3_torcs.actions import controls_from_action
+from sb3_torcs.actions import actions_of_races, controls_from_action
 from sb3_torcs.backends.base import Backend, Fleet
 from sb3_torcs.backends.lite.backend import LiteBackend
 from sb3_torcs.backends.lite.fleet import LiteFleet
@@ -22,16 +21,10 @@ from sb3_torcs.backends.seats import SeatWorld
 from sb3_torcs.backends.several import present_world
 from sb3_torcs.car import CAR_RECORD, CarState, Controls, FloatArray, car_from_record
 from sb3_torcs.envs.aids import AIDS
-from sb3_torcs.envs.compiled import (
-    COMPILED,
-    RULES,
-    aid_cars,
-    read_actions,
-    value_timesteps,
-)
+from sb3_torcs.envs.compiled import COMPILED, RULES, aid_cars, read_actions, value_timesteps
 from sb3_torcs.envs.info import racing_info
 from sb3_torcs.envs.racing import RacingEnv
-from sb3_torcs.errors import CarLost, InvalidAction, InvalidOption
+from sb3_torcs.errors import CarLost, InvalidOption
 from sb3_torcs.rewards import Term
 from sb3_torcs.sensors import View
 
@@ -335,13 +328,8 @@ class Batch:
             fits = asked.shape == (len(self.envs), len(low))
             if fits and read_actions(np.ascontiguousarray(asked), low, high, controls):
                 return controls
-        rows = list(asked) if isinstance(asked, Iterable) else [asked]
-        what = "numbers" if all(isinstance(row, Real) for row in rows) else "actions"
-        if what == "numbers" or len(rows) != len(self.envs):
-            raise InvalidAction(
-                f"{len(rows)} {what} for {len(self.envs)} races; expected shape "
-                f"({len(self.envs)}, {len(low)}), as of model.predict(observations)"
-            )
+        shape = len(self.envs), len(low)
+        rows = actions_of_races(asked, shape, ", as of model.predict(observations)")
         for race, row in enumerate(rows):
             controls[race] = _row(controls_from_action(row, self._layout))
         return controls

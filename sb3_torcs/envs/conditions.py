@@ -13,7 +13,6 @@ from sb3_torcs.errors import InvalidOption
 
 __all__ = ["Conditions", "Delay", "Part"]
 
-
 Part = tuple[Controls, int]
 """Controls, and the control ticks for which they are held."""
 

@@ -167,7 +167,7 @@ def _refuse(options: Mapping[str, Any]) -> None:
     """
     for name, value in options.items():
         if name not in OF_THE_GAME:
-            raise unknown_argument(TorcsLiteEnv, name, signature(TorcsLiteEnv).parameters)
+            raise unknown_argument("TorcsLiteEnv", name, signature(TorcsLiteEnv).parameters)
         raise InvalidOption(
             f"{name} is {value!r}, which needs the installed game, so it is for Torcs-v0; leave it "
             "out for TorcsLite-v0"

@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from functools import partial
-from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -14,6 +13,7 @@ import numpy.typing as npt
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
+from sb3_torcs.actions import actions_of_races
 from sb3_torcs.backends.native import Fleet
 from sb3_torcs.backends.several import present_world, shared_worlds
 from sb3_torcs.car import CarState, check_count
@@ -26,7 +26,7 @@ from sb3_torcs.envs.making import (
 )
 from sb3_torcs.envs.racing import Observation
 from sb3_torcs.envs.torcs import TorcsEnv
-from sb3_torcs.errors import CarLost, EnvClosed, InvalidAction, InvalidOption
+from sb3_torcs.errors import CarLost, EnvClosed, InvalidOption
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.starting_list import guests_of
 
@@ -103,13 +103,8 @@ class TorcsVectorEnv(SyncVectorEnv):
         """
         if self.closed:
             raise EnvClosed("step after close; make new environments with gym.make_vec")
-        rows = list(actions) if isinstance(actions, Iterable) else [actions]
-        what = "numbers" if all(isinstance(row, Real) for row in rows) else "actions"
-        if what == "numbers" or len(rows) != self.num_envs:
-            raise InvalidAction(
-                f"{len(rows)} {what} for {self.num_envs} races; expected shape "
-                f"{self.action_space.shape}: take them from envs.action_space.sample()"
-            )
+        shape = self.action_space.shape or ()
+        rows = actions_of_races(actions, shape, ": take them from envs.action_space.sample()")
         anew = self._begin_anew()
         going = [index for index in range(self.num_envs) if not anew[index]]
         # All before any sets out: a wrong one leaves all races where they are.

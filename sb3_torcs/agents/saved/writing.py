@@ -233,9 +233,8 @@ def _recipe_of_environment(model: BaseAlgorithm) -> Recipe:
     if spec is None:
         return recipe(algo, None, seen)
     wrappers = [_wrapper_item(wrapper) for wrapper in spec.additional_wrappers]
-    wrappers = [item for item in wrappers if item is not None]
-    if wrappers:
-        seen["env_wrapper"] = wrappers
+    if any(wrappers):
+        seen["env_wrapper"] = [item for item in wrappers if item]
     kwargs = {name: value for name, value in spec.kwargs.items() if name != "render_mode"}
     tracks = kwargs.get("track")
     if isinstance(tracks, Track):
