@@ -19,6 +19,7 @@ from sb3_torcs.callbacks.learning import (
 from sb3_torcs.callbacks.lines import LinePicturesCallback
 from sb3_torcs.callbacks.metrics import MONITOR_KWARGS, DrivingMetricsCallback
 from sb3_torcs.callbacks.progress import RacingProgressCallback
+from sb3_torcs.callbacks.reuse import ReuseRolloutsCallback
 from sb3_torcs.callbacks.switches import ConditionsCallback, RandomStartCallback, RewardCallback
 
 __all__ = [
@@ -35,6 +36,7 @@ __all__ = [
     "RacingProgressCallback",
     "RandomStartCallback",
     "RecordCallback",
+    "ReuseRolloutsCallback",
     "RewardCallback",
     "StochasticBrakeCallback",
     "ValuesOnlyCallback",

@@ -33,6 +33,7 @@ __all__ = [
     "LeanUpdatesCallback",
     "MirrorCallback",
     "ValuesOnlyCallback",
+    "WhileLearning",
     "learn_values",
 ]
 
@@ -60,7 +61,7 @@ class _Training:
                 undo()
 
 
-class _WhileLearning(BaseCallback):
+class WhileLearning(BaseCallback):
     """
     Base of callbacks that change the algorithm only while it learns.
 
@@ -97,7 +98,7 @@ class _WhileLearning(BaseCallback):
         self._undo()
 
 
-class GradientStepsCallback(_WhileLearning):
+class GradientStepsCallback(WhileLearning):
     """
     Take more gradient steps at the beginning of a training, when there are few timesteps.
 
@@ -135,7 +136,7 @@ class GradientStepsCallback(_WhileLearning):
         self._algorithm.gradient_steps = self._own
 
 
-class LeanUpdatesCallback(_WhileLearning):
+class LeanUpdatesCallback(WhileLearning):
     """
     Update DDPG or TD3 with a ``SplitHeadPolicy``, or PPO, without PyTorch's record of operations.
 
@@ -177,7 +178,7 @@ class LeanUpdatesCallback(_WhileLearning):
         vars(self.model.policy).pop("forward", None)
 
 
-class AdaptiveLearningRateCallback(_WhileLearning):
+class AdaptiveLearningRateCallback(WhileLearning):
     """
     Scale PPO's learning rate so that each update changes the policy about equally much.
 
@@ -313,7 +314,7 @@ def learn_values(model: PPO, timesteps: int) -> None:
     )
 
 
-class MirrorCallback(_WhileLearning):
+class MirrorCallback(WhileLearning):
     """
     Mirror half of each batch from left to right, so that its bends go the other way.
 
