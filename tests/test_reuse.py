@@ -9,7 +9,7 @@ from torch import nn
 from toy import ToyRace
 
 from sb3_torcs.callbacks import LeanUpdatesCallback, ReuseRolloutsCallback
-from sb3_torcs.callbacks.reuse import _taken, learn_again
+from sb3_torcs.callbacks.reuse import _learn_again, _taken
 from sb3_torcs.errors import InvalidOption
 
 SIZE = 20
@@ -83,7 +83,7 @@ def test_lean_updates_learn_the_same():
 def test_a_rollout_of_todays_policy_tells_what_it_tells_ppo():
     """Tolerance: values of one observation at a time and of all at once differ in rounding."""
     model = learned(kept := Kept(), rollouts=1, model=make(learning_rate=0.0))
-    again, buffer = learn_again(model, kept.rollouts[0]), model.rollout_buffer
+    again, buffer = _learn_again(model, kept.rollouts[0]), model.rollout_buffer
     for name in ("values", "log_probs", "advantages", "returns"):
         stock = getattr(buffer, name).reshape(-1)  # which learning has flattened
         np.testing.assert_allclose(getattr(again, name).reshape(-1), stock, rtol=1e-4, atol=1e-5)
@@ -94,7 +94,7 @@ def test_older_rollouts_count_by_v_trace():
     model = learned(kept := Kept(), rollouts=1)
     old = kept.rollouts[0]
     model.learn(3 * SIZE)
-    again = learn_again(model, old)
+    again = _learn_again(model, old)
     counts = np.minimum(np.exp(again.log_probs - old.log_probs), 1.0)[:, 0]
     assert counts.min() < 0.9
     goes_on = 1.0 - np.append(old.episode_starts[1:, 0], old.last_dones)

@@ -21,8 +21,6 @@ __all__ = ["ReuseRolloutsCallback"]
 
 Floats = npt.NDArray[np.float32]
 
-FARTHEST = np.float32(20.0)  # [-] logarithm of a ratio of probabilities, so that none overflows
-
 
 class _Rollout(NamedTuple):
     """What was driven; arrays are (timesteps, cars, …)."""
@@ -91,7 +89,7 @@ class ReuseRolloutsCallback(WhileLearning):
     def _change(self) -> None:
         newest = self._own
         self._kept.append(_taken(newest, self.locals))
-        learned = [learn_again(self._ppo, old) for old in list(self._kept)[:-1]]
+        learned = [_learn_again(self._ppo, old) for old in list(self._kept)[:-1]]
         learned.append(_Learned(newest.values, newest.log_probs, newest.advantages, newest.returns))
         self._ppo.rollout_buffer = self._joined(learned)
 
@@ -130,16 +128,16 @@ def _taken(buffer: RolloutBuffer, local: Mapping[str, Any]) -> _Rollout:
 
 
 @th.no_grad()
-def learn_again(model: PPO, old: _Rollout) -> _Learned:
+def _learn_again(model: PPO, old: _Rollout) -> _Learned:
     """
     Find what an older rollout tells today's policy and value function.
 
     :param model: that learns
     :param old: rollout of an earlier policy
-    :return: with 1 as the ratio of all probabilities, what SB3 computes for the newest rollout
+    :return: where today's policy is the old one, what SB3 computes for its newest rollout
     """
     policy, device = model.policy, model.device
-    seen, done, last = (
+    seen, acted, last = (
         th.as_tensor(array, device=device)
         for array in (
             old.observations.reshape(-1, *old.observations.shape[2:]),
@@ -149,11 +147,10 @@ def learn_again(model: PPO, old: _Rollout) -> _Learned:
     )
     values, log_probs = (
         tensor.cpu().numpy().reshape(old.rewards.shape)
-        for tensor in policy.evaluate_actions(seen, done)[:2]
+        for tensor in policy.evaluate_actions(seen, acted)[:2]
     )
     following = policy.predict_values(last).cpu().numpy().reshape(-1)
-    ratios = np.exp(np.minimum(log_probs - old.log_probs, FARTHEST))
-    counts = np.minimum(ratios, np.float32(1.0))
+    counts = np.exp(np.minimum(log_probs - old.log_probs, np.float32(0.0)))
     advantages = counts * _advantages(old, values, following, counts, model)
     return _Learned(values, log_probs, advantages, values + advantages)
 
