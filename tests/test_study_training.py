@@ -131,10 +131,13 @@ ADAPTIVE = {
 }  # fmt: skip
 
 
+REUSED = {**PPO, "callback": {"sb3_torcs.callbacks.ReuseRolloutsCallback": {"rollouts": 3}}}
+
+
 @pytest.mark.parametrize(
     "changes",
-    [PPO, BEHIND_WRAPPERS, ADAPTIVE],
-    ids=["bare", "behind wrappers", "hard starts and a rate that adapts"],
+    [PPO, BEHIND_WRAPPERS, ADAPTIVE, REUSED],
+    ids=["bare", "behind wrappers", "hard starts and a rate that adapts", "rollouts again"],
 )
 def test_an_algorithm_without_a_replay_buffer_goes_on_the_same(tmp_path, changes):
     wanted = trial(tmp_path, changes)

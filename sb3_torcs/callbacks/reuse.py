@@ -54,7 +54,7 @@ class ReuseRolloutsCallback(WhileLearning):
     tells is what it tells PPO without this callback.
 
     An epoch passes over all of these rollouts: take fewer epochs or larger batches. Saved models do
-    not hold rollouts: a resumed training begins with none.
+    not hold rollouts: a resumed training begins with none. A study goes on with them.
 
     :param rollouts: number of them, the newest included, 1 or more
     :param verbose: as in ``BaseCallback``
@@ -66,6 +66,23 @@ class ReuseRolloutsCallback(WhileLearning):
         super().__init__(verbose)
         check_count("rollouts", rollouts)
         self.rollouts = rollouts
+        self._restored: list[_Rollout] = []
+
+    def arrays(self) -> dict[str, Any]:
+        """Return the rollouts that are kept, one after the other: each array is (rollouts, …)."""
+        return {
+            name: np.stack([getattr(rollout, name) for rollout in self._kept])
+            for name in _Rollout._fields
+        }
+
+    def restore(self, arrays: Mapping[str, Any]) -> None:
+        """
+        Let the next training begin with rollouts.
+
+        :param arrays: that ``arrays`` returned
+        """
+        parts = (arrays[name] for name in _Rollout._fields)
+        self._restored = [_Rollout(*rollout) for rollout in zip(*parts, strict=True)]
 
     def _on_training_start(self) -> None:
         model = self.model
@@ -84,7 +101,8 @@ class ReuseRolloutsCallback(WhileLearning):
                     "the callbacks"
                 )
         self._ppo, self._own = model, model.rollout_buffer
-        self._kept: deque[_Rollout] = deque(maxlen=self.rollouts)
+        self._kept = deque(self._restored, maxlen=self.rollouts)
+        self._restored = []
 
     def _change(self) -> None:
         newest = self._own
@@ -100,8 +118,8 @@ class ReuseRolloutsCallback(WhileLearning):
             first.buffer_size, first.observation_space, first.action_space, model.device,
             first.gae_lambda, first.gamma, first.n_envs * len(self._kept),
         )  # fmt: skip
-        names = "observations", "actions", "rewards", "episode_starts"
-        parts = {name: [getattr(each, name) for each in self._kept] for name in names}
+        driven = ("observations", "actions")
+        parts = {name: [getattr(each, name) for each in self._kept] for name in driven}
         parts |= {name: [getattr(each, name) for each in learned] for name in _Learned._fields}
         for name, arrays in parts.items():
             np.concatenate(arrays, axis=1, out=getattr(joined, name))
@@ -138,7 +156,7 @@ def _learn_again(model: PPO, old: _Rollout) -> _Learned:
     """
     policy, device = model.policy, model.device
     seen, acted, last = (
-        th.as_tensor(array, device=device)
+        th.tensor(array, device=device)  # aligned alike each time, on which rounding depends
         for array in (
             old.observations.reshape(-1, *old.observations.shape[2:]),
             old.actions.reshape(-1, old.actions.shape[2]),

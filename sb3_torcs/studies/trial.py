@@ -11,7 +11,8 @@ import io
 import json
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from sb3_torcs.agents.saved.driver import ModelDriver
 from sb3_torcs.agents.saved.record import BEST_MODEL, STATISTICS, TrainingRecord
 from sb3_torcs.agents.saved.writing import recipe, write_record
 from sb3_torcs.agents.wrapping import frames_of
+from sb3_torcs.callbacks.tree import KeepsArrays, callbacks_in
 from sb3_torcs.errors import StudyError
 from sb3_torcs.evaluation.ladder import rung
 from sb3_torcs.evaluation.protocol import Episode, Merit, evaluate, merit, race_environment
@@ -166,6 +168,8 @@ class Training:
         if getattr(self.model, "replay_buffer", None) is not None:
             arrays: dict[str, Any] = dict(_buffer_arrays(self.model.replay_buffer))
             np.savez(folder / REPLAY, **arrays)
+        for name, callback in self._keepers():
+            np.savez(folder / name, **callback.arrays())
         if self.normalizer is not None:
             self.normalizer.save(str(folder / LAST_STATISTICS))
         for name, content in {**self._best_files, **self._records}.items():
@@ -193,6 +197,9 @@ class Training:
         if (folder / REPLAY).is_file():
             with np.load(folder / REPLAY) as arrays:
                 _refill(self.model.replay_buffer, arrays)
+        for name, callback in self._keepers():
+            with np.load(folder / name) as arrays:
+                callback.restore(arrays)
         state = json.loads((folder / STATE).read_text(encoding="utf-8"))
         self.rows, self.episodes = state["rows"], state["episodes"]
         self._best, self._spent = Merit(*state["best"]), np.array(state["spent"])
@@ -200,6 +207,12 @@ class Training:
             env.env_method("set_mishaps", mishaps, indices=car)
         names = (BEST_MODEL, STATISTICS)
         self._best_files = {n: (folder / n).read_bytes() for n in names if (folder / n).is_file()}
+
+    def _keepers(self) -> Iterator[tuple[str, KeepsArrays]]:
+        """Find the callbacks that keep arrays, and name their files in a checkpoint."""
+        every = chain.from_iterable(map(callbacks_in, self.callbacks))
+        for number, callback in enumerate(own for own in every if isinstance(own, KeepsArrays)):
+            yield f"callback-{number}.npz", callback
 
     def _progress(self) -> Row:
         """Say how far the training has come."""
