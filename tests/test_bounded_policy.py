@@ -12,6 +12,7 @@ from toy import ToyRace
 from sb3_torcs.callbacks import LeanUpdatesCallback
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.policies import BoundedPolicy
+from sb3_torcs.policies.mirror import mirror_actions, mirror_image, mirror_observations
 from sb3_torcs.policies.ppo import is_for
 from sb3_torcs.sensors import GROUPS, feature_slices
 
@@ -165,15 +166,54 @@ def test_an_actor_may_see_less_than_its_value_function(actor_sensors, names, tmp
         assert values[0].allclose(values[1]) is (names == SEES)
 
 
+@pytest.mark.parametrize("symmetric", [False, True])
 @pytest.mark.parametrize("net_arch", [[8], {"pi": [6, 5], "vf": [8]}, []])
-def test_lean_updates_of_an_asymmetric_policy_learn_as_ppo_does(net_arch):
+def test_lean_updates_of_an_asymmetric_policy_learn_as_ppo_does(net_arch, symmetric):
     states = []
     for callback in (None, LeanUpdatesCallback()):
-        model = make_asymmetric(net_arch=net_arch)
+        model = make_asymmetric(net_arch=net_arch, symmetric=symmetric)
         assert is_for(model) is (net_arch != [])
         model.learn(80, callback=callback)
         states.append(model.policy.state_dict())
     th.testing.assert_close(*states, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("actor_sensors", [None, ["base"]])
+@pytest.mark.parametrize("net_arch", [[8], []])
+def test_a_symmetric_policy_drives_and_values_both_ways_alike(actor_sensors, net_arch, tmp_path):
+    """The mean of what the same networks alone say of an observation and of its mirror image."""
+    model, plain = (
+        make_asymmetric(actor_sensors=actor_sensors, net_arch=net_arch, symmetric=symmetric)
+        for symmetric in (True, False)
+    )
+    model.learn(40)
+    plain.policy.load_state_dict(model.policy.state_dict())
+    space, rng = model.observation_space, np.random.default_rng(0)
+    seen = th.as_tensor(rng.uniform(space.low, space.high, (50, *space.shape)).astype(np.float32))
+    image = mirror_observations(seen, mirror_image(space))
+    model.save(tmp_path / "model.zip")
+    model.policy.save(tmp_path / "policy.pth")
+    loaded = PPO.load(tmp_path / "model.zip").policy, BoundedPolicy.load(tmp_path / "policy.pth")
+    with th.no_grad():
+        one, other = (plain.policy.get_distribution(way).mode() for way in (seen, image))
+        values = [plain.policy.predict_values(way) for way in (seen, image)]
+        for policy in (model.policy, *loaded):
+            mean = policy.get_distribution(seen).mode()
+            th.testing.assert_close(mean, 0.5 * (one + mirror_actions(other)))
+            th.testing.assert_close(policy.predict_values(seen), 0.5 * (values[0] + values[1]))
+            driver = policy.exact_driver()
+            assert th.equal(driver(image), mirror_actions(driver(seen)))
+            th.testing.assert_close(driver(seen), mean, rtol=0.0, atol=1e-5)
+    assert not th.allclose(one, mirror_actions(other), atol=1e-3)
+
+
+def test_who_has_no_mirror_image_has_no_symmetric_policy():
+    with pytest.raises(
+        InvalidOption, match=r"of shape \(3,\), .* are others; pass symmetric=False"
+    ):
+        PPO(BoundedPolicy, gym.make("Pendulum-v1"), policy_kwargs={"symmetric": True})
+    with pytest.raises(InvalidOption, match="symmetric is 'no'; expected True or False"):
+        make(symmetric="no")
 
 
 def test_an_actor_cannot_see_what_the_environment_does_not_give():

@@ -67,6 +67,18 @@ def test_the_export_is_the_driver(tmp_path, algorithm, symmetric):
     assert np.abs(learner - run(file, OBSERVATIONS)).max() > 0.01
 
 
+@pytest.mark.parametrize("symmetric", [False, True])
+def test_a_bounded_policy_is_exported(tmp_path, symmetric):
+    kwargs = {"net_arch": [16], "symmetric": symmetric}
+    model = PPO("BoundedPolicy", race(), policy_kwargs=kwargs, device="cpu", seed=0)
+    with th.no_grad():
+        model.policy.action_net.linear.weight *= 100.0
+    file = export_actor(model, tmp_path / "driver.onnx")
+    for observations in (OBSERVATIONS, OBSERVATIONS[:1]):
+        expected, _ = model.predict(observations, deterministic=True)
+        np.testing.assert_allclose(run(file, observations), expected, rtol=0.0, atol=ROUNDING)
+
+
 @pytest.mark.parametrize("algo", ["ars", "crossq", "ppo", "sac", "td3"])
 def test_stock_policies_are_exported(tmp_path, algo):
     """One algorithm of each kind of policy."""

@@ -444,11 +444,12 @@ def test_a_driver_of_ppo_keeps_its_value_function_if_asked(env, tmp_path, kept):
     assert stock._last_obs is None
 
 
+@pytest.mark.parametrize("symmetric", [False, True])
 @pytest.mark.parametrize("net_arch", [[8], []])
-def test_a_driver_of_ppo_leaves_out_what_only_its_value_function_saw(tmp_path, net_arch):
+def test_a_driver_of_ppo_leaves_out_what_only_its_value_function_saw(tmp_path, net_arch, symmetric):
     """In stock SB3, too, it then drives where there are no such sensors."""
     with gym.make("TorcsLite-v0", sensors=["base", "line"]) as env:
-        kwargs = {"net_arch": net_arch, "actor_sensors": ["base"]}
+        kwargs = {"net_arch": net_arch, "actor_sensors": ["base"], "symmetric": symmetric}
         model = trained(PPO, BoundedPolicy, env, n_steps=8, batch_size=8, policy_kwargs=kwargs)
         seen = np.stack([env.observation_space.sample() for _ in range(4)])
     model.save(tmp_path / "whole.zip")

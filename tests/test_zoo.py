@@ -294,6 +294,9 @@ def test_a_symmetric_policy_needs_observations_that_have_a_mirror_image(tmp_path
     )
     assert "and frame_stack is 2" in complaint(tmp_path, {**symmetric, "frame_stack": 2})
     assert "set range_finders to scr or narrow" in complaint(tmp_path, {**symmetric, **one_sided})
+    ppo = {**symmetric, "policy": "sb3_torcs.policies.BoundedPolicy"}
+    accepted(ppo, "ppo")
+    assert "whose middle is 0" in complaint(tmp_path, {**ppo, "normalize": True}, "ppo")
 
 
 def zoo_script(*words):

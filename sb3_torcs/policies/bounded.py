@@ -15,16 +15,23 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.preprocessing import get_action_dim
-from stable_baselines3.common.torch_layers import MlpExtractor
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, MlpExtractor
 from stable_baselines3.common.type_aliases import Schedule
 from torch import nn
 
+from sb3_torcs.car import checked_flag
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.policies.asymmetric import ActorSensors
 from sb3_torcs.policies.exact import ExactDriver, ExactPolicy, check_sizes
+from sb3_torcs.policies.mirror import (
+    check_symmetric,
+    mirror_actions,
+    mirror_image,
+    mirror_observations,
+)
 from sb3_torcs.sensors import SensorsName, checked_sensors
 
-__all__ = ["BoundedHead", "BoundedPolicy"]
+__all__ = ["BothWays", "BoundedHead", "BoundedPolicy", "MeanOfBoth"]
 
 LARGEST_LOG_STD = 20
 
@@ -42,20 +49,59 @@ class _WrongAlgorithm(InvalidOption, AttributeError):
         )
 
 
+class BothWays(BaseFeaturesExtractor):
+    """
+    Extracts the features of an observation, and those of its mirror image.
+
+    :param extractor: of features
+    :param space: of observations that have a mirror image
+    """
+
+    def __init__(self, extractor: BaseFeaturesExtractor, space: spaces.Space[Any]) -> None:
+        super().__init__(space, extractor.features_dim)
+        self.extractor = extractor
+        self._image = mirror_image(space)
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        """
+        Extract.
+
+        :param observations: (batch, numbers)
+        :return: (batch, 2, features)
+        """
+        ways = observations, mirror_observations(observations, self._image)
+        return th.stack([self.extractor(way) for way in ways], dim=1)
+
+
+class MeanOfBoth(nn.Module):
+    """Takes the mean of what became of an observation, and of its mirror image."""
+
+    def forward(self, latent: th.Tensor) -> th.Tensor:
+        """
+        Take the mean.
+
+        :param latent: (batch, 2, units)
+        :return: (batch, units)
+        """
+        return latent.mean(dim=1)
+
+
 class BoundedHead(nn.Module):
     """
     A layer whose outputs lie within bounds: middle + half of the range × tanh.
 
     :param linear: the layer before tanh
     :param space: of actions, with finite bounds
+    :param symmetric: give the mean of the action, and of the mirror image of that of the mirrored
+        drive
     """
 
     middle: th.Tensor
     reach: th.Tensor
 
-    def __init__(self, linear: nn.Linear, space: spaces.Box) -> None:
+    def __init__(self, linear: nn.Linear, space: spaces.Box, *, symmetric: bool = False) -> None:
         super().__init__()
-        self.linear = linear
+        self.linear, self.symmetric = linear, symmetric
         for name, value in (
             ("middle", 0.5 * (space.high + space.low)),
             ("reach", 0.5 * (space.high - space.low)),
@@ -67,10 +113,13 @@ class BoundedHead(nn.Module):
         """
         Compute mean actions.
 
-        :param latent: (batch, inputs of the layer)
+        :param latent: (batch, inputs of the layer), or if symmetric (batch, 2, inputs)
         :return: (batch, actuators), within the bounds
         """
-        return self.middle + self.reach * th.tanh(self.linear(latent))
+        actions = self.middle + self.reach * th.tanh(self.linear(latent))
+        if not self.symmetric:
+            return actions
+        return 0.5 * (actions[:, 0] + mirror_actions(actions[:, 1]))
 
 
 class BoundedPolicy(ExactPolicy, ActorCriticPolicy):
@@ -83,10 +132,14 @@ class BoundedPolicy(ExactPolicy, ActorCriticPolicy):
     :param log_std_init: as in ``ActorCriticPolicy``, or one number per actuator, -20 to 20
     :param actor_sensors: groups of sensors that the actor sees, ``"base"`` among them, while the
         value function sees all that the environment gives; ``None`` is all for both
+    :param symmetric: drive and learn left and right bends alike: the mean of the Gaussian is that
+        of an observation and of its mirror image, turned back, and so is the value. It needs
+        observations whose middle is 0 (no ``VecNormalize``), and range finders with the same angles
+        on both sides
     :param kwargs: the other arguments of ``ActorCriticPolicy``, but for ``use_sde``
     :raises InvalidOption: if the action space has no bounds, if ``net_arch`` or ``log_std_init``
-        has other numbers, if observations lack one of ``actor_sensors``, with ``use_sde``, or if
-        the algorithm is neither PPO nor A2C
+        has other numbers, if observations lack one of ``actor_sensors``, or a mirror image that
+        ``symmetric`` needs, with ``use_sde``, or if the algorithm is neither PPO nor A2C
     """
 
     action_net: BoundedHead
@@ -98,6 +151,7 @@ class BoundedPolicy(ExactPolicy, ActorCriticPolicy):
         lr_schedule: Schedule,
         log_std_init: float | Sequence[float] = 0.0,
         actor_sensors: Sequence[SensorsName] | None = None,
+        symmetric: bool = False,
         **kwargs: Any,
     ) -> None:
         if "n_critics" in kwargs:  # DDPG gives it
@@ -111,6 +165,8 @@ class BoundedPolicy(ExactPolicy, ActorCriticPolicy):
             raise InvalidOption("BoundedPolicy has no use_sde; leave it out, or use MlpPolicy")
         check_sizes(kwargs.get("net_arch") or [])
         self._first_log_std = _log_std(log_std_init, get_action_dim(action_space))
+        self.symmetric = checked_flag("symmetric", symmetric)
+        check_symmetric(self.symmetric, observation_space, action_space)
         self.actor_sensors = None
         if actor_sensors is not None:
             self.actor_sensors = checked_sensors(actor_sensors, "actor_sensors")
@@ -124,21 +180,32 @@ class BoundedPolicy(ExactPolicy, ActorCriticPolicy):
         with th.no_grad():
             self.log_std.copy_(th.as_tensor(self._first_log_std))
         assert isinstance(self.action_space, spaces.Box)
-        self.action_net = BoundedHead(self.action_net, self.action_space)  # type: ignore[arg-type]
+        linear: Any = self.action_net
+        self.action_net = BoundedHead(linear, self.action_space, symmetric=self.symmetric)
+
+    def make_features_extractor(self) -> BaseFeaturesExtractor:
+        """Make what extracts features as SB3 does, both ways if the policy is symmetric."""
+        return self._both_ways(super().make_features_extractor())
+
+    def _both_ways(self, extractor: BaseFeaturesExtractor) -> BaseFeaturesExtractor:
+        return BothWays(extractor, self.observation_space) if self.symmetric else extractor
 
     def _build_mlp_extractor(self) -> None:
         """Make the hidden layers as SB3 does, those of the actor for what it sees."""
         super()._build_mlp_extractor()
         if self.actor_sensors is not None:
-            self.pi_features_extractor = ActorSensors(self.observation_space, self.actor_sensors)
+            seen = ActorSensors(self.observation_space, self.actor_sensors)
+            self.pi_features_extractor = self._both_ways(seen)
             actor = MlpExtractor(
-                self.pi_features_extractor.features_dim,
+                seen.features_dim,
                 self.net_arch,
                 self.activation_fn,
                 self.device,
             )
             self.mlp_extractor.policy_net = actor.policy_net
             self.mlp_extractor.latent_dim_pi = actor.latent_dim_pi
+        if self.symmetric:
+            self.mlp_extractor.value_net.append(MeanOfBoth())
 
     def __getattr__(self, name: str) -> Any:
         """Find a part as PyTorch does, and tell an algorithm that this policy is not for it."""
@@ -147,7 +214,8 @@ class BoundedPolicy(ExactPolicy, ActorCriticPolicy):
         return super().__getattr__(name)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        return {**super()._get_constructor_parameters(), "actor_sensors": self.actor_sensors}
+        own = {"actor_sensors": self.actor_sensors, "symmetric": self.symmetric}
+        return {**super()._get_constructor_parameters(), **own}
 
     def exact_driver(self) -> ExactDriver:
         """Return a copy of what gives the mean action, which drives if it is deterministic."""

@@ -12,8 +12,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
+from sb3_torcs.actions import layout_of_width
 from sb3_torcs.car import look_both_ways
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.sensors import GROUPS, Sensor, view_of
@@ -21,6 +24,7 @@ from sb3_torcs.sensors import GROUPS, Sensor, view_of
 __all__ = [
     "MirrorImage",
     "check_angles",
+    "check_symmetric",
     "mirror_actions",
     "mirror_half",
     "mirror_image",
@@ -52,6 +56,26 @@ def check_angles(angles: Any, what: str) -> None:
         raise InvalidOption(
             f"{what} needs range finders that look equally far to both sides, not "
             f"{np.degrees(angles).round(3).tolist()}; pass 'scr' or 'narrow'"
+        )
+
+
+def check_symmetric(
+    symmetric: bool, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]
+) -> None:
+    """
+    Make sure that what a symmetric policy sees and does has a mirror image.
+
+    :param symmetric: whether the policy is
+    :param observation_space: of the policy
+    :param action_space: of the policy
+    :raises InvalidOption: if it has none
+    """
+    ours = sensors_of(observation_space) and layout_of_width(get_action_dim(action_space))
+    if symmetric and not ours:
+        raise InvalidOption(
+            "symmetric=True mirrors the sensors and actuators of Torcs-v0 and TorcsLite-v0, and "
+            f"these observations, of shape {observation_space.shape}, or these actions, of shape "
+            f"{action_space.shape}, are others; pass symmetric=False"
         )
 
 

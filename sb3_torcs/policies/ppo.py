@@ -22,7 +22,7 @@ from torch import nn
 
 from sb3_torcs.policies import kernels
 from sb3_torcs.policies.asymmetric import ActorSensors
-from sb3_torcs.policies.bounded import BoundedHead, BoundedPolicy
+from sb3_torcs.policies.bounded import BothWays, BoundedHead, BoundedPolicy, MeanOfBoth
 from sb3_torcs.policies.flat import Slot
 from sb3_torcs.policies.fused import array
 from sb3_torcs.policies.layers import compiled
@@ -140,16 +140,21 @@ class LeanPPO:
         actions, values, chances = np.empty_like(noise), *np.empty((2, batch), np.float32)
         decide(
             (self.weights[actor.part], self.log_std, self.weights[critic.part]), actor.sizes,
-            critic.sizes, self.bounds, (*seen, noise), (actor.room(batch), critic.room(batch)),
-            actions, values.reshape(-1, 1), chances,
+            critic.sizes, self.bounds, (*seen, noise),
+            (actor.room(len(seen[0])), critic.room(len(seen[1]))), actions, values, chances,
         )  # fmt: skip
         return th.from_numpy(actions), th.from_numpy(values)[:, None], th.from_numpy(chances)
 
     def _seen(self, observations: th.Tensor) -> tuple[np.ndarray, np.ndarray]:
-        """Return what the policy and what the value function sees of observations."""
+        """
+        Return what the policy and what the value function sees of observations.
+
+        :param observations: (batch, numbers)
+        :return: (rows, features) of each; a symmetric policy has two rows per observation
+        """
         given, policy = observations.float(), self.policy
-        for_actor = policy.pi_features_extractor(given)
-        for_critic = policy.vf_features_extractor(given)
+        for_actor = policy.pi_features_extractor(given).flatten(end_dim=-2)
+        for_critic = policy.vf_features_extractor(given).flatten(end_dim=-2)
         return array(for_actor), array(for_critic)
 
     # ------------------------------------------------------------------------- updates
@@ -192,7 +197,7 @@ class LeanPPO:
         other.begin(lambda: value_losses.append(self._find_value_gradient(for_critic, returns)))
         policy_loss, clipped, kl = find_policy_gradient(
             self.weights[actor.part], self.log_std, actor.sizes, self.bounds, np.float32(clip),
-            (for_actor, actions), (chances, advantages), actor.room(len(actions)),
+            (for_actor, actions), (chances, advantages), actor.room(len(for_actor)),
             gradient[actor.part], gradient[: len(self.log_std)],
         )  # fmt: skip
         gradient[: len(self.log_std)] -= np.float32(model.ent_coef)
@@ -204,7 +209,7 @@ class LeanPPO:
         critic = self.critic
         loss: float = find_value_gradient(
             self.weights[critic.part], critic.sizes, np.float32(self.model.vf_coef),
-            observations, returns, critic.room(len(returns)), self.gradient[critic.part],
+            observations, returns, critic.room(len(observations)), self.gradient[critic.part],
         )  # fmt: skip
         return loss
 
@@ -286,6 +291,52 @@ def bound(means: Any, bounds: Any) -> None:
 
 
 @compiled
+def find_means(
+    weights: Any, sizes: Any, bounds: Any, seen: Any, work: Any, each: Any, means: Any
+) -> None:
+    """
+    Find the means of the actions; those of a symmetric policy are of both its rows.
+
+    :param weights: of the means
+    :param sizes: of the policy's layers
+    :param bounds: of the means, as of ``bound``
+    :param seen: (rows, features); one row per action, or two, the latter in the mirror
+    :param work: as of ``stack_forward``
+    :param each: (rows, actuators) what each row alone would give, written
+    :param means: (batch, actuators), written
+    """
+    kernels.stack_forward(weights, sizes, False, seen, work, each)
+    bound(each, bounds)
+    ways, number = len(each) // len(means), means.dtype.type(len(each) // len(means))
+    means[:] = 0
+    for row in range(len(each)):
+        j, mirrored = row // ways, row % ways == 1
+        for o in range(each.shape[1]):
+            means[j, o] += (-each[row, o] if mirrored and o == 0 else each[row, o]) / number
+
+
+@compiled
+def share_slopes(slope: Any, bounds: Any, each: Any) -> None:
+    """
+    Find the gradients before the bounds, of each row, from those of the means.
+
+    :param slope: (batch, actuators) gradients of the means
+    :param bounds: of the means, as of ``bound``
+    :param each: of ``find_means``; overwritten by the gradients
+    """
+    (middle, half), real = bounds, slope.dtype.type
+    ways, number = len(each) // len(slope), real(len(each) // len(slope))
+    for row in range(len(each)):
+        j, mirrored = row // ways, row % ways == 1
+        for o in range(each.shape[1]):
+            share = (-slope[j, o] if mirrored and o == 0 else slope[j, o]) / number
+            if half.size:
+                tanh = (each[row, o] - middle[o]) / half[o]
+                share *= half[o] * (real(1) - tanh * tanh)
+            each[row, o] = share
+
+
+@compiled
 def decide(
     parameters: Any, actor_sizes: Any, critic_sizes: Any, bounds: Any, given: Any, rooms: Any,
     actions: Any, values: Any, chances: Any,
@@ -298,18 +349,18 @@ def decide(
     :param actor_sizes: of the policy's layers
     :param critic_sizes: of the value function's layers
     :param bounds: of the means, as of ``bound``
-    :param given: what the policy and what the value function sees, (batch, features), and noise,
+    :param given: what the policy and what the value function sees, (rows, features), and noise,
         (batch, actuators)
     :param rooms: as ``work`` of ``stack_forward``, of each network
     :param actions: (batch, actuators), written
-    :param values: (batch, 1), written
+    :param values: (batch,), written
     :param chances: (batch,) logarithms of the actions' probabilities, written
     """
     actor, log_std, critic = parameters
     for_actor, for_critic, noise = given
-    kernels.stack_forward(actor, actor_sizes, False, for_actor, rooms[0], actions)
-    kernels.stack_forward(critic, critic_sizes, False, for_critic, rooms[1], values)
-    bound(actions, bounds)
+    each = np.empty((len(for_actor), log_std.size), actions.dtype)
+    find_means(actor, actor_sizes, bounds, for_actor, rooms[0], each, actions)
+    find_values(critic, critic_sizes, for_critic, rooms[1], values)
     deviations, two = np.exp(log_std), actions.dtype.type(2)
     chances[:] = 0
     for j in range(len(actions)):
@@ -332,7 +383,7 @@ def find_policy_gradient(
     :param sizes: of the policy's layers
     :param bounds: of the means, as of ``bound``
     :param clip: range of the ratio of probabilities about 1
-    :param seen: observations and actions, (batch, ...)
+    :param seen: observations, (rows, features), and actions, (batch, actuators)
     :param kept: (batch,) logarithms of the actions' probabilities in the rollout; advantages
     :param work: as of ``stack_forward``
     :param gradient: of the weights, written
@@ -342,11 +393,10 @@ def find_policy_gradient(
     observations, actions = seen
     chances, advantages = kept
     batch, real = len(actions), weights.dtype.type
-    one = real(1)
+    one, inverse = real(1), np.exp(-log_std)
     slope = np.empty(actions.shape, weights.dtype)
-    kernels.stack_forward(weights, sizes, False, observations, work, slope)
-    bound(slope, bounds)
-    (middle, half), inverse = bounds, np.exp(-log_std)
+    each = np.empty((len(observations), log_std.size), weights.dtype)
+    find_means(weights, sizes, bounds, observations, work, each, slope)
     d_log_std[:] = 0
     loss, clipped, divergence = 0.0, 0, 0.0
     for j in range(batch):
@@ -367,11 +417,28 @@ def find_policy_gradient(
             z = slope[j, o]
             slope[j, o] = share * z * inverse[o]
             d_log_std[o] += share * (z * z - one)
-            if half.size:
-                tanh = (actions[j, o] - z / inverse[o] - middle[o]) / half[o]
-                slope[j, o] *= half[o] * (one - tanh * tanh)
-    kernels.stack_backward(weights, sizes, False, observations, work, slope, gradient, NO_FEATURES)
+    share_slopes(slope, bounds, each)
+    kernels.stack_backward(weights, sizes, False, observations, work, each, gradient, NO_FEATURES)
     return loss / batch, clipped / batch, divergence / batch
+
+
+@compiled
+def find_values(weights: Any, sizes: Any, seen: Any, work: Any, values: Any) -> None:
+    """
+    Find values; those of a symmetric policy are the means of both rows.
+
+    :param weights: of the value function
+    :param sizes: of its layers
+    :param seen: (rows, features)
+    :param work: as of ``stack_forward``
+    :param values: (batch,), written
+    """
+    each = np.empty((len(seen), 1), weights.dtype)
+    kernels.stack_forward(weights, sizes, False, seen, work, each)
+    ways, number = len(seen) // len(values), values.dtype.type(len(seen) // len(values))
+    values[:] = 0
+    for row in range(len(seen)):
+        values[row // ways] += each[row, 0] / number
 
 
 @compiled
@@ -385,20 +452,21 @@ def find_value_gradient(
     :param weights: of the value function
     :param sizes: of its layers
     :param coefficient: by which the error is multiplied in the loss
-    :param observations: (batch, features_dim)
+    :param observations: (rows, features)
     :param returns: (batch,)
     :param work: as of ``stack_forward``
     :param gradient: of the weights, written
     :return: the error
     """
-    batch, real = len(returns), weights.dtype.type
-    slope = np.empty((batch, 1), weights.dtype)
-    kernels.stack_forward(weights, sizes, False, observations, work, slope)
-    loss = 0.0
+    batch, rows, real = len(returns), len(observations), weights.dtype.type
+    values = np.empty(batch, weights.dtype)
+    find_values(weights, sizes, observations, work, values)
+    slope, loss = np.empty((rows, 1), weights.dtype), 0.0
     for j in range(batch):
-        error = slope[j, 0] - returns[j]
-        loss += error * error
-        slope[j, 0] = coefficient * real(2) / real(batch) * error
+        values[j] -= returns[j]
+        loss += values[j] * values[j]
+    for row in range(rows):
+        slope[row, 0] = coefficient * real(2) / real(rows) * values[row * batch // rows]
     kernels.stack_backward(weights, sizes, False, observations, work, slope, gradient, NO_FEATURES)
     return loss / batch
 
@@ -417,8 +485,8 @@ def is_for(model: PPO) -> bool:
         and isinstance(model.observation_space, spaces.Box)
         and len(model.observation_space.shape) == 1
         and type(policy.action_dist) is DiagGaussianDistribution
-        and type(policy.pi_features_extractor) in (FlattenExtractor, ActorSensors)
-        and type(policy.vf_features_extractor) is FlattenExtractor
+        and _plain(policy.pi_features_extractor) in (FlattenExtractor, ActorSensors)
+        and _plain(policy.vf_features_extractor) is FlattenExtractor
         and _is_known(policy.mlp_extractor.policy_net)
         and _is_known(policy.mlp_extractor.value_net)
         and model.clip_range_vf is None
@@ -429,7 +497,12 @@ def is_for(model: PPO) -> bool:
     )
 
 
+def _plain(extractor: nn.Module) -> type[nn.Module]:
+    """Find what extracts features, maybe both ways."""
+    return type(extractor.extractor if isinstance(extractor, BothWays) else extractor)
+
+
 def _is_known(hidden: nn.Module) -> bool:
     """Whether hidden layers are linear ones, each followed by ReLU."""
-    kinds = [type(each) for each in hidden.children()]
+    kinds = [type(each) for each in hidden.children() if not isinstance(each, MeanOfBoth)]
     return bool(kinds) and kinds == [nn.Linear, nn.ReLU] * (len(kinds) // 2)

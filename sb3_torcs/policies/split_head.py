@@ -20,14 +20,13 @@ from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.td3.policies import Actor, TD3Policy
 from torch import nn
 
-from sb3_torcs.actions import layout_of_width
 from sb3_torcs.car import check_count, checked_flag, is_number
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.policies import fast_matmul as matmul
 from sb3_torcs.policies.exact import ExactDriver, ExactPolicy, check_sizes
 from sb3_torcs.policies.export import export_actor
 from sb3_torcs.policies.flat import FlatParameters, keep_plain_state
-from sb3_torcs.policies.mirror import sensors_of
+from sb3_torcs.policies.mirror import check_symmetric
 from sb3_torcs.policies.networks import (
     HEAD_GAINS,
     ActorAverage,
@@ -110,7 +109,7 @@ class SplitHeadPolicy(ExactPolicy, TD3Policy):
         fast_matmul = checked_flag("fast_matmul", fast_matmul)
         symmetric = checked_flag("symmetric", symmetric)
         check_count("n_critics", kwargs.get("n_critics", 2))
-        _check_symmetric(symmetric, observation_space, action_space)
+        check_symmetric(symmetric, observation_space, action_space)
         self.own_kwargs: dict[str, Any] = {
             "heads": tuple(heads),
             "head_bias": bias,
@@ -269,18 +268,6 @@ def _check_net_arch(net_arch: Any) -> None:
             "net_arch=dict(pi=[300, 600], qf=[300, 600])"
         )
     check_sizes(net_arch)
-
-
-def _check_symmetric(
-    symmetric: bool, observation_space: spaces.Space, action_space: spaces.Space
-) -> None:
-    ours = sensors_of(observation_space) and layout_of_width(get_action_dim(action_space))
-    if symmetric and not ours:
-        raise InvalidOption(
-            "symmetric=True mirrors the sensors and actuators of Torcs-v0 and TorcsLite-v0, and "
-            f"these observations, of shape {observation_space.shape}, or these actions, of shape "
-            f"{action_space.shape}, are others; pass symmetric=False"
-        )
 
 
 def _positive(name: str, value: float) -> float:
