@@ -166,12 +166,12 @@ def test_an_actor_may_see_less_than_its_value_function(actor_sensors, names, tmp
         assert values[0].allclose(values[1]) is (names == SEES)
 
 
-@pytest.mark.parametrize("symmetric", [False, True])
+@pytest.mark.parametrize("kwargs", [{}, {"symmetric": True, "ema_decay": 0.9}])
 @pytest.mark.parametrize("net_arch", [[8], {"pi": [6, 5], "vf": [8]}, []])
-def test_lean_updates_of_an_asymmetric_policy_learn_as_ppo_does(net_arch, symmetric):
+def test_lean_updates_of_an_asymmetric_policy_learn_as_ppo_does(net_arch, kwargs):
     states = []
     for callback in (None, LeanUpdatesCallback()):
-        model = make_asymmetric(net_arch=net_arch, symmetric=symmetric)
+        model = make_asymmetric(net_arch=net_arch, **kwargs)
         assert is_for(model) is (net_arch != [])
         model.learn(80, callback=callback)
         states.append(model.policy.state_dict())
@@ -205,6 +205,45 @@ def test_a_symmetric_policy_drives_and_values_both_ways_alike(actor_sensors, net
             assert th.equal(driver(image), mirror_actions(driver(seen)))
             th.testing.assert_close(driver(seen), mean, rtol=0.0, atol=1e-5)
     assert not th.allclose(one, mirror_actions(other), atol=1e-3)
+
+
+@pytest.mark.parametrize("callbacks", [[], [LeanUpdatesCallback()]])
+def test_the_average_of_the_weights_drives(callbacks, tmp_path):
+    """It begins with those of the first update, and training is the same without it."""
+    kwargs = {"net_arch": [8], "activation_fn": nn.ReLU}
+    model, plain = (
+        PPO(
+            BoundedPolicy, ToyRace(), policy_kwargs={**kwargs, **own}, n_steps=8, batch_size=8,
+            n_epochs=1, seed=0,
+        )
+        for own in ({"ema_decay": 0.75}, {})
+    )  # fmt: skip
+    expected = []
+    for _ in range(3):
+        for each in (model, plain):
+            each.set_random_seed(3)
+            each.learn(8, callback=callbacks, reset_num_timesteps=False)
+        learned = [*plain.policy.mlp_extractor.policy_net.parameters()]
+        learned += plain.policy.action_net.parameters()
+        pairs = zip(expected or learned, learned, strict=True)
+        expected = [(0.75 * old + 0.25 * new).detach() for old, new in pairs]
+    th.testing.assert_close([*model.policy.average.module.parameters()], expected)
+    states = {**model.policy.state_dict()}
+    for name, own in plain.policy.state_dict().items():
+        assert th.equal(states[name], own)
+    model.save(tmp_path / "model.zip")
+    seen = np.random.default_rng(0).uniform(-1, 1, (50, 29)).astype(np.float32)
+    drives = [
+        each.predict(seen, deterministic=True)[0]
+        for each in (model, PPO.load(tmp_path / "model.zip"), plain)
+    ]
+    np.testing.assert_array_equal(*drives[:2])
+    assert np.any(drives[1] != drives[2])
+
+
+def test_a_share_of_the_average_is_told():
+    with pytest.raises(InvalidOption, match=r"ema_decay=1.0: pass a share in \[0, 1\), e.g. ema"):
+        make(ema_decay=1.0)
 
 
 def test_who_has_no_mirror_image_has_no_symmetric_policy():

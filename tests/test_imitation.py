@@ -37,6 +37,14 @@ def test_only_what_acts_is_taught():
     assert all(own.grad is None for own in student.parameters())
 
 
+def test_an_average_does_not_imitate():
+    student = BoundedPolicy(
+        spaces.Box(-1.0, 1.0, (4,), np.float32), ACTIONS, lambda _: 1e-3, ema_decay=0.9
+    )
+    with pytest.raises(InvalidOption, match="make its policy without ema_decay"):
+        Imitation(student)
+
+
 def test_the_steering_counts_more_than_the_pedal():
     """A unit is an error of 0.05 of the steering, and of 0.2 of the pedal."""
     student = policy(4, 1)

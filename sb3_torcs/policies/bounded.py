@@ -22,13 +22,14 @@ from torch import nn
 from sb3_torcs.car import checked_flag
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.policies.asymmetric import ActorSensors
-from sb3_torcs.policies.exact import ExactDriver, ExactPolicy, check_sizes
+from sb3_torcs.policies.exact import ExactDriver, ExactPolicy, check_sizes, checked_decay
 from sb3_torcs.policies.mirror import (
     check_symmetric,
     mirror_actions,
     mirror_image,
     mirror_observations,
 )
+from sb3_torcs.policies.networks import ActorAverage
 from sb3_torcs.sensors import SensorsName, checked_sensors
 
 __all__ = ["BothWays", "BoundedHead", "BoundedPolicy", "MeanOfBoth"]
@@ -136,10 +137,13 @@ class BoundedPolicy(ExactPolicy, ActorCriticPolicy):
         of an observation and of its mirror image, turned back, and so is the value. It needs
         observations whose middle is 0 (no ``VecNormalize``), and range finders with the same angles
         on both sides
+    :param ema_decay: if given, a running average of the actor's weights drives in its place
+        whenever ``predict`` is ``deterministic``, as in evaluations; each update keeps this share
+        of the average, e.g. 0.999. Training is the same to the bit without it
     :param kwargs: the other arguments of ``ActorCriticPolicy``, but for ``use_sde``
-    :raises InvalidOption: if the action space has no bounds, if ``net_arch`` or ``log_std_init``
-        has other numbers, if observations lack one of ``actor_sensors``, or a mirror image that
-        ``symmetric`` needs, with ``use_sde``, or if the algorithm is neither PPO nor A2C
+    :raises InvalidOption: if the action space has no bounds, if ``net_arch``, ``log_std_init`` or
+        ``ema_decay`` has other numbers, if observations lack one of ``actor_sensors``, or a mirror
+        image that ``symmetric`` needs, with ``use_sde``, or if the algorithm is neither PPO nor A2C
     """
 
     action_net: BoundedHead
@@ -152,6 +156,7 @@ class BoundedPolicy(ExactPolicy, ActorCriticPolicy):
         log_std_init: float | Sequence[float] = 0.0,
         actor_sensors: Sequence[SensorsName] | None = None,
         symmetric: bool = False,
+        ema_decay: float | None = None,
         **kwargs: Any,
     ) -> None:
         if "n_critics" in kwargs:  # DDPG gives it
@@ -167,6 +172,7 @@ class BoundedPolicy(ExactPolicy, ActorCriticPolicy):
         self._first_log_std = _log_std(log_std_init, get_action_dim(action_space))
         self.symmetric = checked_flag("symmetric", symmetric)
         check_symmetric(self.symmetric, observation_space, action_space)
+        self.ema_decay = checked_decay(ema_decay)
         self.actor_sensors = None
         if actor_sensors is not None:
             self.actor_sensors = checked_sensors(actor_sensors, "actor_sensors")
@@ -182,6 +188,21 @@ class BoundedPolicy(ExactPolicy, ActorCriticPolicy):
         assert isinstance(self.action_space, spaces.Box)
         linear: Any = self.action_net
         self.action_net = BoundedHead(linear, self.action_space, symmetric=self.symmetric)
+        self.average = self._averaged()
+
+    def _averaged(self) -> ActorAverage | None:
+        """Begin the average of the actor's weights; the optimizer keeps it up to date."""
+        if self.ema_decay is None:
+            return None
+        actor = self._actor()
+        average = ActorAverage(actor, self.ema_decay)
+        average.requires_grad_(False)
+        self.optimizer.register_step_post_hook(lambda *_: average.update_parameters(actor))
+        return average
+
+    def _actor(self) -> nn.Sequential:
+        """Return the layers of the actor that learns."""
+        return nn.Sequential(self.mlp_extractor.policy_net, self.action_net)
 
     def make_features_extractor(self) -> BaseFeaturesExtractor:
         """Make what extracts features as SB3 does, both ways if the policy is symmetric."""
@@ -214,13 +235,14 @@ class BoundedPolicy(ExactPolicy, ActorCriticPolicy):
         return super().__getattr__(name)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        own = {"actor_sensors": self.actor_sensors, "symmetric": self.symmetric}
+        names = ("actor_sensors", "symmetric", "ema_decay")
+        own = {name: getattr(self, name) for name in names}
         return {**super()._get_constructor_parameters(), **own}
 
     def exact_driver(self) -> ExactDriver:
         """Return a copy of what gives the mean action, which drives if it is deterministic."""
-        network = nn.Sequential(self.mlp_extractor.policy_net, self.action_net)
-        return ExactDriver(self, self.pi_features_extractor, copy.deepcopy(network))
+        actor = self._actor() if self.average is None else self.average.module
+        return ExactDriver(self, self.pi_features_extractor, copy.deepcopy(actor))
 
 
 def _log_std(given: Any, actuators: int) -> float | list[float]:

@@ -16,11 +16,11 @@ from stable_baselines3.common.preprocessing import preprocess_obs
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
-from sb3_torcs.car import is_count
+from sb3_torcs.car import is_count, is_number
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.policies.mirror import mirror_actions, mirror_image, mirror_observations
 
-__all__ = ["ExactDriver", "ExactPolicy", "check_sizes"]
+__all__ = ["ExactDriver", "ExactPolicy", "check_sizes", "checked_decay"]
 
 
 def check_sizes(net_arch: Any) -> None:
@@ -36,6 +36,21 @@ def check_sizes(net_arch: Any) -> None:
                 f"net_arch={net_arch!r}: {size!r} is no layer size; pass whole numbers >= 1, e.g. "
                 "net_arch=[300, 600]"
             )
+
+
+def checked_decay(ema_decay: Any) -> float | None:
+    """
+    Check the share of the average of the weights that an update keeps.
+
+    :param ema_decay: the share, or ``None`` for no average
+    :return: the same as a plain number
+    :raises InvalidOption: if it is no share
+    """
+    if ema_decay is not None and not (is_number(ema_decay) and 0.0 <= ema_decay < 1.0):
+        raise InvalidOption(
+            f"ema_decay={ema_decay!r}: pass a share in [0, 1), e.g. ema_decay=0.9995, or None"
+        )
+    return None if ema_decay is None else float(ema_decay)
 
 
 def _sizes(net_arch: Any) -> Iterator[Any]:

@@ -46,9 +46,15 @@ class Imitation:
 
     :param policy: of PPO or A2C, which learns
     :param learning_rate: of Adam
+    :raises InvalidOption: if an average of the policy's weights drives, which would not learn
     """
 
     def __init__(self, policy: ActorCriticPolicy, learning_rate: float = 1e-3) -> None:
+        if getattr(policy, "average", None) is not None:
+            raise InvalidOption(
+                "the student drives an average of its weights, which does not follow imitation; "
+                "make its policy without ema_decay"
+            )
         self._policy = policy
         parts = (policy.mlp_extractor.policy_net, policy.action_net)
         parameters = [own for part in parts for own in part.parameters()]

@@ -201,7 +201,7 @@ class ActorAverage(AveragedModel):
     :param decay: share of the average that each update keeps
     """
 
-    def __init__(self, actor: Actor, decay: float) -> None:
+    def __init__(self, actor: nn.Module, decay: float) -> None:
         super().__init__(actor, multi_avg_fn=get_ema_multi_avg_fn(decay))
         self.decay = decay
 

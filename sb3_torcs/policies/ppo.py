@@ -6,7 +6,7 @@ The policy and the value function share no layer, so two threads find their grad
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,6 +26,7 @@ from sb3_torcs.policies.bounded import BothWays, BoundedHead, BoundedPolicy, Mea
 from sb3_torcs.policies.flat import Slot
 from sb3_torcs.policies.fused import array
 from sb3_torcs.policies.layers import compiled
+from sb3_torcs.policies.networks import ActorAverage
 from sb3_torcs.policies.optimizers import adam_factors, adam_state, is_usual
 from sb3_torcs.policies.threads import Helper, two_threads
 
@@ -107,6 +108,9 @@ class LeanPPO:
         )
         self.log_std = self.weights[:first]
         self.count = 0  # steps of Adam
+        self.average: ActorAverage | None = getattr(policy, "average", None)
+        averages = 0 if self.average is None else self.actor.part.stop - first
+        self.averaged = np.zeros(averages, np.float32)
         self._versions = -1  # of the policy's parameters that were taken over
 
     # ------------------------------------------------------------------------ rollouts
@@ -114,7 +118,7 @@ class LeanPPO:
     def read_parameters(self) -> None:
         """Take over the parameters of the policy."""
         self._versions = self._policy_versions()
-        self._read(self.weights, [own.detach() for own in self.parameters])
+        self._read(self.weights, self.slots, [own.detach() for own in self.parameters])
 
     def _policy_versions(self) -> int:
         """Return a number that grows whenever a parameter of the policy is changed in place."""
@@ -221,6 +225,10 @@ class LeanPPO:
         self.count += 1
         factors = adam_factors(group, self.count, np.float32)
         kernels.adam(self.weights, self.gradient, self.mean, self.square, *factors)
+        if self.average is not None:
+            share = 1.0 - self.average.decay if self.average.n_averaged > 0 else 1.0
+            kernels.follow(self.averaged, self.weights[self.actor.part], np.float32(share))
+            self.average.n_averaged += 1
 
     def _record(self, figures: list[list[Figures]]) -> None:
         """Log what ``PPO.train`` logs."""
@@ -242,14 +250,17 @@ class LeanPPO:
 
     # --------------------------------------------------------------------------- state
 
-    def _views(self, vector: np.ndarray) -> list[th.Tensor]:
-        """Look at the part of each parameter, in the form that the model gives it."""
-        parts = th.from_numpy(vector).split([own.numel() for own in self.parameters])
-        return [slot.of(part) for slot, part in zip(self.slots, parts, strict=True)]
-
-    def _read(self, vector: np.ndarray, tensors: Sequence[th.Tensor]) -> None:
-        for view, own in zip(self._views(vector), tensors, strict=True):
+    def _read(
+        self, vector: np.ndarray, slots: Sequence[Slot], tensors: Iterable[th.Tensor]
+    ) -> None:
+        for view, own in zip(_views(vector, slots), tensors, strict=True):
             view.copy_(own)
+
+    def _averages(self) -> tuple[list[Slot], list[th.Tensor]]:
+        """Look at the average of each parameter of the actor; there may be none."""
+        if self.average is None:
+            return [], []
+        return self.actor.slots, list(self.average.module.parameters())
 
     def _states(self) -> list[dict[str, Any]]:
         """Look at what Adam keeps of each parameter; begin it if needed."""
@@ -259,20 +270,30 @@ class LeanPPO:
         """Take over the parameters and what Adam keeps of them."""
         states = self._states()
         self.read_parameters()
-        self._read(self.mean, [state["exp_avg"] for state in states])
-        self._read(self.square, [state["exp_avg_sq"] for state in states])
+        self._read(self.mean, self.slots, [state["exp_avg"] for state in states])
+        self._read(self.square, self.slots, [state["exp_avg_sq"] for state in states])
+        self._read(self.averaged, *self._averages())
         self.count = int(states[0]["step"].item())
 
     @th.no_grad()
     def _write_state(self) -> None:
         """Give them back to the model."""
-        views = map(self._views, (self.weights, self.mean, self.square))
+        views = (_views(each, self.slots) for each in (self.weights, self.mean, self.square))
         for own, state, *found in zip(self.parameters, self._states(), *views, strict=True):
             for tensor, view in zip(
                 (own, state["exp_avg"], state["exp_avg_sq"]), found, strict=True
             ):
                 tensor.copy_(view)
             state["step"].fill_(self.count)
+        slots, tensors = self._averages()
+        for own, view in zip(tensors, _views(self.averaged, slots), strict=True):
+            own.copy_(view)
+
+
+def _views(vector: np.ndarray, slots: Sequence[Slot]) -> list[th.Tensor]:
+    """Look at the part of each parameter, in the form that the model gives it."""
+    parts = th.from_numpy(vector).split([math.prod(slot.shape) for slot in slots])
+    return [slot.of(part) for slot, part in zip(slots, parts, strict=True)]
 
 
 @compiled
@@ -493,7 +514,10 @@ def is_for(model: PPO) -> bool:
         and model.target_kl is None
         and is_usual(policy.optimizer)
         and len(policy.optimizer.param_groups) == 1
-        and all(own.dtype == th.float32 and own.requires_grad for own in policy.parameters())
+        and all(
+            own.dtype == th.float32 and (own.requires_grad or name.startswith("average."))
+            for name, own in policy.named_parameters()
+        )
     )
 
 

@@ -23,7 +23,7 @@ from torch import nn
 from sb3_torcs.car import check_count, checked_flag, is_number
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.policies import fast_matmul as matmul
-from sb3_torcs.policies.exact import ExactDriver, ExactPolicy, check_sizes
+from sb3_torcs.policies.exact import ExactDriver, ExactPolicy, check_sizes, checked_decay
 from sb3_torcs.policies.export import export_actor
 from sb3_torcs.policies.flat import FlatParameters, keep_plain_state
 from sb3_torcs.policies.mirror import check_symmetric
@@ -116,7 +116,7 @@ class SplitHeadPolicy(ExactPolicy, TD3Policy):
             "init_std": _positive("init_std", init_std),
             "layer_norm": layer_norm,
             "critic_lr_scale": _positive("critic_lr_scale", critic_lr_scale),
-            "ema_decay": _share("ema_decay", ema_decay),
+            "ema_decay": checked_decay(ema_decay),
             "symmetric": symmetric,
             "fast_matmul": fast_matmul,
         }
@@ -274,14 +274,6 @@ def _positive(name: str, value: float) -> float:
     if not is_number(value) or value <= 0.0:
         raise InvalidOption(f"{name}={value!r}: pass a number above 0, e.g. {name}=1.0")
     return float(value)
-
-
-def _share(name: str, value: float | None) -> float | None:
-    if value is not None and not (is_number(value) and 0.0 <= value < 1.0):
-        raise InvalidOption(
-            f"{name}={value!r}: pass a share in [0, 1), e.g. {name}=0.9995, or None"
-        )
-    return None if value is None else float(value)
 
 
 def _fast_optimizer(kwargs: dict[str, Any]) -> dict[str, Any]:
