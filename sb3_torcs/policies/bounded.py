@@ -188,17 +188,9 @@ class BoundedPolicy(ExactPolicy, ActorCriticPolicy):
         assert isinstance(self.action_space, spaces.Box)
         linear: Any = self.action_net
         self.action_net = BoundedHead(linear, self.action_space, symmetric=self.symmetric)
-        self.average = self._averaged()
-
-    def _averaged(self) -> ActorAverage | None:
-        """Begin the average of the actor's weights; the optimizer keeps it up to date."""
-        if self.ema_decay is None:
-            return None
-        actor = self._actor()
-        average = ActorAverage(actor, self.ema_decay)
-        average.requires_grad_(False)
-        self.optimizer.register_step_post_hook(lambda *_: average.update_parameters(actor))
-        return average
+        self.average: ActorAverage | None = None
+        if self.ema_decay is not None:
+            self.average = ActorAverage(self._actor(), self.ema_decay, self.optimizer)
 
     def _actor(self) -> nn.Sequential:
         """Return the layers of the actor that learns."""

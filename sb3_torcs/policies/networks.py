@@ -199,11 +199,14 @@ class ActorAverage(AveragedModel):
 
     :param actor: to average
     :param decay: share of the average that each update keeps
+    :param optimizer: whose steps are the updates
     """
 
-    def __init__(self, actor: nn.Module, decay: float) -> None:
+    def __init__(self, actor: nn.Module, decay: float, optimizer: th.optim.Optimizer) -> None:
         super().__init__(actor, multi_avg_fn=get_ema_multi_avg_fn(decay))
         self.decay = decay
+        self.requires_grad_(False)
+        optimizer.register_step_post_hook(lambda *_: self.update_parameters(actor))
 
 
 class LateActionQ(nn.Module):

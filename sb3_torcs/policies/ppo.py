@@ -114,7 +114,7 @@ class LeanPPO:
     def read_parameters(self) -> None:
         """Take over the parameters of the policy."""
         self._versions = self._policy_versions()
-        self._read(self.weights, self.slots, [own.detach() for own in self.parameters])
+        _read(self.weights, self.slots, [own.detach() for own in self.parameters])
 
     def _policy_versions(self) -> int:
         """Return a number that grows whenever a parameter of the policy is changed in place."""
@@ -246,12 +246,6 @@ class LeanPPO:
 
     # --------------------------------------------------------------------------- state
 
-    def _read(
-        self, vector: np.ndarray, slots: Sequence[Slot], tensors: Iterable[th.Tensor]
-    ) -> None:
-        for view, own in zip(_views(vector, slots), tensors, strict=True):
-            view.copy_(own)
-
     def _averages(self) -> tuple[list[Slot], list[th.Tensor]]:
         """Look at the average of each parameter of the actor; there may be none."""
         if self.average is None:
@@ -266,9 +260,9 @@ class LeanPPO:
         """Take over the parameters and what Adam keeps of them."""
         states = self._states()
         self.read_parameters()
-        self._read(self.mean, self.slots, [state["exp_avg"] for state in states])
-        self._read(self.square, self.slots, [state["exp_avg_sq"] for state in states])
-        self._read(self.averaged, *self._averages())
+        _read(self.mean, self.slots, [state["exp_avg"] for state in states])
+        _read(self.square, self.slots, [state["exp_avg_sq"] for state in states])
+        _read(self.averaged, *self._averages())
         self.count = int(states[0]["step"].item())
 
     @th.no_grad()
@@ -290,6 +284,12 @@ def _views(vector: np.ndarray, slots: Sequence[Slot]) -> list[th.Tensor]:
     """Look at the part of each parameter, in the form that the model gives it."""
     parts = th.from_numpy(vector).split([math.prod(slot.shape) for slot in slots])
     return [slot.of(part) for slot, part in zip(slots, parts, strict=True)]
+
+
+def _read(vector: np.ndarray, slots: Sequence[Slot], tensors: Iterable[th.Tensor]) -> None:
+    """Take over parameters from the model."""
+    for view, own in zip(_views(vector, slots), tensors, strict=True):
+        view.copy_(own)
 
 
 def is_for(model: PPO) -> bool:

@@ -37,6 +37,20 @@ def bound(means: Any, bounds: Any) -> None:
 
 
 @compiled
+def turned_back(x: Any, row: int, ways: int, actuator: int) -> Any:
+    """
+    Turn what belongs to an actuator back, if its row is a mirror image. Steering comes first.
+
+    :param x: an action, or its gradient
+    :param row: of the observation
+    :param ways: rows per observation
+    :param actuator: number of it
+    :return: the same, with the other sign for the steering in the mirror
+    """
+    return -x if row % ways == 1 and actuator == 0 else x
+
+
+@compiled
 def find_means(
     weights: Any, sizes: Any, bounds: Any, seen: Any, work: Any, each: Any, means: Any
 ) -> None:
@@ -53,12 +67,12 @@ def find_means(
     """
     kernels.stack_forward(weights, sizes, False, seen, work, each)
     bound(each, bounds)
-    ways, number = len(each) // len(means), means.dtype.type(len(each) // len(means))
+    ways = len(each) // len(means)
+    number = means.dtype.type(ways)
     means[:] = 0
     for row in range(len(each)):
-        j, mirrored = row // ways, row % ways == 1
         for o in range(each.shape[1]):
-            means[j, o] += (-each[row, o] if mirrored and o == 0 else each[row, o]) / number
+            means[row // ways, o] += turned_back(each[row, o], row, ways, o) / number
 
 
 @compiled
@@ -71,11 +85,10 @@ def share_slopes(slope: Any, bounds: Any, each: Any) -> None:
     :param each: of ``find_means``; overwritten by the gradients
     """
     (middle, half), real = bounds, slope.dtype.type
-    ways, number = len(each) // len(slope), real(len(each) // len(slope))
+    ways = len(each) // len(slope)
     for row in range(len(each)):
-        j, mirrored = row // ways, row % ways == 1
         for o in range(each.shape[1]):
-            share = (-slope[j, o] if mirrored and o == 0 else slope[j, o]) / number
+            share = turned_back(slope[row // ways, o], row, ways, o) / real(ways)
             if half.size:
                 tanh = (each[row, o] - middle[o]) / half[o]
                 share *= half[o] * (real(1) - tanh * tanh)
@@ -181,7 +194,8 @@ def find_values(weights: Any, sizes: Any, seen: Any, work: Any, values: Any) -> 
     """
     each = np.empty((len(seen), 1), weights.dtype)
     kernels.stack_forward(weights, sizes, False, seen, work, each)
-    ways, number = len(seen) // len(values), values.dtype.type(len(seen) // len(values))
+    ways = len(seen) // len(values)
+    number = values.dtype.type(ways)
     values[:] = 0
     for row in range(len(seen)):
         values[row // ways] += each[row, 0] / number
@@ -205,6 +219,7 @@ def find_value_gradient(
     :return: the error
     """
     batch, rows, real = len(returns), len(observations), weights.dtype.type
+    ways = rows // batch
     values = np.empty(batch, weights.dtype)
     find_values(weights, sizes, observations, work, values)
     slope, loss = np.empty((rows, 1), weights.dtype), 0.0
@@ -212,6 +227,6 @@ def find_value_gradient(
         values[j] -= returns[j]
         loss += values[j] * values[j]
     for row in range(rows):
-        slope[row, 0] = coefficient * real(2) / real(rows) * values[row * batch // rows]
+        slope[row, 0] = coefficient * real(2) / real(rows) * values[row // ways]
     kernels.stack_backward(weights, sizes, False, observations, work, slope, gradient, NO_FEATURES)
     return loss / batch

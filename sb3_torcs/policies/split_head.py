@@ -156,16 +156,9 @@ class SplitHeadPolicy(ExactPolicy, TD3Policy):
         return optimizer
 
     def _averaged(self) -> ActorAverage | None:
-        """Begin the average of the actor's weights; its optimizer keeps it up to date."""
+        """Begin the average of the actor's weights, if it is wanted."""
         decay = self.own_kwargs["ema_decay"]
-        if decay is None:
-            return None
-        average = ActorAverage(self.actor, decay)
-        average.requires_grad_(False)
-        self.actor.optimizer.register_step_post_hook(
-            lambda *_: average.update_parameters(self.actor)
-        )
-        return average
+        return None if decay is None else ActorAverage(self.actor, decay, self.actor.optimizer)
 
     @property
     def driver(self) -> Actor:
