@@ -129,6 +129,9 @@ def test_a_replay_buffer_that_is_missing_is_told(tmp_path, capsys):
     words = ["train", "--no-progress", "--folder", str(tmp_path)]
     assert main([*words, "--conf-file", str(tmp_path / "own.yml")]) == 0
     begun = tmp_path / "ddpg" / "TorcsLite-v0_1"
+    resumed = [*words, "--resume", str(begun)]
+    assert main([*resumed, "--", "--hyperparams", "buffer_size:50"]) == 2
+    assert "keeps 100 timesteps, and the training would keep 50" in capsys.readouterr().err
     (begun / "replay_buffer.pkl").unlink()
     capsys.readouterr()
     said = "there is no replay_buffer.pkl beside"
@@ -141,6 +144,9 @@ def test_what_changes_how_it_sees_is_refused(run, tmp_path, capsys):
     words = ["train", "--resume", str(run), "--folder", str(tmp_path / "none"), "--no-progress"]
     assert main([*words, "--", "--hyperparams", "normalize:True"]) == 2
     assert "has learned with normalize False, and would go on with True" in capsys.readouterr().err
+    for change in ("policy_kwargs:{'net_arch': [8]}", "policy:'sb3_torcs.policies.BoundedPolicy'"):
+        assert main([*words, "--", "--hyperparams", change]) == 2
+        assert f"has learned with {change.partition(':')[0]} " in capsys.readouterr().err
     assert main([*words, "--algo", "a2c"]) == 2
     assert "is a model of ppo, not of a2c; give --algo ppo" in capsys.readouterr().err
     assert not (tmp_path / "none").exists()

@@ -19,7 +19,7 @@ from sb3_torcs.car import range_finder_angles
 from sb3_torcs.errors import ModelMismatch, ModelNotTrusted
 from sb3_torcs.files import listed, path_and_arguments
 from sb3_torcs.training.keeping import REPLAY_BUFFER
-from sb3_torcs.training.zoo_data import SCHEDULES, as_data
+from sb3_torcs.training.zoo_data import SCHEDULES, as_data, policy_arguments
 
 __all__ = ["check_resumable", "recorded_entry", "restore_statistics"]
 
@@ -121,11 +121,10 @@ def check_resumable(
         )
     known = record.algo is not None
     check_same(model, record.algo or told_algorithm(data), algo, to_learn=known)
-    frames, before = frames_of(entry), record.hyperparameters
-    for what, was, now in (
-        ("frame_stack", frames_of(before), frames),
-        ("normalize", normalizes(before.get("normalize")), normalizes(entry.get("normalize"))),
-    ):
+    frames = frames_of(entry)
+    before, after = (_lasting(each) for each in (record.hyperparameters, entry))
+    for what, was in before.items():
+        now = after.get(what)
         if record.known and was != now:
             raise ModelMismatch(
                 f"'{model}' has learned with {what} {was}, and would go on with {now}; give the "
@@ -146,7 +145,7 @@ def check_resumable(
     file = model.parent / REPLAY_BUFFER
     if not file.is_file():
         return False
-    n_envs = entry.get("n_envs", 1)
+    n_envs = int(entry.get("n_envs", 1))
     said = f"'{file}' is no replay buffer that can be gone on with"
     with as_mismatch(said, "remove it, or give"), file.open("rb") as content:
         buffer = load_from_pkl(content)
@@ -156,4 +155,22 @@ def check_resumable(
                 f"{n_envs}; give n_envs {buffer.n_envs}, or remove the file to begin with an empty "
                 "one"
             )
+        size, before_size = int(entry.get("buffer_size", 0)), buffer.buffer_size * n_envs
+        if size and max(size // n_envs, 1) != buffer.buffer_size:
+            raise ModelMismatch(
+                f"'{file}' keeps {before_size} timesteps, and the training would keep {size}; give "
+                f"buffer_size {before_size}, or remove the file to begin with an empty one"
+            )
     return True
+
+
+def _lasting(entry: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what of a training cannot change: how it sees, and its networks."""
+    lasting: dict[str, Any] = {
+        "frame_stack": frames_of(entry),
+        "normalize": normalizes(entry.get("normalize")),
+    }
+    if "policy" in entry:  # a script's record does not tell it
+        lasting["policy"] = str(entry["policy"]).rpartition(".")[2]
+        lasting["policy_kwargs"] = policy_arguments(as_data(entry)) or {}
+    return lasting
