@@ -10,6 +10,7 @@ from torch import nn
 from toy import ToyRace
 
 from sb3_torcs.callbacks import LeanUpdatesCallback
+from sb3_torcs.callbacks.learning import learn_values
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.policies import BoundedPolicy
 from sb3_torcs.policies.mirror import mirror_actions, mirror_image, mirror_observations
@@ -239,6 +240,25 @@ def test_the_average_of_the_weights_drives(callbacks, tmp_path):
     ]
     np.testing.assert_array_equal(*drives[:2])
     assert np.any(drives[1] != drives[2])
+
+
+def test_before_its_first_update_an_average_leaves_the_driving_to_the_actor(tmp_path):
+    """Weights of a policy without one may be loaded; and where only values learn, it learns not."""
+    kwargs = {"net_arch": [8], "activation_fn": nn.ReLU}
+    plain, model = (
+        PPO(BoundedPolicy, ToyRace(), policy_kwargs={**kwargs, **own}, n_steps=8, batch_size=8)
+        for own in ({}, {"ema_decay": 0.999})
+    )
+    seen = np.random.default_rng(0).uniform(-1, 1, (50, 29)).astype(np.float32)
+    plain.save(tmp_path / "plain.zip")
+    model.predict(seen, deterministic=True)
+    model.set_parameters(tmp_path / "plain.zip", exact_match=False)
+    expected, _ = plain.predict(seen, deterministic=True)
+    np.testing.assert_array_equal(model.predict(seen, deterministic=True)[0], expected)
+    learn_values(model, 32)
+    np.testing.assert_array_equal(model.predict(seen, deterministic=True)[0], expected)
+    model.learn(8)
+    assert np.any(model.predict(seen, deterministic=True)[0] != expected)
 
 
 def test_a_share_of_the_average_is_told():

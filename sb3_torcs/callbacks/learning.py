@@ -281,7 +281,8 @@ class ValuesOnlyCallback(BaseCallback):
             )
         parts = policy.mlp_extractor.value_net, policy.value_net
         values = {id(own) for part in parts for own in part.parameters()}
-        others = [own for own in policy.parameters() if id(own) not in values]
+        state = *policy.parameters(), *policy.buffers()  # a buffer counts what an average has seen
+        others = [own for own in state if id(own) not in values]
         self._policy = [(own, own.detach().clone()) for own in others]
 
     def _on_rollout_start(self) -> None:

@@ -233,7 +233,9 @@ class BoundedPolicy(ExactPolicy, ActorCriticPolicy):
 
     def exact_driver(self) -> ExactDriver:
         """Return a copy of what gives the mean action, which drives if it is deterministic."""
-        actor = self._actor() if self.average is None else self.average.module
+        actor: Any = self._actor()
+        if self.average is not None and self.average.has_begun:
+            actor = self.average.module
         return ExactDriver(self, self.pi_features_extractor, copy.deepcopy(actor))
 
 

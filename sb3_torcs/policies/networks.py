@@ -195,7 +195,8 @@ class SplitHeadActor(Actor):
 
 class ActorAverage(AveragedModel):
     """
-    A running average of an actor's weights. It begins with those of the first update.
+    A running average of an actor's weights. It begins with those of the first update; before that
+    the actor itself drives.
 
     :param actor: to average
     :param decay: share of the average that each update keeps
@@ -207,6 +208,11 @@ class ActorAverage(AveragedModel):
         self.decay = decay
         self.requires_grad_(False)
         optimizer.register_step_post_hook(lambda *_: self.update_parameters(actor))
+
+    @property
+    def has_begun(self) -> bool:
+        """Whether there was an update. Loaded weights may come without an average of theirs."""
+        return int(self.n_averaged) > 0
 
 
 class LateActionQ(nn.Module):

@@ -222,7 +222,7 @@ class LeanPPO:
         factors = adam_factors(group, self.count, np.float32)
         kernels.adam(self.weights, self.gradient, self.mean, self.square, *factors)
         if self.average is not None:
-            share = 1.0 - self.average.decay if self.average.n_averaged > 0 else 1.0
+            share = 1.0 - self.average.decay if self.average.has_begun else 1.0
             kernels.follow(self.averaged, self.weights[self.actor.part], np.float32(share))
             self.average.n_averaged += 1
 

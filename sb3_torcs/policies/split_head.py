@@ -163,7 +163,9 @@ class SplitHeadPolicy(ExactPolicy, TD3Policy):
     @property
     def driver(self) -> Actor:
         """The actor that drives when ``predict`` is deterministic."""
-        return self.actor if self.average is None else cast(Actor, self.average.module)
+        if self.average is None or not self.average.has_begun:
+            return self.actor
+        return cast(Actor, self.average.module)
 
     @property
     def fuses(self) -> bool:

@@ -51,7 +51,7 @@ class LeanUpdates:
         if self.average is None:
             self.averages = np.empty(0, dtype), np.zeros((), np.int64)
         else:
-            self.averages = array(policy.driver.mu.flat), self.average.n_averaged.numpy()
+            self.averages = array(self.average.module.mu.flat), self.average.n_averaged.numpy()
 
     def train(self, gradient_steps: int, batch_size: int) -> None:
         """
