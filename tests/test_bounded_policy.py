@@ -167,7 +167,12 @@ def test_an_actor_may_see_less_than_its_value_function(actor_sensors, names, tmp
         assert values[0].allclose(values[1]) is (names == SEES)
 
 
-@pytest.mark.parametrize("kwargs", [{}, {"symmetric": True, "ema_decay": 0.9}])
+SCALE = {"range_finders": 3.0, "heading_error": 0.2, "bends_ahead": 0.1}
+
+
+@pytest.mark.parametrize(
+    "kwargs", [{}, {"symmetric": True, "ema_decay": 0.9, "input_scale": SCALE}]
+)
 @pytest.mark.parametrize("net_arch", [[8], {"pi": [6, 5], "vf": [8]}, []])
 def test_lean_updates_of_an_asymmetric_policy_learn_as_ppo_does(net_arch, kwargs):
     states = []
@@ -206,6 +211,50 @@ def test_a_symmetric_policy_drives_and_values_both_ways_alike(actor_sensors, net
             assert th.equal(driver(image), mirror_actions(driver(seen)))
             th.testing.assert_close(driver(seen), mean, rtol=0.0, atol=1e-5)
     assert not th.allclose(one, mirror_actions(other), atol=1e-3)
+
+
+@pytest.mark.parametrize("symmetric", [False, True])
+@pytest.mark.parametrize(("actor_sensors", "seen"), [(None, SEES), (["base"], ["base"])])
+def test_both_networks_see_scaled_inputs(actor_sensors, seen, symmetric, tmp_path):
+    """As if the weights of their first layers had the factors instead."""
+    model, plain = (
+        make_asymmetric(actor_sensors=actor_sensors, symmetric=symmetric, **scale)
+        for scale in ({"input_scale": SCALE}, {})
+    )
+    model.learn(40)
+    weights = {name: own.clone() for name, own in model.policy.state_dict().items()}
+    for net, groups in (("policy_net", seen), ("value_net", SEES)):
+        where = feature_slices(groups)
+        for sensor in SCALE.keys() & where.keys():
+            weights[f"mlp_extractor.{net}.0.weight"][:, where[sensor]] *= SCALE[sensor]
+    plain.policy.load_state_dict(weights)
+    model.save(tmp_path / "model.zip")
+    model.policy.save(tmp_path / "policy.pth")
+    loaded = PPO.load(tmp_path / "model.zip").policy, BoundedPolicy.load(tmp_path / "policy.pth")
+    some = th.as_tensor(np.stack([model.observation_space.sample() for _ in range(50)]))
+    with th.no_grad():
+        expected = plain.policy.get_distribution(some).mode(), plain.policy.predict_values(some)
+        for policy in loaded:
+            assert policy.input_scale == SCALE
+            found = policy.get_distribution(some).mode(), policy.predict_values(some)
+            th.testing.assert_close(found, expected)
+            th.testing.assert_close(policy.exact_driver()(some), expected[0], rtol=0.0, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"wheel_speed": 0.3}, "names 'wheel_speed'; did you mean 'wheel_speeds'"),
+        ({"base": 0.3}, "names 'base'.* pass factors by the names of sensors, e.g."),
+        ({"wheel_speeds": 0.0}, r"={'wheel_speeds': 0.0}: a factor is a number above 0"),
+        ({"wheel_speeds": "3"}, "a factor is a number above 0"),
+        ({3: 0.3}, "names 3; pass factors"),
+        ([0.3], r"input_scale=\[0.3\]; pass factors"),
+    ],
+)
+def test_a_scale_that_is_none_is_told(wrong, message):
+    with pytest.raises(InvalidOption, match=message):
+        make(input_scale=wrong)
 
 
 @pytest.mark.parametrize("callbacks", [[], [LeanUpdatesCallback()]])
@@ -285,3 +334,5 @@ def test_an_actor_cannot_see_what_the_environment_does_not_give():
             make_asymmetric(actor_sensors=wrong)
     with pytest.raises(InvalidOption, match="take out what changes their bounds or size"):
         PPO(BoundedPolicy, gym.make("Pendulum-v1"), policy_kwargs={"actor_sensors": ["base"]})
+    with pytest.raises(InvalidOption, match=r"input_scale: these .*, or leave input_scale out"):
+        PPO(BoundedPolicy, gym.make("Pendulum-v1"), policy_kwargs={"input_scale": SCALE})

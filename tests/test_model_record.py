@@ -449,7 +449,11 @@ def test_a_driver_of_ppo_keeps_its_value_function_if_asked(env, tmp_path, kept):
 def test_a_driver_of_ppo_leaves_out_what_only_its_value_function_saw(tmp_path, net_arch, symmetric):
     """In stock SB3, too, it then drives where there are no such sensors."""
     with gym.make("TorcsLite-v0", sensors=["base", "line"]) as env:
-        kwargs = {"net_arch": net_arch, "actor_sensors": ["base"], "symmetric": symmetric}
+        scale = {"speed_x": 2.0, "line_margins": 0.1}  # the latter is seen by the value function
+        kwargs = {
+            "net_arch": net_arch, "actor_sensors": ["base"], "symmetric": symmetric,
+            "input_scale": scale,
+        }  # fmt: skip
         model = trained(PPO, BoundedPolicy, env, n_steps=8, batch_size=8, policy_kwargs=kwargs)
         seen = np.stack([env.observation_space.sample() for _ in range(4)])
     model.save(tmp_path / "whole.zip")

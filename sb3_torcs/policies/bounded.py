@@ -7,7 +7,7 @@ every draw is full throttle: then no draw brakes, and PPO never learns that it s
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,8 +21,8 @@ from torch import nn
 
 from sb3_torcs.car import checked_flag
 from sb3_torcs.errors import InvalidOption
-from sb3_torcs.policies.asymmetric import ActorSensors
 from sb3_torcs.policies.exact import ExactDriver, ExactPolicy, check_sizes, checked_decay
+from sb3_torcs.policies.inputs import SensorInputs, checked_scale
 from sb3_torcs.policies.mirror import (
     check_symmetric,
     mirror_actions,
@@ -133,6 +133,10 @@ class BoundedPolicy(ExactPolicy, ActorCriticPolicy):
     :param log_std_init: as in ``ActorCriticPolicy``, or one number per actuator, -20 to 20
     :param actor_sensors: groups of sensors that the actor sees, ``"base"`` among them, while the
         value function sees all that the environment gives; ``None`` is all for both
+    :param input_scale: factors on the numbers of sensors before both networks see them, by the
+        sensor's name (:class:`~sb3_torcs.sensors.Sensor`), e.g. ``{"wheel_speeds": 0.3}``; sensors
+        that are not named, or not seen, stay as they are. Adam changes each weight by about as
+        much, so large numbers are learned from fast and coarsely, and small ones slowly
     :param symmetric: drive and learn left and right bends alike: the mean of the Gaussian is that
         of an observation and of its mirror image, turned back, and so is the value. It needs
         observations whose middle is 0 (no ``VecNormalize``), and range finders with the same angles
@@ -141,9 +145,10 @@ class BoundedPolicy(ExactPolicy, ActorCriticPolicy):
         whenever ``predict`` is ``deterministic``, as in evaluations; each update keeps this share
         of the average, e.g. 0.999. Training is the same to the bit without it
     :param kwargs: the other arguments of ``ActorCriticPolicy``, but for ``use_sde``
-    :raises InvalidOption: if the action space has no bounds, if ``net_arch``, ``log_std_init`` or
-        ``ema_decay`` has other numbers, if observations lack one of ``actor_sensors``, or a mirror
-        image that ``symmetric`` needs, with ``use_sde``, or if the algorithm is neither PPO nor A2C
+    :raises InvalidOption: if the action space has no bounds, if ``net_arch``, ``log_std_init``,
+        ``input_scale`` or ``ema_decay`` has other numbers, if observations lack one of
+        ``actor_sensors``, or a mirror image that ``symmetric`` needs, with ``use_sde``, or if the
+        algorithm is neither PPO nor A2C
     """
 
     action_net: BoundedHead
@@ -155,6 +160,7 @@ class BoundedPolicy(ExactPolicy, ActorCriticPolicy):
         lr_schedule: Schedule,
         log_std_init: float | Sequence[float] = 0.0,
         actor_sensors: Sequence[SensorsName] | None = None,
+        input_scale: Mapping[str, float] | None = None,
         symmetric: bool = False,
         ema_decay: float | None = None,
         **kwargs: Any,
@@ -173,6 +179,7 @@ class BoundedPolicy(ExactPolicy, ActorCriticPolicy):
         self.symmetric = checked_flag("symmetric", symmetric)
         check_symmetric(self.symmetric, observation_space, action_space)
         self.ema_decay = checked_decay(ema_decay)
+        self.input_scale = checked_scale(input_scale)
         self.actor_sensors = None
         if actor_sensors is not None:
             self.actor_sensors = checked_sensors(actor_sensors, "actor_sensors")
@@ -197,8 +204,10 @@ class BoundedPolicy(ExactPolicy, ActorCriticPolicy):
         return nn.Sequential(self.mlp_extractor.policy_net, self.action_net)
 
     def make_features_extractor(self) -> BaseFeaturesExtractor:
-        """Make what extracts features as SB3 does, both ways if the policy is symmetric."""
-        return self._both_ways(super().make_features_extractor())
+        """Make what extracts features as SB3 does, scaled, and both ways if symmetric."""
+        if self.input_scale is None:
+            return self._both_ways(super().make_features_extractor())
+        return self._both_ways(SensorInputs(self.observation_space, scale=self.input_scale))
 
     def _both_ways(self, extractor: BaseFeaturesExtractor) -> BaseFeaturesExtractor:
         return BothWays(extractor, self.observation_space) if self.symmetric else extractor
@@ -207,7 +216,7 @@ class BoundedPolicy(ExactPolicy, ActorCriticPolicy):
         """Make the hidden layers as SB3 does, those of the actor for what it sees."""
         super()._build_mlp_extractor()
         if self.actor_sensors is not None:
-            seen = ActorSensors(self.observation_space, self.actor_sensors)
+            seen = SensorInputs(self.observation_space, self.actor_sensors, self.input_scale)
             self.pi_features_extractor = self._both_ways(seen)
             actor = MlpExtractor(
                 seen.features_dim,
@@ -227,7 +236,7 @@ class BoundedPolicy(ExactPolicy, ActorCriticPolicy):
         return super().__getattr__(name)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        names = ("actor_sensors", "symmetric", "ema_decay")
+        names = ("actor_sensors", "input_scale", "symmetric", "ema_decay")
         own = {name: getattr(self, name) for name in names}
         return {**super()._get_constructor_parameters(), **own}
 

@@ -21,10 +21,10 @@ from stable_baselines3.common.utils import explained_variance
 from torch import nn
 
 from sb3_torcs.policies import kernels
-from sb3_torcs.policies.asymmetric import ActorSensors
 from sb3_torcs.policies.bounded import BothWays, BoundedHead, BoundedPolicy, MeanOfBoth
 from sb3_torcs.policies.flat import Slot
 from sb3_torcs.policies.fused import array
+from sb3_torcs.policies.inputs import SensorInputs
 from sb3_torcs.policies.networks import ActorAverage
 from sb3_torcs.policies.optimizers import adam_factors, adam_state, is_usual
 from sb3_torcs.policies.ppo_passes import decide, find_policy_gradient, find_value_gradient
@@ -306,8 +306,8 @@ def is_for(model: PPO) -> bool:
         and isinstance(model.observation_space, spaces.Box)
         and len(model.observation_space.shape) == 1
         and type(policy.action_dist) is DiagGaussianDistribution
-        and _plain(policy.pi_features_extractor) in (FlattenExtractor, ActorSensors)
-        and _plain(policy.vf_features_extractor) is FlattenExtractor
+        and _plain(policy.pi_features_extractor) in (FlattenExtractor, SensorInputs)
+        and _plain(policy.vf_features_extractor) in (FlattenExtractor, SensorInputs)
         and _is_known(policy.mlp_extractor.policy_net)
         and _is_known(policy.mlp_extractor.value_net)
         and model.clip_range_vf is None

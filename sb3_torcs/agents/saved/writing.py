@@ -43,7 +43,7 @@ from sb3_torcs.agents.saved.record import (
 from sb3_torcs.agents.wrapping import LEFT_OUT
 from sb3_torcs.errors import InvalidOption, ModelNotTrusted
 from sb3_torcs.files import whole_file
-from sb3_torcs.policies.asymmetric import columns_of
+from sb3_torcs.policies.inputs import columns_of
 from sb3_torcs.torcs.track_names import lasting_kwargs
 from sb3_torcs.tracks.catalogue import lasting_name
 from sb3_torcs.tracks.track import Track
