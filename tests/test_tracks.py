@@ -271,6 +271,9 @@ class TestCompactFile:
         [
             ("sb3-torcs track,1", "track,1", 1, "instead of the first record"),
             ("name,ring", "nmae,ring", 2, "unknown record 'nmae'; allowed are name, category"),
+            ("category,oval", "category,ovla", 3, "'ovla' is none of road, oval, dirt"),
+            ("category,oval", "name,ring", 3, "there is a second 'name'; expected one"),
+            ('"mud, deep"', "tar", 7, "there is a second surface 'tar'; give it another name"),
             ("start,1.0,2.0,0.5", "start,1.0,2.0", 4, "'start' has 2 fields, expected 3"),
             ("start,1.0,2.0,0.5", "start,1.0,2.0,1e9", 4, "expected -2 pi to 2 pi"),
             ("7.0,-2.0", "seven,-2.0", 5, "'seven' is not a finite number"),
@@ -293,12 +296,19 @@ class TestCompactFile:
         [
             ("-1.0,0.0", "the grid is -1 m before the line; expected 0 to "),
             ("1e9,0.0", r"the grid is 1e\+09 m before the line; expected 0 to "),
-            ("7.0,-5.5", "the grid is -5.5 m from the axis, and the road ends at 5 m"),
+            ("7.0,-5.5", "the grid is -5.5 m from the axis, and there the road ends at 5 m"),
         ],
     )
     def test_a_grid_beside_the_road_is_refused(self, tmp_path, grid, message):
         path = write(tmp_path, SMALL.replace("7.0,-2.0", grid))
         with pytest.raises(TrackFileError, match=message):
+            load_track(path)
+
+    def test_a_grid_beside_a_road_that_is_narrow_there_is_refused(self, tmp_path):
+        """The road is 10 m wide elsewhere; 7 m before the line it has become narrower."""
+        last = SMALL.splitlines()[-1]
+        path = write(tmp_path, SMALL.replace(last, last.replace("10.0,10.0", "10.0,3.0", 1)))
+        with pytest.raises(TrackFileError, match=r"and there the road ends at 1\.65597 m"):
             load_track(path)
 
     @pytest.mark.parametrize("text", ["", "sb3-torcs track,1\nname,ring\n", "# nothing\n"])

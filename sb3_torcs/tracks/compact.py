@@ -28,7 +28,7 @@ from pathlib import Path
 from sb3_torcs.errors import TrackFileError
 from sb3_torcs.files import IN_A_FOLDER, whole_file
 from sb3_torcs.torcs.params import read_bounded
-from sb3_torcs.tracks.track import Grid, Segment, Surface, Track
+from sb3_torcs.tracks.track import CATEGORIES, Grid, Segment, Surface, Track
 
 __all__ = ["read_track_file", "surfaces_of", "write_track_file"]
 
@@ -58,6 +58,7 @@ class _Reader:
         self.start = (0.0, 0.0, 0.0)
         self.grid = Grid(10.0, 0.0)
         self.surfaces: dict[str, Surface] = {}
+        self.seen: set[str] = set()  # what stands once
         self.segments: list[Segment] = []
 
     def fail(self, message: str) -> TrackFileError:
@@ -144,18 +145,43 @@ class _Reader:
                 )
             self.segments.append(self.segment(values))
         elif keyword == "surface":
-            name, *texts = values
-            numbers = [self.number(text) for text in texts]
-            if min(numbers) < 0.0:
-                raise self.fail("the numbers of a surface may not be negative")
-            self.surfaces[name] = Surface(name, *numbers)
-        elif keyword == "grid":
+            self.define(*values)
+        else:
+            self.header(keyword, values)
+
+    def define(self, name: str, *texts: str) -> None:
+        """
+        Define a surface.
+
+        :param name: of the surface
+        :param texts: its numbers
+        """
+        numbers = [self.number(text) for text in texts]
+        if min(numbers) < 0.0:
+            raise self.fail("the numbers of a surface may not be negative")
+        if name in self.surfaces:
+            raise self.fail(f"there is a second surface '{name}'; give it another name")
+        self.surfaces[name] = Surface(name, *numbers)
+
+    def header(self, keyword: str, values: list[str]) -> None:
+        """
+        Take in what stands once in a file.
+
+        :param keyword: of the line
+        :param values: the fields after it
+        """
+        if keyword in self.seen:
+            raise self.fail(f"there is a second '{keyword}'; expected one")
+        self.seen.add(keyword)
+        if keyword == "grid":
             self.grid = Grid(*map(self.number, values))
         elif keyword == "start":
             x, y, heading = map(self.number, values)
             if abs(heading) > math.tau:
                 raise self.fail(f"the heading is {heading} rad; expected -2 pi to 2 pi")
             self.start = (x, y, heading)
+        elif keyword == "category" and values[0] not in CATEGORIES:
+            raise self.fail(f"category '{values[0]}' is none of {', '.join(CATEGORIES)}")
         else:
             self.texts[keyword] = values[0]
 
@@ -175,17 +201,20 @@ class _Reader:
         return track
 
     def _check_grid(self, track: Track) -> None:
-        """Make sure that the first grid slot is on the road where that is widest."""
+        """Make sure that the first grid slot is on the road."""
         distance, offset = track.grid
         if not 0.0 <= distance <= track.length:
             raise TrackFileError(
                 f"{self.path}: the grid is {distance:g} m before the line; expected 0 to "
                 f"{track.length:g} m"
             )
-        half = 0.5 * max(segment.width_start for segment in track.segments)
+        index, along = track.find(track.length - distance)
+        segment = track.segments[index]
+        change = (segment.width_end - segment.width_start) * along / segment.length
+        half = 0.5 * (segment.width_start + change)
         if abs(offset) > half:
             raise TrackFileError(
-                f"{self.path}: the grid is {offset:g} m from the axis, and the road ends at "
+                f"{self.path}: the grid is {offset:g} m from the axis, and there the road ends at "
                 f"{half:g} m"
             )
 
