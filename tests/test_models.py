@@ -351,9 +351,16 @@ def test_a_model_that_is_given_other_options_is_told_its_own(capsys):
     words = ["evaluate", "ppo-aalborg", "--env-kwargs", "action=pedals"]
     assert main(words) == 2
     said = capsys.readouterr().err
-    assert "it learned there with action_repeat=5, range_finders='narrow', " in said
+    assert "it learned with action_repeat=5, range_finders='narrow', " in said
     assert "action='pedal'" in said
     assert said.endswith("; give it the same\n")
+
+
+def test_a_model_is_told_its_own_options_in_the_other_world_too(env):
+    with pytest.raises(
+        ModelMismatch, match=r"it learned with .*'line', 'motion'\], action='pedal'"
+    ):
+        models.load_driver("ppo-aalborg", env)
 
 
 def test_a_model_that_is_given_other_sensors_is_told_the_usual_ones(capsys):

@@ -269,15 +269,15 @@ def check_spaces(
         name = env.spec.id if env.spec else "Torcs-v0"  # cars of one race have no spec
         frames_seen = _frames_seen(has, needs) if what == "observations" else None
         option = _option_of(has)
-        if record.env_id == name and frames_seen is not None and frames is None:
+        if record.known and frames_seen is not None and frames is None:
             advice = (
                 f"it sees {frames_seen} observations at once, which its record does not tell; "
                 "train it with VecFrameStack around VecNormalize, not within it, and with "
                 "RecordCallback"
             )
-        elif record.env_id == name:
+        elif record.known and name in ("Torcs-v0", "TorcsLite-v0"):  # one contract
             said = ", ".join(f"{key}={value!r}" for key, value in _task(record).items())
-            advice = f"it learned there with {said}; give it the same"
+            advice = f"it learned with {said}; give it the same"
         elif record.known or (frames_seen is None and option is None):
             advice = (
                 "give the --env that it was trained on, or train a model for this one: sb3-torcs "
