@@ -140,6 +140,16 @@ def test_a_replay_buffer_that_is_missing_is_told(tmp_path, capsys):
         assert (said in capsys.readouterr().err) == told
 
 
+def test_what_is_left_of_a_warm_up_goes_on(tmp_path):
+    own = {"n_timesteps": 60, "policy": "MlpPolicy", "learning_starts": 30, "buffer_size": 100}
+    (tmp_path / "own.yml").write_text(yaml.safe_dump({"TorcsLite-v0": own}))
+    words = ["train", "--no-progress", "--folder", str(tmp_path), "--timesteps", "20"]
+    assert main([*words, "--conf-file", str(tmp_path / "own.yml")]) == 0
+    assert main([*words, "--resume", str(tmp_path / "ddpg" / "TorcsLite-v0_1")]) == 0
+    resumed = tmp_path / "ddpg" / "TorcsLite-v0_2" / "TorcsLite-v0" / "config.yml"
+    assert _read_plain(resumed)["learning_starts"] == 10
+
+
 def test_what_changes_how_it_sees_is_refused(run, tmp_path, capsys):
     words = ["train", "--resume", str(run), "--folder", str(tmp_path / "none"), "--no-progress"]
     assert main([*words, "--", "--hyperparams", "normalize:True"]) == 2

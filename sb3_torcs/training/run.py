@@ -242,7 +242,7 @@ def _check_resumed(
     changed: Mapping[str, Any],
 ) -> None:
     """
-    Check the model to resume. With its replay buffer it needs no new warm-up.
+    Check the model to resume. With its replay buffer it needs only what is left of a warm-up.
 
     :param options: what to train
     :param resume: the model
@@ -252,6 +252,7 @@ def _check_resumed(
     """
     from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
+    from sb3_torcs.agents.models import saved_timesteps
     from sb3_torcs.agents.saved.algorithm import algorithm_class
     from sb3_torcs.agents.saved.record import BEST_MODEL
     from sb3_torcs.training.keeping import REPLAY_BUFFER
@@ -259,7 +260,8 @@ def _check_resumed(
 
     buffer = check_resumable(resume, env, options.algo, changed, trust=options.trust)
     if "learning_starts" in entry and buffer:
-        entry["learning_starts"] = 0
+        left = int(entry["learning_starts"]) - saved_timesteps(resume)
+        entry["learning_starts"] = max(left, 0)
     replays = issubclass(algorithm_class(options.algo), OffPolicyAlgorithm)
     if replays and not buffer:
         _tell(f"there is no {REPLAY_BUFFER} beside '{resume}': the training fills an empty one")
