@@ -5,6 +5,7 @@ import errno
 import importlib
 import itertools
 import json
+import math
 import os
 import shlex
 import signal
@@ -619,6 +620,11 @@ def test_an_evaluation_refuses_arguments_that_no_environment_has():
     given = {"opponents": ["bt"], "start": "random", "max_episode_steps": 9, "sensr": ["base"]}
     with pytest.raises(InvalidOption, match=r"'sensr', which no.*did you mean 'sensors'"):
         evaluation.race_environment("TorcsLite-v0", given, "aalborg")
+    with pytest.raises(InvalidOption, match="env_kwargs has '1', which no environment takes"):
+        evaluation.race_environment("TorcsLite-v0", {1: 2}, "aalborg")
+    for wrong in ("five", None, 0, math.nan):
+        with pytest.raises(InvalidOption, match=f"action_repeat is {wrong!r}; expected a whole"):
+            evaluation.race_environment("TorcsLite-v0", {"action_repeat": wrong}, "aalborg")
     del given["sensr"]
     with evaluation.race_environment("TorcsLite-v0", given, "aalborg") as env:
         assert env.spec.max_episode_steps > 9

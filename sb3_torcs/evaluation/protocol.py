@@ -140,6 +140,7 @@ def time_limit(kwargs: Mapping[str, Any]) -> int:
 
     :param kwargs: of the environment, with ``laps``
     :return: timesteps
+    :raises InvalidOption: if ``action_repeat`` is no whole number of at least 1
     """
     from sb3_torcs.envs.ends import STUCK_SPEED
     from sb3_torcs.tracks.catalogue import load_track
@@ -148,7 +149,9 @@ def time_limit(kwargs: Mapping[str, Any]) -> int:
     length = LONGEST_TRACK if track == RANDOM_TRACK else load_track(track).length
     # One lap more than asked for: for the way from the grid to the line, and as a margin.
     seconds = (kwargs["laps"] + 1) * length / STUCK_SPEED
-    return math.ceil(seconds / (kwargs.get("action_repeat", 5) * CONTROL_TICK))
+    action_repeat = kwargs.get("action_repeat", 5)
+    check_count("action_repeat", action_repeat)
+    return math.ceil(seconds / (action_repeat * CONTROL_TICK))
 
 
 def race_environment(
@@ -206,7 +209,7 @@ def _check_names(env_kwargs: Mapping[str, Any], env_id: str) -> None:
     for name in env_kwargs:
         if name not in known:
             raise InvalidOption(
-                f"env_kwargs has '{name}', which no environment takes{near_miss(name, known)}"
+                f"env_kwargs has '{name}', which no environment takes{near_miss(str(name), known)}"
             )
 
 
