@@ -96,6 +96,16 @@ def test_a_study_that_still_runs_can_be_reported(tmp_path):
     assert [len(trial.train) for trial in read_results(tmp_path / "study")] == [3, 1]
 
 
+def test_rows_of_several_machines_may_be_mixed(study, tmp_path):
+    write_report(study, tmp_path / "whole")
+    heading, *rows = (study / "results.csv").read_text().splitlines(keepends=True)
+    mixed = [row for which in (0, 1, 2) for row in rows[which::5]] + rows[3::5] + rows[4::5]
+    (study / "results.csv").write_text("".join([heading, *mixed]))
+    write_report(study, tmp_path / "mixed")
+    for name in ("report.md", "learning-base.png"):
+        assert (tmp_path / "mixed" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+
+
 def test_few_seeds_have_no_interval(tmp_path):
     rows = [row(seed, phase) for seed in (0, 1) for phase in ("train", "final")]
     (summary,) = lines_of(write_report(written(tmp_path / "study", rows), tmp_path), "| base |")
@@ -133,7 +143,13 @@ def test_a_name_is_no_table(tmp_path):
     assert lines_of(report, "| a \\| b |")[0].replace("\\|", "").count("|") == 9
 
 
-@pytest.mark.parametrize("change", [{"phase": "final"}, {"kept": False}, {"ladder": "flies"}])
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"phase": "final"}, {"phase": "trian"}, {"kept": False}, {"ladder": "flies"},
+        {"decisions": -1}, {"wall_s": "nan"}, {"lap_times_s": "97.0 -84.0 83.5"},
+    ],
+)  # fmt: skip
 def test_rows_that_say_nothing_are_told(tmp_path, capsys, change):
     assert main(["report", str(written(tmp_path / "study", [{**row(0), **change}]))]) == 2
     assert "results.csv cannot be read as results (ValueError" in capsys.readouterr().err

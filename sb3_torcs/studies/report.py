@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import itertools
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -66,8 +65,10 @@ def read_results(folder: Path) -> list[Results]:
 def _trials(rows: Sequence[dict[str, Any]]) -> list[Results]:
     """Sort rows into trials, and make sure that each has the rows that the report needs."""
     trials = []
-    for (variant, seed), group in itertools.groupby(rows, lambda r: (r["variant"], r["seed"])):
-        own = list(group)
+    rows_of: dict[tuple[str, int], list[dict[str, Any]]] = {}  # of several machines, maybe mixed
+    for row in rows:
+        rows_of.setdefault((row["variant"], row["seed"]), []).append(row)
+    for (variant, seed), own in rows_of.items():
         train = [row for row in own if row["phase"] == "train"]
         if not any(row["kept"] for row in train):
             raise ValueError(f"no evaluation of {variant}, {seed} has kept a model")
@@ -84,6 +85,13 @@ def _read(row: dict[str, str]) -> dict[str, Any]:
     }
     whole = {key: int(row[key]) for key in ("seed", "decisions", "episodes", "laps")}
     truths = {key: row[key] == "1" for key in ("completes", "kept")}
+    told = [*numbers.items(), *whole.items(), *(("lap_times_s", lap) for lap in laps)]
+    for key, value in told:
+        least = -math.inf if key == "distance_m" else 0.0  # a car may drive backwards
+        if value is not None and not (math.isfinite(value) and value >= least):
+            raise ValueError(f"{value!r} is no number of a drive")
+    if row["phase"] not in ("train", "final"):
+        raise ValueError(f"there is no phase '{row['phase']}'")
     if row["ladder"] not in ("", *RUNGS):
         raise ValueError(f"there is no rung '{row['ladder']}'")
     return {**row, **numbers, **whole, **truths, "lap_times_s": laps}
