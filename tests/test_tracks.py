@@ -271,7 +271,6 @@ class TestCompactFile:
         [
             ("sb3-torcs track,1", "track,1", 1, "instead of the first record"),
             ("name,ring", "nmae,ring", 2, "unknown record 'nmae'; allowed are name, category"),
-            ("category,oval", "category,ovla", 3, "'ovla' is none of road, oval, dirt"),
             ("category,oval", "name,ring", 3, "there is a second 'name'; expected one"),
             ('"mud, deep"', "tar", 7, "there is a second surface 'tar'; give it another name"),
             ("start,1.0,2.0,0.5", "start,1.0,2.0", 4, "'start' has 2 fields, expected 3"),

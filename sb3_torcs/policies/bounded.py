@@ -161,7 +161,7 @@ class BoundedPolicy(ExactPolicy, ActorCriticPolicy):
         lr_schedule: Schedule,
         log_std_init: float | Sequence[float] = 0.0,
         actor_sensors: Sequence[SensorsName] | None = None,
-        input_scale: Mapping[str, float] | None = None,
+        input_scale: Mapping[str, float] | Mapping[str, Mapping[str, float]] | None = None,
         symmetric: bool = False,
         ema_decay: float | None = None,
         **kwargs: Any,

@@ -24,8 +24,7 @@ from sb3_torcs.agents.saved.algorithm import SBX
 from sb3_torcs.errors import StudyError, near_miss, with_new_names
 from sb3_torcs.files import listed, read_yaml
 from sb3_torcs.torcs.track_names import RANDOM_TRACK
-from sb3_torcs.tracks.catalogue import load_track, tracks_of
-from sb3_torcs.tracks.track import CATEGORIES
+from sb3_torcs.tracks.catalogue import CATEGORIES, load_track, tracks_of
 from sb3_torcs.training import zoo
 from sb3_torcs.training.zoo_data import as_data
 

@@ -17,9 +17,12 @@ from sb3_torcs.torcs.track_names import RANDOM_TRACK, TrackFile, find_track, kno
 from sb3_torcs.tracks.compact import read_track_file
 from sb3_torcs.tracks.generator import random_track
 from sb3_torcs.tracks.torcs_xml import read_track_xml
-from sb3_torcs.tracks.track import CATEGORIES, Track, TrackSummary, closed
+from sb3_torcs.tracks.track import Track, TrackSummary, closed
 
-__all__ = ["available_tracks", "lasting_name", "load_track", "tracks_of"]
+__all__ = ["CATEGORIES", "available_tracks", "lasting_name", "load_track", "tracks_of"]
+
+
+CATEGORIES = ("road", "oval", "dirt")
 
 
 def load_track(

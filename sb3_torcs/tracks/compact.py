@@ -28,7 +28,7 @@ from pathlib import Path
 from sb3_torcs.errors import TrackFileError
 from sb3_torcs.files import IN_A_FOLDER, whole_file
 from sb3_torcs.torcs.params import read_bounded
-from sb3_torcs.tracks.track import CATEGORIES, Grid, Segment, Surface, Track
+from sb3_torcs.tracks.track import Grid, Segment, Surface, Track
 
 __all__ = ["read_track_file", "surfaces_of", "write_track_file"]
 
@@ -180,8 +180,6 @@ class _Reader:
             if abs(heading) > math.tau:
                 raise self.fail(f"the heading is {heading} rad; expected -2 pi to 2 pi")
             self.start = (x, y, heading)
-        elif keyword == "category" and values[0] not in CATEGORIES:
-            raise self.fail(f"category '{values[0]}' is none of {', '.join(CATEGORIES)}")
         else:
             self.texts[keyword] = values[0]
 

@@ -21,7 +21,6 @@ from sb3_torcs.car import FloatArray
 from sb3_torcs.tracks.profile import RoadProfile, road_profile
 
 __all__ = [
-    "CATEGORIES",
     "CURVATURE",
     "LENGTH",
     "START",
@@ -62,8 +61,6 @@ RIGHT_WALL_FRICTION = 21  # [-]
 RIGHT_WALL_REBOUND = 22  # [-]
 RIGHT_WALL_DAMAGE = 23  # [-]
 COLUMNS = 24
-
-CATEGORIES = ("road", "oval", "dirt")
 
 CLOSED_WITHIN = 1e-9  # [m] and [rad] what counts as no gap at the start line
 MAX_GAP = 0.005  # [-] of the length: a chain that misses its start by more is no circuit
