@@ -1,5 +1,7 @@
 """A Gaussian policy whose mean cannot leave the action space."""
 
+import copy
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -318,6 +320,17 @@ def test_before_its_first_update_an_average_leaves_the_driving_to_the_actor(tmp_
     np.testing.assert_array_equal(model.predict(seen, deterministic=True)[0], expected)
     model.learn(8)
     assert np.any(model.predict(seen, deterministic=True)[0] != expected)
+
+
+def test_the_average_of_a_copy_follows_the_copy():
+    kwargs = {"net_arch": [8], "ema_decay": 0.9}
+    model = PPO(BoundedPolicy, ToyRace(), policy_kwargs=kwargs, n_steps=8, batch_size=8, n_epochs=2)
+    first = model.policy
+    model.policy = copy.deepcopy(first)
+    model.learn(16)
+    assert (first.average.n_averaged, model.policy.average.n_averaged) == (0, 4)
+    trained = zip(model.policy.average.parameters(), first.average.parameters(), strict=True)
+    assert not all(own.equal(other) for own, other in trained)
 
 
 def test_a_share_of_the_average_is_told():

@@ -396,6 +396,16 @@ def test_each_update_moves_the_average_once_whatever_optimizers_there_were():
     assert model.policy.average.n_averaged == model._n_updates > 0
 
 
+def test_the_average_of_a_copy_follows_the_copy():
+    model = make_model(ema_decay=0.75)
+    first = model.policy
+    model.policy = deepcopy(first)
+    model._create_aliases()
+    model.learn(12)
+    assert first.average.n_averaged == 0
+    assert model.policy.average.n_averaged > 0
+
+
 @pytest.mark.parametrize("ema_decay", [None, 0.9])
 def test_predictions_follow_the_training(ema_decay):
     """They come from a copy in double precision, which must not be an old one."""

@@ -200,7 +200,14 @@ class BoundedPolicy(ExactPolicy, ActorCriticPolicy):
         self.action_net = BoundedHead(linear, self.action_space, symmetric=self.symmetric)
         self.average: ActorAverage | None = None
         if self.ema_decay is not None:
-            self.average = ActorAverage(self._actor(), self.ema_decay, self.optimizer)
+            self.average = ActorAverage(self._actor(), self.ema_decay)
+            self.average.follow(self._actor(), self.optimizer)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Become a copy, whose average follows it."""
+        super().__setstate__(state)
+        if self.average is not None:
+            self.average.follow(self._actor(), self.optimizer)
 
     def _actor(self) -> nn.Sequential:
         """Return the layers of the actor that learns."""

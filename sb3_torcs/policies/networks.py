@@ -200,13 +200,20 @@ class ActorAverage(AveragedModel):
 
     :param actor: to average
     :param decay: share of the average that each update keeps
-    :param optimizer: whose steps are the updates
     """
 
-    def __init__(self, actor: nn.Module, decay: float, optimizer: th.optim.Optimizer) -> None:
+    def __init__(self, actor: nn.Module, decay: float) -> None:
         super().__init__(actor, multi_avg_fn=get_ema_multi_avg_fn(decay))
         self.decay = decay
         self.requires_grad_(False)
+
+    def follow(self, actor: nn.Module, optimizer: th.optim.Optimizer) -> None:
+        """
+        Follow an actor from now on. Copies of an optimizer leave its hooks behind.
+
+        :param actor: of the same shape
+        :param optimizer: whose steps are the updates
+        """
         optimizer.register_step_post_hook(lambda *_: self.update_parameters(actor))
 
     @property

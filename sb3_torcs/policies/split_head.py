@@ -134,7 +134,17 @@ class SplitHeadPolicy(ExactPolicy, TD3Policy):
         scale = self.own_kwargs["critic_lr_scale"]
         self.actor.optimizer = self._optimizer(self.actor, 1.0, lr_schedule)
         self.critic.optimizer = self._optimizer(self.critic, scale, lr_schedule)
-        self.average = self._averaged()
+        decay = self.own_kwargs["ema_decay"]
+        self.average: ActorAverage | None = None
+        if decay is not None:
+            self.average = ActorAverage(self.actor, decay)
+            self.average.follow(self.actor, self.actor.optimizer)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Become a copy, whose average follows it."""
+        super().__setstate__(state)
+        if self.average is not None:
+            self.average.follow(self.actor, self.actor.optimizer)
 
     def _optimizer(
         self, network: nn.Module, scale: float, lr_schedule: Schedule
@@ -154,11 +164,6 @@ class SplitHeadPolicy(ExactPolicy, TD3Policy):
         for part in flat:
             keep_plain_state(optimizer, part)
         return optimizer
-
-    def _averaged(self) -> ActorAverage | None:
-        """Begin the average of the actor's weights, if it is wanted."""
-        decay = self.own_kwargs["ema_decay"]
-        return None if decay is None else ActorAverage(self.actor, decay, self.actor.optimizer)
 
     @property
     def driver(self) -> Actor:
