@@ -22,7 +22,7 @@ from torch import nn
 from sb3_torcs.car import checked_flag
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.policies.exact import ExactDriver, ExactPolicy, check_sizes, checked_decay
-from sb3_torcs.policies.inputs import SensorInputs, checked_scale, scale_of
+from sb3_torcs.policies.inputs import SensorInputs, checked_scale
 from sb3_torcs.policies.mirror import (
     check_symmetric,
     mirror_actions,
@@ -133,11 +133,10 @@ class BoundedPolicy(ExactPolicy, ActorCriticPolicy):
     :param log_std_init: as in ``ActorCriticPolicy``, or one number per actuator, -20 to 20
     :param actor_sensors: groups of sensors that the actor sees, ``"base"`` among them, while the
         value function sees all that the environment gives; ``None`` is all for both
-    :param input_scale: factors on the numbers of sensors before the networks see them, by the
-        sensor's name (:class:`~sb3_torcs.sensors.Sensor`), e.g. ``{"wheel_speeds": 0.3}``, or as
-        ``net_arch`` such a mapping for each network, ``{"pi": …, "vf": …}``; sensors that are not
-        named, or not seen, stay as they are. Adam changes each weight by about as much, so large
-        numbers are learned from fast and coarsely, and small ones slowly
+    :param input_scale: factors on the numbers of sensors before both networks see them, by the
+        sensor's name (:class:`~sb3_torcs.sensors.Sensor`), e.g. ``{"wheel_speeds": 0.3}``; sensors
+        that are not named, or not seen, stay as they are. Adam changes each weight by about as
+        much, so large numbers are learned from fast and coarsely, and small ones slowly
     :param symmetric: drive and learn left and right bends alike: the mean of the Gaussian is that
         of an observation and of its mirror image, turned back, and so is the value. It needs
         observations whose middle is 0 (no ``VecNormalize``), and range finders with the same angles
@@ -161,7 +160,7 @@ class BoundedPolicy(ExactPolicy, ActorCriticPolicy):
         lr_schedule: Schedule,
         log_std_init: float | Sequence[float] = 0.0,
         actor_sensors: Sequence[SensorsName] | None = None,
-        input_scale: Mapping[str, float] | Mapping[str, Mapping[str, float]] | None = None,
+        input_scale: Mapping[str, float] | None = None,
         symmetric: bool = False,
         ema_decay: float | None = None,
         **kwargs: Any,
@@ -181,11 +180,9 @@ class BoundedPolicy(ExactPolicy, ActorCriticPolicy):
         check_symmetric(self.symmetric, observation_space, action_space)
         self.ema_decay = checked_decay(ema_decay)
         self.input_scale = checked_scale(input_scale)
-        self._scales = tuple(scale_of(network, self.input_scale) for network in ("pi", "vf"))
         self.actor_sensors = None
         if actor_sensors is not None:
             self.actor_sensors = checked_sensors(actor_sensors, "actor_sensors")
-        if self._sees_otherwise():
             kwargs["share_features_extractor"] = False
         super().__init__(observation_space, action_space, lr_schedule, **kwargs)
         self.log_std_init = self._first_log_std  # type: ignore[assignment]  # for copies of it
@@ -214,16 +211,10 @@ class BoundedPolicy(ExactPolicy, ActorCriticPolicy):
         return nn.Sequential(self.mlp_extractor.policy_net, self.action_net)
 
     def make_features_extractor(self) -> BaseFeaturesExtractor:
-        """Make what the value function sees, as SB3 does or scaled, both ways if symmetric."""
-        scale = self._scales[1]
-        if not scale:
+        """Make what extracts features as SB3 does, or scales them; both ways if symmetric."""
+        if self.input_scale is None:
             return self._both_ways(super().make_features_extractor())
-        return self._both_ways(SensorInputs(self.observation_space, scale=scale))
-
-    def _sees_otherwise(self) -> bool:
-        """Whether the actor does not see what the value function sees."""
-        own, other = self._scales
-        return self.actor_sensors is not None or own != other
+        return self._both_ways(SensorInputs(self.observation_space, scale=self.input_scale))
 
     def _both_ways(self, extractor: BaseFeaturesExtractor) -> BaseFeaturesExtractor:
         return BothWays(extractor, self.observation_space) if self.symmetric else extractor
@@ -231,8 +222,8 @@ class BoundedPolicy(ExactPolicy, ActorCriticPolicy):
     def _build_mlp_extractor(self) -> None:
         """Make the hidden layers as SB3 does, those of the actor for what it sees."""
         super()._build_mlp_extractor()
-        if self._sees_otherwise():
-            seen = SensorInputs(self.observation_space, self.actor_sensors, self._scales[0])
+        if self.actor_sensors is not None:
+            seen = SensorInputs(self.observation_space, self.actor_sensors, self.input_scale)
             self.pi_features_extractor = self._both_ways(seen)
             actor = MlpExtractor(
                 seen.features_dim,

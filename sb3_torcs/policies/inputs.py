@@ -7,7 +7,6 @@ Only the actor drives, so a critic may see what the driver must not know: an asy
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -19,12 +18,7 @@ from sb3_torcs.car import is_number
 from sb3_torcs.errors import InvalidOption, near_miss
 from sb3_torcs.sensors import GROUPS, SensorsName, View, checked_sensors, feature_slices, view_of
 
-__all__ = ["SensorInputs", "checked_scale", "columns_of", "scale_of"]
-
-NETWORKS = frozenset({"pi", "vf"})
-"""How SB3 calls the policy's and the value function's part of ``net_arch``."""
-
-EXAMPLE = 'pass factors by the names of sensors, e.g. input_scale={"wheel_speeds": 0.3}'
+__all__ = ["SensorInputs", "checked_scale", "columns_of"]
 
 
 class SensorInputs(BaseFeaturesExtractor):
@@ -33,8 +27,8 @@ class SensorInputs(BaseFeaturesExtractor):
 
     :param observation_space: of ``Torcs-v0`` or ``TorcsLite-v0``
     :param sensors: names of groups, ``"base"`` among them; ``None`` takes all that there are
-    :param scale: factors on the numbers of sensors, by the sensor's name, of :func:`scale_of`;
-        sensors that the observation lacks do not matter
+    :param scale: factors on the numbers of sensors, by the sensor's name, as
+        :func:`checked_scale` returns them; sensors that the observation lacks do not matter
     :raises InvalidOption: if observations have no such groups
     """
 
@@ -45,7 +39,7 @@ class SensorInputs(BaseFeaturesExtractor):
         self,
         observation_space: spaces.Space[Any],
         sensors: Sequence[SensorsName] | None = None,
-        scale: Mapping[str, float] = MappingProxyType({}),
+        scale: Mapping[str, float] | None = None,
     ) -> None:
         option = "input_scale" if sensors is None else f"actor_sensors={list(sensors)!r}"
         view = _view(observation_space, option)
@@ -53,7 +47,7 @@ class SensorInputs(BaseFeaturesExtractor):
         super().__init__(observation_space, len(columns))
         factors = th.ones(view.size)
         for name, where in feature_slices(view.sensors).items():
-            factors[where] = scale.get(name, 1.0)
+            factors[where] = (scale or {}).get(name, 1.0)
         self.register_buffer("columns", th.tensor(columns), persistent=False)
         self.register_buffer("factors", factors[columns], persistent=False)
 
@@ -67,48 +61,26 @@ class SensorInputs(BaseFeaturesExtractor):
         return observations[:, self.columns] * self.factors
 
 
-def checked_scale(given: Any) -> dict[str, Any] | None:
+def checked_scale(given: Any) -> dict[str, float] | None:
     """
     Check factors on the numbers of sensors.
 
-    :param given: factors above 0, by the sensor's name in the table, or such mappings for
-        ``"pi"`` and ``"vf"``; ``None`` for none
+    :param given: factors above 0, by the sensor's name in the table; ``None`` for none
     :return: the same as plain numbers
     :raises InvalidOption: if a name is unknown, or a factor no positive number
     """
     if given is None:
         return None
+    example = 'pass factors by the names of sensors, e.g. input_scale={"wheel_speeds": 0.3}'
     if not isinstance(given, Mapping):
-        raise InvalidOption(f"input_scale={given!r}; {EXAMPLE}")
-    if given and NETWORKS.issuperset(given):
-        return {network: _checked_factors(factors) for network, factors in given.items()}
-    return _checked_factors(given)
-
-
-def scale_of(network: str, scale: Mapping[str, Any] | None) -> dict[str, float]:
-    """
-    Find the factors of one network.
-
-    :param network: ``"pi"`` or ``"vf"``
-    :param scale: of :func:`checked_scale`
-    :return: factors by the names of sensors; empty if there are none
-    """
-    if scale and NETWORKS.issuperset(scale):
-        scale = scale.get(network)
-    return dict(scale or {})
-
-
-def _checked_factors(given: Any) -> dict[str, float]:
-    """Check the factors of one network, or of both."""
-    if not isinstance(given, Mapping):
-        raise InvalidOption(f"input_scale has {given!r}; {EXAMPLE}")
+        raise InvalidOption(f"input_scale={given!r}; {example}")
     known = [sensor.name for rows in GROUPS.values() for sensor in rows]
     for name, factor in given.items():
         if name not in known:
-            raise InvalidOption(f"input_scale names {name!r}{near_miss(str(name), known, EXAMPLE)}")
+            raise InvalidOption(f"input_scale names {name!r}{near_miss(str(name), known, example)}")
         if not (is_number(factor) and 0.0 < factor < np.inf):
             raise InvalidOption(
-                f"input_scale={{{name!r}: {factor!r}}}: a factor is a number above 0; {EXAMPLE}"
+                f"input_scale={{{name!r}: {factor!r}}}: a factor is a number above 0; {example}"
             )
     return {name: float(factor) for name, factor in given.items()}
 
