@@ -121,8 +121,7 @@ class ExactPolicy(BasePolicy):
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         if not deterministic:
             return super()._predict(observation, deterministic)  # type: ignore[safe-super]
-        state = *self.parameters(), *self.buffers()
-        versions = [number for own in state for number in (id(own), own._version)]
+        versions = [number for own in self.parameters() for number in (id(own), own._version)]
         if self._exact is None or self._exact[0] != versions:
             self._exact = (versions, self.exact_driver())
         actions: th.Tensor = self._exact[1](observation)
