@@ -208,8 +208,7 @@ class _Reader:
             )
         index, along = track.find(track.length - distance)
         segment = track.segments[index]
-        change = (segment.width_end - segment.width_start) * along / segment.length
-        half = 0.5 * (segment.width_start + change)
+        half = 0.5 * segment.width_at(along / segment.length)
         if abs(offset) > half:
             raise TrackFileError(
                 f"{self.path}: the grid is {offset:g} m from the axis, and there the road ends at "

@@ -100,9 +100,7 @@ def edges(track: Track) -> tuple[FloatArray, FloatArray]:
         )
         steps = 1 if segment.curvature == 0.0 else steps
         for fraction in np.linspace(0.0, 1.0, steps + 1):
-            half = 0.5 * (
-                segment.width_start + fraction * (segment.width_end - segment.width_start)
-            )
+            half = 0.5 * segment.width_at(float(fraction))
             along = float(fraction) * segment.length
             left.append(track.pose_on(index, along, half)[:2])
             right.append(track.pose_on(index, along, -half)[:2])

@@ -93,6 +93,15 @@ class Segment(NamedTuple):
     left_wall: Surface
     right_wall: Surface
 
+    def width_at(self, share: float) -> float:
+        """
+        Compute the width of the road.
+
+        :param share: of the segment's length, 0 to 1
+        :return: [m]
+        """
+        return self.width_start + share * (self.width_end - self.width_start)
+
 
 class Grid(NamedTuple):
     """The first grid slot."""
