@@ -89,7 +89,7 @@ def _read(row: dict[str, str]) -> dict[str, Any]:
     for key, value in told:
         least = -math.inf if key == "distance_m" else 0.0  # a car may drive backwards
         if value is not None and not (math.isfinite(value) and value >= least):
-            raise ValueError(f"{value!r} is no number of a drive")
+            raise ValueError(f"{key} is {value!r}; expected a number that is not negative")
     if row["phase"] not in ("train", "final"):
         raise ValueError(f"there is no phase '{row['phase']}'")
     if row["ladder"] not in ("", *RUNGS):
