@@ -154,7 +154,7 @@ def action_layout(action: str, gears: int = GEARS) -> ActionLayout:
         low, high = (-1.0, 0.0, 0.0, -1.0, 0.0), (1.0, 1.0, 1.0, float(gears), 1.0)
         return ActionLayout(_MANUAL, low, high, _read_manual)
     advice = f"expected one of {', '.join(map(repr, ACTIONS))}"
-    raise InvalidOption(f"action is {action!r}{near_miss(str(action), ACTIONS, advice)}")
+    raise InvalidOption(f"action is {action!r}{near_miss(action, ACTIONS, advice)}")
 
 
 def layout_of_width(width: int) -> ActionLayout | None:

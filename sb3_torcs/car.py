@@ -240,7 +240,7 @@ def checked_choice(name: str, choice: Name, choices: Collection[str]) -> Name:
     if not isinstance(choice, str) or choice not in choices:
         *most, last = map(repr, choices)
         advice = f"expected {', '.join(most)} or {last}"
-        raise InvalidOption(f"{name} is {choice!r}{near_miss(str(choice), choices, advice)}")
+        raise InvalidOption(f"{name} is {choice!r}{near_miss(choice, choices, advice)}")
     return choice
 
 

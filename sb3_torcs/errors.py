@@ -233,7 +233,7 @@ def ends_in_a_line() -> Iterator[None]:
         raise SystemExit(f"error: {error}") from None
 
 
-def near_miss(name: str, known: Iterable[str], advice: str = "") -> str:
+def near_miss(name: object, known: Iterable[str], advice: str = "") -> str:
     """
     Complete a message about an unknown name with the name that was probably meant, and advice.
 
@@ -245,8 +245,9 @@ def near_miss(name: str, known: Iterable[str], advice: str = "") -> str:
     :param advice: what else to say
     :return: e.g. ``"; did you mean 'x'? it has x, y"``, or ``"; it has x, y"`` if none is close
     """
-    lowered = {str(one).lower(): str(one) for one in known if str(one) != name}
-    close = difflib.get_close_matches(name.lower(), lowered, n=1, cutoff=0.6)
+    typed = str(name)
+    lowered = {str(one).lower(): str(one) for one in known if str(one) != typed}
+    close = difflib.get_close_matches(typed.lower(), lowered, n=1, cutoff=0.6)
     suggestion = [f"did you mean '{lowered[close[0]]}'?"] if close else []
     ending = " ".join([*suggestion, advice] if advice else suggestion)
     return f"; {ending}" if ending else ""

@@ -221,9 +221,7 @@ class Reward:
         for name, weight in weights.items():
             if not isinstance(name, str) or name not in (*TERMS, "scale", "crash"):
                 advice = f"terms: {', '.join(TERMS)}; besides them 'scale' and 'crash'"
-                raise UnknownRewardTerm(
-                    f"no reward term '{name}'{near_miss(str(name), TERMS, advice)}"
-                )
+                raise UnknownRewardTerm(f"no reward term '{name}'{near_miss(name, TERMS, advice)}")
             if not is_number(weight) or abs(weight) > LARGEST:
                 raise InvalidOption(
                     f"weight of reward term '{name}' is {weight!r}; expected a number from "

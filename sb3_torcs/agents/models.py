@@ -176,7 +176,7 @@ def agent_record(driver: str | Path, game: Game | None) -> TrainingRecord:
         if game is None:
             no_robot = f"there are no robots, since TORCS was not found; type: {INSTALL}"
         else:
-            no_robot = f"there is no robot '{driver}'{near_miss(str(driver), game.robots())}"
+            no_robot = f"there is no robot '{driver}'{near_miss(driver, game.robots())}"
         raise InvalidOption(f"{error}; and {no_robot}") from None
 
 

@@ -209,7 +209,7 @@ def _check_names(env_kwargs: Mapping[str, Any], env_id: str) -> None:
     for name in env_kwargs:
         if name not in known:
             raise InvalidOption(
-                f"env_kwargs has '{name}', which no environment takes{near_miss(str(name), known)}"
+                f"env_kwargs has '{name}', which no environment takes{near_miss(name, known)}"
             )
 
 

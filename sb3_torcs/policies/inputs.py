@@ -77,7 +77,7 @@ def checked_scale(given: Any) -> dict[str, float] | None:
     known = [sensor.name for rows in GROUPS.values() for sensor in rows]
     for name, factor in given.items():
         if name not in known:
-            raise InvalidOption(f"input_scale names {name!r}{near_miss(str(name), known, example)}")
+            raise InvalidOption(f"input_scale names {name!r}{near_miss(name, known, example)}")
         if not (is_number(factor) and 0.0 < factor < np.inf):
             raise InvalidOption(
                 f"input_scale={{{name!r}: {factor!r}}}: a factor is a number above 0; {example}"

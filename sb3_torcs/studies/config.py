@@ -315,7 +315,7 @@ def _united(one: Sequence[str], other: Sequence[str]) -> tuple[str, ...]:
 def _check_keys(mapping: Mapping[str, Any], known: Sequence[str], what: str) -> None:
     for key in mapping:
         if key not in known:
-            hint = near_miss(str(key), known, f"allowed: {', '.join(known)}")
+            hint = near_miss(key, known, f"allowed: {', '.join(known)}")
             raise StudyError(f"{what} '{key}'{hint}")
 
 

@@ -85,7 +85,7 @@ class Window:
 
     def __post_init__(self) -> None:
         if not isinstance(self.view, str) or self.view not in VIEWS:
-            hint = near_miss(str(self.view), VIEWS, f"it is {' or '.join(VIEWS)}")
+            hint = near_miss(self.view, VIEWS, f"it is {' or '.join(VIEWS)}")
             raise InvalidOption(f"there is no view {self.view!r}{hint}")
         if not all(SMALLEST <= side <= LARGEST for side in self.size):
             raise InvalidOption(

@@ -377,9 +377,7 @@ def _policy(name: Any, algorithm: Any, place: Place) -> Callable[..., Any]:
         return policy
     if not isinstance(name, str) or name not in known:
         advice += ", or a dotted path such as sb3_torcs.policies.SplitHeadPolicy"
-        raise ZooConfigError(
-            f"{place}: unknown policy {name!r}{near_miss(str(name), known, advice)}"
-        )
+        raise ZooConfigError(f"{place}: unknown policy {name!r}{near_miss(name, known, advice)}")
     return known[name]
 
 
@@ -464,5 +462,5 @@ def _check_keys(
     known = sorted(known)
     for key in mapping:
         if key not in known:
-            hint = near_miss(str(key), known) or f"; allowed: {', '.join(known)}"
+            hint = near_miss(key, known) or f"; allowed: {', '.join(known)}"
             raise ZooConfigError(f"{place}: unknown {what} '{key}'{hint}")
