@@ -8,6 +8,7 @@ import pytest
 import torch as th
 from sb3_contrib import RecurrentPPO
 from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from torch import nn
 from toy import ToyRace
 
@@ -257,6 +258,23 @@ def test_both_networks_see_scaled_inputs(actor_sensors, seen, symmetric, tmp_pat
 def test_a_scale_that_is_none_is_told(wrong, message):
     with pytest.raises(InvalidOption, match=message):
         make(input_scale=wrong)
+
+
+@pytest.mark.parametrize(
+    "chosen", [{"input_scale": SCALE}, {"actor_sensors": ["base"], "input_scale": SCALE}]
+)
+def test_features_cannot_be_extracted_otherwise_from_chosen_numbers(chosen):
+    class Twice(FlattenExtractor):
+        def forward(self, observations):
+            return 2.0 * super().forward(observations)
+
+    chosen = {"actor_sensors": None, **chosen}
+    make_asymmetric(features_extractor_class=Twice, actor_sensors=None)
+    with pytest.raises(
+        InvalidOption, match=r"Twice'> with (actor_sensors and )?input_scale: leave"
+    ):
+        make_asymmetric(features_extractor_class=Twice, **chosen)
+    make_asymmetric(features_extractor_class=FlattenExtractor, **chosen)
 
 
 @pytest.mark.parametrize("callbacks", [[], [LeanUpdatesCallback()]])

@@ -15,7 +15,11 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.preprocessing import get_action_dim
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, MlpExtractor
+from stable_baselines3.common.torch_layers import (
+    BaseFeaturesExtractor,
+    FlattenExtractor,
+    MlpExtractor,
+)
 from stable_baselines3.common.type_aliases import Schedule
 from torch import nn
 
@@ -147,7 +151,8 @@ class BoundedPolicy(ExactPolicy, ActorCriticPolicy):
     :param kwargs: the other arguments of ``ActorCriticPolicy``, but for ``use_sde``
     :raises InvalidOption: if the action space has no bounds, if ``net_arch``, ``log_std_init``,
         ``input_scale`` or ``ema_decay`` has other numbers, if observations lack one of
-        ``actor_sensors``, or a mirror image that ``symmetric`` needs, with ``use_sde``, or if the
+        ``actor_sensors``, or a mirror image that ``symmetric`` needs, with ``use_sde``, with
+        ``features_extractor_class`` beside ``actor_sensors`` or ``input_scale``, or if the
         algorithm is neither PPO nor A2C
     """
 
@@ -184,6 +189,7 @@ class BoundedPolicy(ExactPolicy, ActorCriticPolicy):
         if actor_sensors is not None:
             self.actor_sensors = checked_sensors(actor_sensors, "actor_sensors")
             kwargs["share_features_extractor"] = False
+        _check_extractor(kwargs, actor_sensors=actor_sensors, input_scale=input_scale)
         super().__init__(observation_space, action_space, lr_schedule, **kwargs)
         self.log_std_init = self._first_log_std  # type: ignore[assignment]  # for copies of it
 
@@ -253,6 +259,17 @@ class BoundedPolicy(ExactPolicy, ActorCriticPolicy):
         if self.average is not None and self.average.has_begun:
             actor = self.average.module
         return ExactDriver(self, self.pi_features_extractor, copy.deepcopy(actor))
+
+
+def _check_extractor(kwargs: Mapping[str, Any], **chosen: Any) -> None:
+    """Check that nothing but the options that choose numbers extracts features from them."""
+    extractor = kwargs.get("features_extractor_class", FlattenExtractor)
+    taken = [name for name, option in chosen.items() if option is not None]
+    if taken and extractor is not FlattenExtractor:
+        raise InvalidOption(
+            f"features_extractor_class={extractor!r} with {' and '.join(taken)}: leave out one of "
+            "them, since these options take the numbers of sensors as they are"
+        )
 
 
 def _log_std(given: Any, actuators: int) -> float | list[float]:
