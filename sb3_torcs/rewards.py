@@ -78,6 +78,13 @@ def safe_speed(sight: float) -> float:
     return math.sqrt(BEND_SPEED**2 + 2.0 * BRAKING * sight)
 
 
+def steering(before: CarState, after: CarState, controls: Controls) -> float:
+    """Speed × the square of the steering [m/s]: a car that weaves has more of it than one that does
+    not.
+    """
+    return controls.steering * controls.steering * abs(after.speed_x)
+
+
 def overspeed(before: CarState, after: CarState, controls: Controls) -> float:
     """Speed above v = √(12² + 2 · 10 · d) [m/s], where d [m] is the longest range finder: who
     brakes from v at 10 m/s² has 12 m/s at the end of what it sees.
@@ -158,8 +165,8 @@ def leaving(before: CarState, after: CarState, controls: Controls) -> float:
 TERMS: dict[str, Term] = {
     term.__name__: term
     for term in (
-        speed_along, speed_across, speed_off_axis, progress, time, damage, pedals, overspeed,
-        places, gap, contact, fault, closing, passing, off_line, leaving,
+        speed_along, speed_across, speed_off_axis, progress, time, damage, pedals, steering,
+        overspeed, places, gap, contact, fault, closing, passing, off_line, leaving,
     )
 }  # fmt: skip
 """By name. Own ones may be added: functions of the car before and after, and of the controls."""

@@ -30,6 +30,7 @@ AFTER = car_state(
         ("time", 1.0),
         ("damage", 0.0),
         ("pedals", 0.0),
+        ("steering", 0.0),
         ("overspeed", 0.0),
         ("places", 0.0),
         ("gap", 0.0),
@@ -39,6 +40,12 @@ AFTER = car_state(
 )
 def test_a_term_has_its_known_value(term, value):
     assert TERMS[term](BEFORE, AFTER, GAS) == value
+
+
+def test_steering_counts_either_way_and_more_at_speed():
+    for steering in (-0.5, 0.5):
+        assert TERMS["steering"](BEFORE, AFTER, GAS._replace(steering=steering)) == 2.5
+    assert TERMS["steering"](BEFORE, AFTER._replace(speed_x=-20.0), Controls(1.0, 0.0, 0.0)) == 20.0
 
 
 @pytest.mark.parametrize(
