@@ -262,13 +262,14 @@ class BoundedPolicy(ExactPolicy, ActorCriticPolicy):
 
 
 def _check_extractor(kwargs: Mapping[str, Any], **chosen: Any) -> None:
-    """Check that nothing but the options that choose numbers extracts features from them."""
+    """Check that no extractor of one's own meets options that choose and scale the numbers."""
     extractor = kwargs.get("features_extractor_class", FlattenExtractor)
     taken = [name for name, option in chosen.items() if option is not None]
     if taken and extractor is not FlattenExtractor:
+        options = " and ".join(taken)
         raise InvalidOption(
-            f"features_extractor_class={extractor!r} with {' and '.join(taken)}: leave out one of "
-            "them, since these options take the numbers of sensors as they are"
+            f"features_extractor_class={extractor!r} with {options}: leave out "
+            f"features_extractor_class, or {options}, which would replace it"
         )
 
 
