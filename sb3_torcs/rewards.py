@@ -69,6 +69,11 @@ def pedals(before: CarState, after: CarState, controls: Controls) -> float:
     return controls.throttle * controls.brake
 
 
+def steering(before: CarState, after: CarState, controls: Controls) -> float:
+    """Speed × the square of the steering [m/s]: a car that weaves has much of it."""
+    return controls.steering * controls.steering * abs(after.speed_x)
+
+
 def safe_speed(sight: float) -> float:
     """
     Return the speed from which 10 m/s² slow down to 12 m/s within a distance [m/s].
@@ -76,13 +81,6 @@ def safe_speed(sight: float) -> float:
     :param sight: the distance [m]
     """
     return math.sqrt(BEND_SPEED**2 + 2.0 * BRAKING * sight)
-
-
-def steering(before: CarState, after: CarState, controls: Controls) -> float:
-    """Speed × the square of the steering [m/s]: a car that weaves has more of it than one that does
-    not.
-    """
-    return controls.steering * controls.steering * abs(after.speed_x)
 
 
 def overspeed(before: CarState, after: CarState, controls: Controls) -> float:
