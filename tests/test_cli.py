@@ -971,6 +971,26 @@ def test_a_training_in_processes_that_is_ended_from_outside_keeps_what_it_learne
     assert models.find_model(folder, prefer_last=True).name == "TorcsLite-v0.zip"
 
 
+@pytest.mark.slow
+def test_a_training_that_is_killed_leaves_no_temporary_file(tmp_path):
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    conf_file = write_config(tmp_path, n_timesteps=10**6)
+    words = ["--conf-file", conf_file, "--folder", str(tmp_path / "logs"), "--eval-freq", "200"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "sb3_torcs.cli", "train", *words],
+        stdout=subprocess.DEVNULL, env={**os.environ, "TMPDIR": str(scratch)},
+    )  # fmt: skip
+    try:
+        while not list((tmp_path / "logs").glob("ddpg/*/best_model.zip")):
+            assert process.poll() is None
+            time.sleep(0.1)
+    finally:
+        process.kill()
+        process.wait()
+    assert list(scratch.iterdir()) == []
+
+
 @pytest.mark.parametrize("by", [signal.SIGINT, signal.SIGTERM])
 def test_a_training_that_a_signal_has_ended_says_which(monkeypatch, capsys, tmp_path, by):
     run = training_run.Run(tmp_path, 80, 100, by, tmp_path / "TorcsLite-v0.zip", {})

@@ -209,7 +209,8 @@ def test_the_interval_is_a_number_of_calls(tmp_path, every):
 def test_trainings_that_begin_at_once_get_folders_of_their_own(tmp_path):
     def begin(_):
         words = argparse.Namespace()
-        return zoo_training.Manager(words, "ddpg", "TorcsLite-v0", str(tmp_path)).save_path
+        manager = zoo_training.Manager(words, "ddpg", "TorcsLite-v0", str(tmp_path), entry={})
+        return manager.save_path
 
     with concurrent.futures.ThreadPoolExecutor(4) as pool:
         assert len(set(pool.map(begin, range(4)))) == 4
@@ -296,7 +297,7 @@ def test_a_search_that_was_ended_before_its_first_trial_is_told(monkeypatch, tmp
 
     monkeypatch.setattr(ExperimentManager, "hyperparameters_optimization", nothing)
     words = argparse.Namespace()
-    manager = zoo_training.Manager(words, "ddpg", "TorcsLite-v0", str(tmp_path / "logs"))
+    manager = zoo_training.Manager(words, "ddpg", "TorcsLite-v0", str(tmp_path / "logs"), entry={})
     with pytest.raises(InvalidOption, match="no trial of the search has ended"):
         manager.hyperparameters_optimization()
 

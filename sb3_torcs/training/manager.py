@@ -75,10 +75,9 @@ def build(algo: str, env_id: str, entry: Mapping[str, Any], *, seed: int = 0) ->
     """
     said = argparse.Namespace(algo=algo, env=env_id, seed=seed)
     with tempfile.TemporaryDirectory() as scratch, contextlib.redirect_stdout(io.StringIO()):
-        conf_file = _write_entry(Path(scratch), env_id, entry)
         manager = _Threaded(
             said, algo, env_id, scratch, eval_freq=-1, seed=seed, verbose=0, device="cpu",
-            config=str(conf_file),
+            entry=entry,
         )  # fmt: skip
         with contextlib.ExitStack() as unless_built:
             unless_built.callback(manager.close_envs)
@@ -110,21 +109,18 @@ def train(
     """
 
     def manager(*arguments: Any, **keywords: Any) -> Manager:
-        managers.append(Manager(*arguments, **keywords))
+        managers.append(Manager(*arguments, entry=entry, **keywords))
         managers[-1].interrupts = interrupts
         return managers[-1]
 
     ALGOS.setdefault(algo, algorithm_class(algo))  # those of SBX, as SBX's documentation does
-    with tempfile.TemporaryDirectory() as scratch:
-        conf_file = _write_entry(Path(scratch), env_id, entry)
-        first = ["--gym-packages", "sb3_torcs", "--algo", algo, "--env", env_id]
-        first += ["--conf-file", str(conf_file)]
-        # The zoo's function, with our manager and our arguments instead of its own.
-        names = {**vars(rl_zoo3.train), "ExperimentManager": manager}
-        names["argparse"] = types.SimpleNamespace(ArgumentParser=_parser_of([*first, *words]))
-        zoo_train = types.FunctionType(rl_zoo3.train.train.__code__, names)
-        with _command_as_text():
-            zoo_train()
+    first = ["--gym-packages", "sb3_torcs", "--algo", algo, "--env", env_id]
+    # The zoo's function, with our manager and our arguments instead of its own.
+    names = {**vars(rl_zoo3.train), "ExperimentManager": manager}
+    names["argparse"] = types.SimpleNamespace(ArgumentParser=_parser_of([*first, *words]))
+    zoo_train = types.FunctionType(rl_zoo3.train.train.__code__, names)
+    with _command_as_text():
+        zoo_train()
 
 
 def _parser_of(words: list[str]) -> type[argparse.ArgumentParser]:
@@ -140,21 +136,34 @@ def _parser_of(words: list[str]) -> type[argparse.ArgumentParser]:
     return Parser
 
 
-def _write_entry(folder: Path, env_id: str, entry: Mapping[str, Any]) -> Path:
-    """Write the one entry that the zoo shall read, under the environment's id."""
-    path = folder / "zoo.yml"
-    path.write_text(yaml.safe_dump({env_id: dict(entry)}), encoding="utf-8")
-    return path
-
-
 class _Threaded(ExperimentManager):
-    """The zoo's manager, which lets several cars of a training drive on threads."""
+    """
+    The zoo's manager of an entry, which lets several cars of a training drive on threads.
+
+    :param arguments: of the zoo's own
+    :param entry: of a hyperparameter file
+    :param keywords: of the zoo's own
+    """
 
     vec_env_class: type[VecEnv]
 
-    def __init__(self, *arguments: Any, **keywords: Any) -> None:
+    def __init__(self, *arguments: Any, entry: Mapping[str, Any], **keywords: Any) -> None:
         self._made: list[VecEnv] = []
+        self._entry = entry
         super().__init__(*arguments, **keywords)
+
+    def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """
+        Give the entry to the zoo, which reads files only.
+
+        :return: two equal dicts, of which the zoo changes the first
+        """
+        # The file lives no longer than this, so that a training that is killed leaves none behind.
+        with tempfile.TemporaryDirectory() as scratch:
+            self.config = str(Path(scratch) / "zoo.yml")
+            text = yaml.safe_dump({self.env_name.gym_id: dict(self._entry)})
+            Path(self.config).write_text(text, encoding="utf-8")
+            return super().read_hyperparameters()
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
         """
@@ -211,7 +220,7 @@ class Manager(_Threaded):
     The zoo's manager of one training. It saves the model at each evaluation.
 
     :param arguments: of the zoo's own
-    :param keywords: of the zoo's own
+    :param keywords: of the zoo's own, and ``entry``
     :raises InvalidOption: if the zoo cannot search the algorithm's hyperparameters, and is to
     """
 
