@@ -95,7 +95,8 @@ def range_finders_table():
 
 
 def terms_table():
-    rows = [[f"`{name}`", one_line(term.__doc__)] for name, term in rewards.TERMS.items()]
+    terms = {**rewards.TERMS, **rewards.ROAD_TERMS}
+    rows = [[f"`{name}`", one_line(term.__doc__)] for name, term in terms.items()]
     return markdown(["term", "what it measures"], rows)
 
 
