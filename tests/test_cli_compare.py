@@ -15,7 +15,7 @@ from sb3_torcs.agents.ghosts import Ghost
 from sb3_torcs.agents.rollout import drive as rollout
 from sb3_torcs.agents.scripted import ScriptedDriver
 from sb3_torcs.cli import main
-from sb3_torcs.errors import ModelMismatch
+from sb3_torcs.errors import InvalidOption, ModelMismatch
 from sb3_torcs.evaluation import comparing
 from sb3_torcs.evaluation.comparing import compare
 from sb3_torcs.telemetry import DriveLog, read_drives
@@ -264,3 +264,9 @@ def test_a_report_of_an_own_track_needs_no_name(game, tmp_path):
 def test_a_csv_of_a_drive_is_not_taken_for_a_model(capsys):
     assert main(["compare", "drive.csv", "bt"]) == 2
     assert "'drive.csv' is a CSV file" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("driver", [3, None, ["inferno", "bt"]])
+def test_drivers_are_names_and_paths_one_after_the_other(driver):
+    with pytest.raises(InvalidOption, match=r"a driver is .*; expected names and paths, one after"):
+        compare(driver, "inferno")

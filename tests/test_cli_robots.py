@@ -13,8 +13,9 @@ import types
 import pytest
 from fake_game import write_game
 
+from sb3_torcs.agents.robots import race
 from sb3_torcs.cli import main
-from sb3_torcs.errors import OutputNotWritable
+from sb3_torcs.errors import InvalidOption, OutputNotWritable
 from sb3_torcs.torcs.race_results import Lap, RobotResult
 
 
@@ -214,3 +215,9 @@ def test_telemetry_in_another_format_is_refused(capsys, fake, tmp_path):
     status, out, err = run(capsys, "racer", "--telemetry", str(tmp_path / "drive.txt"))
     assert (status, out) == (2, "")
     assert "should end in .parquet or .csv" in err
+
+
+@pytest.mark.parametrize("robots", [["inferno"], "inferno", [("inferno", 3, 1)], [3]])
+def test_robots_are_pairs_of_a_name_and_an_index(robots):
+    with pytest.raises(InvalidOption, match=r"robots hold .*; expected pairs of a name and an"):
+        race(robots, "aalborg", 1)

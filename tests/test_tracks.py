@@ -345,6 +345,11 @@ class TestPlot:
         for text in ("a lap", "180"):  # [km/h] of 50 m/s
             assert f"<!-- {text} -->" in drawn
 
+    def test_the_name_of_a_track_is_no_track(self, tmp_path):
+        with pytest.raises(InvalidOption, match="track is 'aalborg'; expected a track"):
+            plot_track("aalborg", tmp_path / "a.png")
+        assert list(tmp_path.iterdir()) == []
+
     def test_the_line_and_its_speed_may_be_left_out(self, oval, tmp_path):
         plot_track(oval, tmp_path / "a.png")
         plot_track(oval, tmp_path / "b.png", np.zeros((2, 2)))

@@ -95,6 +95,11 @@ def compare(
     if not drivers:
         raise InvalidOption("there is nobody to compare; name drivers, e.g. ddpg-aalborg inferno")
     for driver in drivers:
+        if not isinstance(driver, str | os.PathLike):
+            raise InvalidOption(
+                f"a driver is {driver!r}; expected names and paths, one after the other, e.g. "
+                'compare("ddpg-aalborg", "inferno")'
+            )
         if Path(driver).suffix.lower() == ".csv":
             raise DriveFileError(
                 f"'{driver}' is a CSV file; saved drives are compared from files that --telemetry "

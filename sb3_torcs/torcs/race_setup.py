@@ -76,6 +76,12 @@ class RaceSetup:
         drivers = list(self.drivers)
         if not drivers:
             raise InvalidOption("no robot is named; name at least one")
+        for driver in drivers:
+            if isinstance(driver, str) or not isinstance(driver, Sequence) or len(driver) != 2:
+                raise InvalidOption(
+                    f"robots hold {driver!r}; expected pairs of a name and an index, e.g. "
+                    "[('inferno', 3), ('bt', 1)]"
+                )
         twice = next((driver for driver in drivers if drivers.count(driver) > 1), None)
         if twice is not None:
             raise InvalidOption(

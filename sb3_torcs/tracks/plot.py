@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sb3_torcs.car import KMH, FloatArray
+from sb3_torcs.errors import InvalidOption
 from sb3_torcs.files import IN_A_FOLDER, whole_file
 from sb3_torcs.tracks.track import CURVATURE, LENGTH, Track
 
@@ -45,8 +46,14 @@ def plot_track(
     :param title: above the picture; ``None`` is the track's name and measures
     :param fastest: speed at the end of the colours, which begin at 0 [m/s]; ``None`` spreads them
         over the given speeds
+    :raises InvalidOption: if ``track`` is no track
     :raises OutputNotWritable: if the file cannot be written; the previous one is kept
     """
+    if not isinstance(track, Track):
+        raise InvalidOption(
+            f"track is {track!r}; expected a track, e.g. "
+            'sb3_torcs.tracks.catalogue.load_track("aalborg")'
+        )
     # Drawing is rare and its import is slow. Figures of their own leave the caller's windows be.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
