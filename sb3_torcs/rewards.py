@@ -10,26 +10,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from functools import partial
-from types import MappingProxyType
-from typing import Any, Literal
-
-import numpy as np
+from typing import Literal
 
 from sb3_torcs.car import CAR_WIDTH, FIRST_RIVAL, RIVALS, CarState, Controls, is_number
 from sb3_torcs.errors import InvalidOption, UnknownRewardTerm, near_miss
 from sb3_torcs.rivals import clarity, rival
-from sb3_torcs.tracks.profile import profile_of
-from sb3_torcs.tracks.racing_line import LINE_PLACES, look_along, racing_line
 
 __all__ = [
     "CRASHES",
     "PRESETS",
-    "ROAD_TERMS",
     "TERMS",
     "Reward",
     "RewardChoice",
     "RewardName",
-    "RoadTerm",
     "Term",
     "safe_speed",
 ]
@@ -39,7 +32,6 @@ BEND_SPEED = 12.0  # [m/s] in a bend behind which nothing is seen; the tightest 
 ROOM = 0.5  # [m] that a car keeps to others
 
 Term = Callable[[CarState, CarState, Controls], float]
-RoadTerm = Callable[[Any, CarState, CarState, Controls], float]
 
 
 def speed_along(before: CarState, after: CarState, controls: Controls) -> float:
@@ -180,21 +172,6 @@ TERMS: dict[str, Term] = {
 OWN_TERMS: tuple[Term, ...] = tuple(TERMS.values())
 """Those of this package, which return numbers."""
 
-
-def line_overspeed(world: Any, before: CarState, after: CarState, controls: Controls) -> float:
-    """Speed above that from which a careful driver can still drive the racing line ahead [m/s]: how
-    far the least of the sensor ``line_margins`` is below 0. So a car that will not get around a
-    bend is told as soon as it is too fast.
-    """
-    table, step = racing_line(profile_of(world))
-    seen = np.empty((3, LINE_PLACES))
-    look_along(table, step, after.distance_from_start, after.track_position, after.speed_x, seen)
-    return max(-float(seen[2].min()), 0.0)
-
-
-ROAD_TERMS: Mapping[str, RoadTerm] = MappingProxyType({"line_overspeed": line_overspeed})
-"""Further terms by name, which know the road: functions of the world, too, before all else."""
-
 LARGEST = 1e9  # of a weight, so that no reward is infinite
 SCALE = 0.1  # [1/m] a reward of 1 for ten metres along the road
 CRASH = -1.0  # when an episode ends off the road, backwards, stuck or damaged
@@ -227,19 +204,16 @@ class Reward:
     :param reward: the name of a preset, or a mapping from names of terms to weights; the
         mapping may also hold ``scale`` (a factor on all terms, 1 if left out) and ``crash`` (added
         once, unscaled, when the episode ends badly, 0 if left out)
-    :param world: in which the car drives; only terms of :data:`ROAD_TERMS` ask for it, when they
-        are computed
     :raises UnknownRewardTerm: if a name is unknown
     :raises InvalidOption: if a weight is no number from -1e9 to 1e9, or if an added term is no
         function, or has a name that means something else
     """
 
-    def __init__(self, reward: RewardChoice, world: Any = None) -> None:
-        known = (*TERMS, *ROAD_TERMS)
+    def __init__(self, reward: RewardChoice) -> None:
         if isinstance(reward, str):
             if reward not in PRESETS:
                 advice = (
-                    f"rewards: {', '.join(PRESETS)}, or a dict of weights over {', '.join(known)}"
+                    f"rewards: {', '.join(PRESETS)}, or a dict of weights over {', '.join(TERMS)}"
                 )
                 raise UnknownRewardTerm(f"no reward '{reward}'{near_miss(reward, PRESETS, advice)}")
             weights = PRESETS[reward]
@@ -250,9 +224,9 @@ class Reward:
                 f"reward is {reward!r}; expected one of {', '.join(PRESETS)}, or a dict of weights"
             )
         for name, weight in weights.items():
-            if not isinstance(name, str) or name not in (*known, "scale", "crash"):
-                advice = f"terms: {', '.join(known)}; besides them 'scale' and 'crash'"
-                raise UnknownRewardTerm(f"no reward term '{name}'{near_miss(name, known, advice)}")
+            if not isinstance(name, str) or name not in (*TERMS, "scale", "crash"):
+                advice = f"terms: {', '.join(TERMS)}; besides them 'scale' and 'crash'"
+                raise UnknownRewardTerm(f"no reward term '{name}'{near_miss(name, TERMS, advice)}")
             if not is_number(weight) or abs(weight) > LARGEST:
                 raise InvalidOption(
                     f"weight of reward term '{name}' is {weight!r}; expected a number from "
@@ -268,9 +242,9 @@ class Reward:
         scale = self.weights.get("scale", 1.0)
         self._crash = float(weights.get("crash", 0.0))
         self.terms = tuple(
-            (name, _term(name, world), float(weight) * scale)
+            (name, _checked_term(name, TERMS[name]), float(weight) * scale)
             for name, weight in weights.items()
-            if name in known
+            if name in TERMS
         )
 
     def nothing(self) -> dict[str, float]:
@@ -303,11 +277,8 @@ class Reward:
         return terms
 
 
-def _term(name: str, world: Any) -> Term:
-    """Look a term up: one of the road is told the world, one that somebody has added is checked."""
-    if name not in TERMS:
-        return partial(ROAD_TERMS[name], world)
-    term = TERMS[name]
+def _checked_term(name: str, term: Term) -> Term:
+    """Let the values of a term be checked, if somebody has added it."""
     if term in OWN_TERMS:
         return term
     if not callable(term):

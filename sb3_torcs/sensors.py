@@ -28,7 +28,7 @@ from numba.extending import overload
 from sb3_torcs.car import FIRST_RIVAL, KMH, REST_HEIGHT, RIVALS, CarState, FloatArray
 from sb3_torcs.errors import InvalidOption, near_miss
 from sb3_torcs.rivals import see_rivals
-from sb3_torcs.tracks.profile import INTERVALS, QUANTITIES, look_ahead, profile_of, speed_margins
+from sb3_torcs.tracks.profile import INTERVALS, QUANTITIES, RoadProfile, look_ahead, speed_margins
 from sb3_torcs.tracks.racing_line import (
     LINE_PLACES,
     USUAL_PACE,
@@ -399,8 +399,13 @@ def _scale_preview(
         numbers[i] = _scaled(means[i // INTERVALS, i % INTERVALS], _PREVIEW_AT + i)
 
 
+def _profile(world: Any) -> RoadProfile:
+    """The road of a world, with hills if it has some."""
+    return getattr(world, "profile", None) or world.track.profile
+
+
 def _write_preview(world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> None:
-    road = profile_of(world)
+    road = _profile(world)
     _scale_preview(road.sums, road.step, car.distance_from_start, numbers)
 
 
@@ -412,7 +417,7 @@ def _scale_into(values: FloatArray, first: int, numbers: npt.NDArray[np.float32]
 
 
 def _write_limits(world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> None:
-    road = profile_of(world)
+    road = _profile(world)
     margins = np.empty(INTERVALS)
     speed_margins(road.sums, road.step, car.distance_from_start, car.speed_x, margins)
     _scale_into(margins, _PARTS["limits"].start, numbers)
@@ -422,7 +427,7 @@ def _write_line(
     group: SensorsName, world: Any, car: CarState, numbers: npt.NDArray[np.float32]
 ) -> None:
     pace = pace_of(world.facts.grip, world.facts.downforce) if group == "car_line" else USUAL_PACE
-    table, step = racing_line(profile_of(world), pace)
+    table, step = racing_line(_profile(world), pace)
     seen = np.empty((3, LINE_PLACES))
     look_along(table, step, car.distance_from_start, car.track_position, car.speed_x, seen)
     seen[1] /= np.abs(seen[1]) + USUAL_BEND

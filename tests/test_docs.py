@@ -95,8 +95,7 @@ def range_finders_table():
 
 
 def terms_table():
-    terms = {**rewards.TERMS, **rewards.ROAD_TERMS}
-    rows = [[f"`{name}`", one_line(term.__doc__)] for name, term in terms.items()]
+    rows = [[f"`{name}`", one_line(term.__doc__)] for name, term in rewards.TERMS.items()]
     return markdown(["term", "what it measures"], rows)
 
 

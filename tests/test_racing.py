@@ -13,7 +13,7 @@ from sb3_torcs.car import Controls, Start
 from sb3_torcs.envs.racing import RacingEnv
 from sb3_torcs.envs.starts import Starts
 from sb3_torcs.errors import CarLost, EnvClosed, InvalidAction, InvalidOption, StartBlocked
-from sb3_torcs.rewards import ROAD_TERMS, TERMS, safe_speed
+from sb3_torcs.rewards import TERMS, safe_speed
 
 GAS = np.array([0.0, 1.0, 0.0], np.float32)
 
@@ -106,9 +106,7 @@ def test_lap_time_is_0_unless_a_lap_was_just_completed(oval):
     assert info["best_lap_time"] == 70.5
 
 
-@pytest.mark.parametrize(
-    "reward", ["progress", dict.fromkeys([*TERMS, *ROAD_TERMS, "crash"], -1.0)]
-)
+@pytest.mark.parametrize("reward", ["progress", dict.fromkeys([*TERMS, "crash"], -1.0)])
 def test_a_car_that_is_lost_ends_the_episode_only(oval, reward):
     """Where the timestep before has left it, as a crash; the next episode is like any other."""
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,10 +11,7 @@ from conftest import car_state
 
 from sb3_torcs.car import NO_RACE, RIVALS, Controls
 from sb3_torcs.errors import InvalidOption, UnknownRewardTerm
-from sb3_torcs.rewards import PRESETS, ROAD_TERMS, TERMS, Reward
-from sb3_torcs.sensors import View
-from sb3_torcs.tracks.catalogue import load_track
-from sb3_torcs.tracks.racing_line import LINE_PLACES
+from sb3_torcs.rewards import PRESETS, TERMS, Reward
 
 GAS = Controls(0.0, 1.0, 0.0)
 BEFORE = car_state(time=1.0)
@@ -136,33 +132,6 @@ def test_passing_is_the_speed_against_cars_nearby(rivals, gained):
         race[5 + rival] = along
         race[5 + 2 * RIVALS + rival] = faster
     assert TERMS["passing"](BEFORE, AFTER._replace(race=race), GAS) == pytest.approx(gained)
-
-
-@pytest.mark.parametrize("speed", [10.0, 40.0, 90.0])
-def test_line_overspeed_is_the_least_margin_of_the_line(speed):
-    """And 0 where the line can be driven."""
-    world = SimpleNamespace(track=load_track("aalborg"))
-    over = []
-    for distance in np.arange(0.0, world.track.length, 50.0):
-        car = AFTER._replace(distance_from_start=float(distance), speed_x=speed)
-        over.append(ROAD_TERMS["line_overspeed"](world, BEFORE, car, GAS))
-        margins = 20.0 * View(("base", "line")).encode(car, world)[-LINE_PLACES:]
-        if margins.min() > -40.0:  # where the sensor ends
-            assert over[-1] == pytest.approx(max(-margins.min(), 0.0), abs=1e-5)
-    assert (max(over) > 0.0) == (speed > 10.0)
-
-
-def test_a_term_of_the_road_counts_as_others_do():
-    world = SimpleNamespace(track=load_track("aalborg"))
-    car = AFTER._replace(distance_from_start=400.0, speed_x=60.0)
-    over = ROAD_TERMS["line_overspeed"](world, BEFORE, car, GAS)
-    reward = Reward({"line_overspeed": -2.0, "time": 1.0, "scale": 0.1}, world)
-    assert over > 0.0
-    assert reward(BEFORE, car, GAS, None) == {
-        "line_overspeed": pytest.approx(-0.1 * over),
-        "time": 0.05,
-        "crash": 0.0,
-    }
 
 
 def test_squares_are_products_as_in_compiled_code():

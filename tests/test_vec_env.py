@@ -37,8 +37,7 @@ from sb3_torcs.vec_env import TorcsVecEnv, glance
 
 GAS = np.array([0.0, 1.0, 0.0], np.float32)
 LITE, TORCS = "TorcsLite-v0", "Torcs-v0"
-TERMS = (*rewards.TERMS, *rewards.ROAD_TERMS)
-EVERY_TERM = {name: 0.1 * (place + 1) for place, name in enumerate(TERMS)}
+EVERY_TERM = {name: 0.1 * (place + 1) for place, name in enumerate(rewards.TERMS)}
 
 
 @pytest.fixture(params=[LITE, TORCS])

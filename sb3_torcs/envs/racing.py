@@ -191,7 +191,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         :return: the previous reward
         """
         previous = getattr(self, "_reward_choice", None)
-        self.reward = Reward(reward, self.backend)
+        self.reward = Reward(reward)
         self._reward_choice = reward
         return previous
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numba import njit
@@ -24,7 +23,6 @@ __all__ = [
     "game_profile",
     "look_ahead",
     "place_at",
-    "profile_of",
     "road_profile",
     "speed_margins",
 ]
@@ -51,15 +49,6 @@ class RoadProfile:
     step: float  # [m] from one place to the next
     frictions: FloatArray  # (n + 1,) of its surface [-]
     bankings: FloatArray  # (n + 1,) by how much it rises to the left [m/m]
-
-
-def profile_of(world: Any) -> RoadProfile:
-    """
-    Return the road of a world, with hills if it has some.
-
-    :param world: in which a car drives
-    """
-    return getattr(world, "profile", None) or world.track.profile
 
 
 def road_profile(
