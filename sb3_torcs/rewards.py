@@ -29,6 +29,7 @@ __all__ = [
 
 BRAKING = 10.0  # [m/s²] a car on asphalt can do twice that, but not while it turns in
 BEND_SPEED = 12.0  # [m/s] in a bend behind which nothing is seen; the tightest hairpins need it
+NO_SLIDE = 0.1  # [-] speed across per speed along of a car that corners on asphalt
 ROOM = 0.5  # [m] that a car keeps to others
 
 Term = Callable[[CarState, CarState, Controls], float]
@@ -72,6 +73,13 @@ def pedals(before: CarState, after: CarState, controls: Controls) -> float:
 def steering(before: CarState, after: CarState, controls: Controls) -> float:
     """Speed × the square of the steering [m/s]: a car that weaves has much of it."""
     return controls.steering * controls.steering * abs(after.speed_x)
+
+
+def sliding(before: CarState, after: CarState, controls: Controls) -> float:
+    """Speed across the car beyond a tenth of that along it [m/s]: who corners without a slide has no
+    more than that tenth.
+    """
+    return max(abs(after.speed_y) - NO_SLIDE * abs(after.speed_x), 0.0)
 
 
 def safe_speed(sight: float) -> float:
@@ -164,7 +172,7 @@ TERMS: dict[str, Term] = {
     term.__name__: term
     for term in (
         speed_along, speed_across, speed_off_axis, progress, time, damage, pedals, steering,
-        overspeed, places, gap, contact, fault, closing, passing, off_line, leaving,
+        sliding, overspeed, places, gap, contact, fault, closing, passing, off_line, leaving,
     )
 }  # fmt: skip
 """By name. Own ones may be added: functions of the car before and after, and of the controls."""

@@ -31,6 +31,7 @@ AFTER = car_state(
         ("damage", 0.0),
         ("pedals", 0.0),
         ("steering", 0.0),
+        ("sliding", 0.0),
         ("overspeed", 0.0),
         ("places", 0.0),
         ("gap", 0.0),
@@ -46,6 +47,15 @@ def test_steering_counts_either_way_and_more_at_speed():
     for steering in (-0.5, 0.5):
         assert TERMS["steering"](BEFORE, AFTER, GAS._replace(steering=steering)) == 2.5
     assert TERMS["steering"](BEFORE, AFTER._replace(speed_x=-20.0), Controls(1.0, 0.0, 0.0)) == 20.0
+
+
+@pytest.mark.parametrize(
+    ("along", "across", "value"),
+    [(20.0, 1.0, 0.0), (20.0, 2.0, 0.0), (20.0, -5.0, 3.0), (-10.0, 4.0, 3.0), (0.0, 2.0, 2.0)],
+)
+def test_sliding_is_speed_across_beyond_that_of_a_bend(along, across, value):
+    car = AFTER._replace(speed_x=along, speed_y=across)
+    assert TERMS["sliding"](BEFORE, car, GAS) == value
 
 
 @pytest.mark.parametrize(
