@@ -76,8 +76,8 @@ def steering(before: CarState, after: CarState, controls: Controls) -> float:
 
 
 def sliding(before: CarState, after: CarState, controls: Controls) -> float:
-    """Speed across the car beyond a tenth of that along it [m/s]: who corners without a slide has no
-    more than that tenth.
+    """Speed across the car beyond a tenth of that along it [m/s]: without a slide a car that corners
+    has no more.
     """
     return max(abs(after.speed_y) - NO_SLIDE * abs(after.speed_x), 0.0)
 

@@ -52,6 +52,7 @@ def learned(model, callback=None):
     {"clip_range": 0.01, "max_grad_norm": 10.0},
     {"policy_kwargs": {"net_arch": [8, 8], "log_std_init": -1.0, **RELU}},
     {"policy_kwargs": {**SMALL, "share_features_extractor": False}}, {"policy": BoundedPolicy},
+    {"policy_kwargs": {**SMALL, "optimizer_kwargs": {"weight_decay": 0.1}}},
 ])  # fmt: skip
 def test_lean_updates_learn_as_ppo_does(kwargs):
     """The same random numbers, log and state of Adam; tolerance: float32 in another order."""
@@ -77,7 +78,7 @@ def test_one_core_learns_what_two_learn(monkeypatch):
 @pytest.mark.parametrize("kwargs", [
     {"policy_kwargs": {"net_arch": [8]}}, {"policy_kwargs": {**RELU, "net_arch": []}},
     {"policy_kwargs": {**SMALL, "optimizer_class": th.optim.SGD}},
-    {"policy_kwargs": {**SMALL, "optimizer_kwargs": {"weight_decay": 0.1}}},
+    {"policy_kwargs": {**SMALL, "optimizer_kwargs": {"amsgrad": True}}},
     {"use_sde": True}, {"target_kl": 0.01}, {"clip_range_vf": 0.1},
 ])  # fmt: skip
 def test_parts_that_lean_updates_do_not_know_learn_as_ever(kwargs):

@@ -351,7 +351,7 @@ def difference(
 @compiled
 def adam(
     weights: Any, gradient: Any, mean: Any, square: Any, betas: Any, rate: Any, scale: Any,
-    epsilon: Any,
+    epsilon: Any, decay: Any,
 ) -> None:  # fmt: skip
     """
     Make a step of Adam (Kingma and Ba, 2015), in the order of the operations of PyTorch.
@@ -364,11 +364,12 @@ def adam(
     :param rate: learning rate, divided by 1 - beta1 ** step
     :param scale: 1 / sqrt(1 - beta2 ** step)
     :param epsilon: added to the root
+    :param decay: by which weights are added to their gradient
     """
     beta1, beta2 = betas
     one = weights.dtype.type(1)
     for i in range(weights.size):
-        g = gradient[i]
+        g = gradient[i] + decay * weights[i]
         m = mean[i] + (one - beta1) * (g - mean[i])
         v = beta2 * square[i] + (one - beta2) * g * g
         mean[i], square[i] = m, v

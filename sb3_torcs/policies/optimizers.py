@@ -102,13 +102,13 @@ def adam_factors(group: dict[str, Any], count: float, real: Any) -> tuple[Any, .
     :param group: of the optimizer's parameters
     :param count: of updates, this one included
     :param real: type of the numbers
-    :return: both betas, the rate, the factor on the root, and epsilon
+    :return: both betas, the rate, the factor on the root, epsilon, and the decay of weights
     """
     beta1, beta2 = group["betas"]
     rate = group["lr"] * group.get("lr_scale", 1.0)
     return (
         (real(beta1), real(beta2)), real(rate / (1 - beta1**count)),
-        real((1 - beta2**count) ** -0.5), real(group["eps"]),
+        real((1 - beta2**count) ** -0.5), real(group["eps"]), real(group["weight_decay"]),
     )  # fmt: skip
 
 
@@ -118,7 +118,7 @@ def is_usual(optimizer: th.optim.Optimizer) -> bool:
 
     :param optimizer: of any kind
     """
-    unusual = ("amsgrad", "weight_decay", "maximize", "decoupled_weight_decay")
+    unusual = ("amsgrad", "maximize", "decoupled_weight_decay")
     return type(optimizer) in (th.optim.Adam, LeanAdam) and all(
         not any(map(group.get, unusual))
         and all(param.is_cpu and param.is_contiguous() for param in group["params"])
