@@ -76,9 +76,7 @@ def steering(before: CarState, after: CarState, controls: Controls) -> float:
 
 
 def sliding(before: CarState, after: CarState, controls: Controls) -> float:
-    """Speed across the car beyond a tenth of that along it [m/s]: without a slide a car that corners
-    has no more.
-    """
+    """Speed across the car beyond what bends take, a tenth of that along it [m/s]: a slide."""
     return max(abs(after.speed_y) - NO_SLIDE * abs(after.speed_x), 0.0)
 
 
