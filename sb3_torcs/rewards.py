@@ -76,7 +76,7 @@ def steering(before: CarState, after: CarState, controls: Controls) -> float:
 
 
 def sliding(before: CarState, after: CarState, controls: Controls) -> float:
-    """Speed across the car beyond what bends take, a tenth of that along it [m/s]: a slide."""
+    """Speed across the car (Vy) beyond a tenth of that along it (Vx) [m/s]: how much it slides."""
     return max(abs(after.speed_y) - NO_SLIDE * abs(after.speed_x), 0.0)
 
 

@@ -364,7 +364,7 @@ def adam(
     :param rate: learning rate, divided by 1 - beta1 ** step
     :param scale: 1 / sqrt(1 - beta2 ** step)
     :param epsilon: added to the root
-    :param decay: by which weights are added to their gradient
+    :param decay: share of each weight that is added to its gradient
     """
     beta1, beta2 = betas
     one = weights.dtype.type(1)
