@@ -1,5 +1,6 @@
 """PPO with lean updates learns what stock PPO learns, but for rounding, and saves stock models."""
 
+import copy
 import os
 from contextlib import closing
 from itertools import permutations
@@ -15,6 +16,7 @@ from toy import ToyRace
 from sb3_torcs.callbacks import (
     AdaptiveLearningRateCallback,
     LeanUpdatesCallback,
+    ReuseRolloutsCallback,
     ValuesOnlyCallback,
 )
 from sb3_torcs.errors import InvalidOption
@@ -296,3 +298,60 @@ def test_an_algorithm_without_such_a_value_function_is_told():
     model = SAC("MlpPolicy", ToyRace())
     with pytest.raises(InvalidOption, match="is for PPO and A2C, but the model learns by SAC"):
         model.learn(1, callback=ValuesOnlyCallback())
+
+
+class Copies(BaseCallback):
+    """Keeps a copy of the policy of each rollout, as self-play does."""
+
+    def _on_training_start(self):
+        self.policies = []
+
+    def _on_step(self):
+        return True
+
+    def _on_rollout_end(self):
+        self.policies.append(copy.deepcopy(self.model.policy))
+
+
+@pytest.mark.parametrize("policy", ["MlpPolicy", BoundedPolicy])
+def test_copies_of_a_policy_that_makes_a_rollout_stand_alone(policy, tmp_path):
+    """The model, which writes for TensorBoard, could not be copied with them."""
+    model, copies = make(policy=policy, tensorboard_log=str(tmp_path)), Copies()
+    model.learn(80, callback=[LeanUpdatesCallback(), copies])
+    first, second = copies.policies
+    seen = th.zeros(1, 29)
+    first.load_state_dict(second.state_dict())
+    found, expected = (each(seen, deterministic=True) for each in (first, second))
+    th.testing.assert_close(found, expected, rtol=0.0, atol=0.0)
+    state = copy.deepcopy(first.state_dict())
+    first.load_state_dict({name: own * 0.0 for name, own in state.items()})
+    assert not th.equal(first(seen, deterministic=True)[1], expected[1])
+
+
+class Interrupt(BaseCallback):
+    """Ctrl-C when a rollout has ended and its update has not begun."""
+
+    def _on_step(self):
+        return True
+
+    def _on_rollout_end(self):
+        raise KeyboardInterrupt
+
+
+def test_a_model_that_is_interrupted_before_an_update_is_saved(tmp_path):
+    model = make(policy=BoundedPolicy, tensorboard_log=str(tmp_path))
+    callbacks = [
+        AdaptiveLearningRateCallback(first_factor=0.1),
+        ReuseRolloutsCallback(),
+        LeanUpdatesCallback(),
+        Interrupt(),
+    ]
+    buffer, schedule = model.rollout_buffer, model.lr_schedule
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(80, callback=callbacks)
+    assert (model.rollout_buffer, model.lr_schedule) == (buffer, schedule)
+    model.save(tmp_path / "model.zip")
+    again = PPO.load(tmp_path / "model.zip", ToyRace())
+    assert not {"train", "_excluded_save_params"} & vars(again).keys()
+    again.learn(40)
+    assert again._n_updates == 3

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3 import A2C, PPO
-from stable_baselines3.common.callbacks import BaseCallback
 from torch import nn
 from toy import ToyRace
 
 from sb3_torcs.callbacks import LeanUpdatesCallback, ReuseRolloutsCallback
+from sb3_torcs.callbacks.learning import WhileLearning
 from sb3_torcs.callbacks.reuse import _learn_again, _taken
 from sb3_torcs.errors import InvalidOption
 
@@ -35,7 +35,7 @@ def weights(model):
     return th.cat([own.detach().flatten() for own in model.policy.parameters()])
 
 
-class Kept(BaseCallback):
+class Kept(WhileLearning):
     """Keeps the rollouts, and the sizes from which the model learned."""
 
     def __init__(self):
@@ -47,9 +47,14 @@ class Kept(BaseCallback):
         return True
 
     def _on_rollout_end(self):
-        if self.model.rollout_buffer.n_envs == 1:
-            self.rollouts.append(_taken(self.model.rollout_buffer, self.locals))
+        super()._on_rollout_end()
+        self.rollouts.append(_taken(self.model.rollout_buffer, self.locals))
+
+    def _change(self):
         self.sizes.append(self.model.rollout_buffer.n_envs)
+
+    def _undo(self):
+        pass
 
 
 def test_one_rollout_is_what_ppo_learns_from_anyway():

@@ -9,6 +9,7 @@ from typing import Any
 
 import torch as th
 from stable_baselines3 import PPO, TD3
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -23,7 +24,7 @@ from sb3_torcs.errors import InvalidOption, renamed
 from sb3_torcs.policies import ppo, updates
 from sb3_torcs.policies.mirror import check_angles
 from sb3_torcs.policies.mirrored_replay import sample_mirrored
-from sb3_torcs.policies.ppo import LeanPPO
+from sb3_torcs.policies.ppo import LeanForward, LeanPPO
 from sb3_torcs.policies.split_head import SplitHeadPolicy
 from sb3_torcs.policies.updates import LeanUpdates
 
@@ -34,6 +35,7 @@ __all__ = [
     "MirrorCallback",
     "ValuesOnlyCallback",
     "WhileLearning",
+    "end_changes",
     "learn_values",
 ]
 
@@ -43,30 +45,65 @@ LEAST_RATE, MOST_RATE = 0.01, 4.0  # [-] of the model's own
 
 class _Training:
     """
-    Replaces a model's ``train`` for one call, and then ends what callbacks changed for it.
+    Replaces a model's ``train`` for one call, in which callbacks change the algorithm.
+
+    Between the rollout and the call other callbacks may save the model, or Ctrl-C may end the
+    training. So saved files leave the replacement out.
 
     :param model: that has just made a rollout
     """
 
     def __init__(self, model: Any) -> None:
-        self._model, self.train = model, model.train
-        self.undo: list[Callable[[], None]] = []
+        self._model = model
+        self.callbacks: list[WhileLearning] = []
+        model.train, model._excluded_save_params = self, self._left_out
 
     def __call__(self, *arguments: Any, **keywords: Any) -> None:
-        vars(self._model).pop("train", None)
+        self._remove()
+        train = self._model.train
         try:
-            self.train(*arguments, **keywords)
+            for callback in self.callbacks:
+                train = callback._change() or train
+            train(*arguments, **keywords)
         finally:  # after Ctrl-C, too: then the model is saved, or learns on without the callbacks
-            for undo in self.undo:
-                undo()
+            self._undo()
+
+    def end(self) -> None:
+        """Let the model learn by its own ``train``."""
+        self._remove()
+        self._undo()
+
+    def _left_out(self) -> list[str]:
+        """Name what a saved file leaves out; see SB3's method of this name."""
+        own: list[str] = type(self._model)._excluded_save_params(self._model)
+        return [*own, "train", "_excluded_save_params"]
+
+    def _remove(self) -> None:
+        for name in ("train", "_excluded_save_params"):
+            vars(self._model).pop(name, None)
+
+    def _undo(self) -> None:
+        for callback in self.callbacks:
+            callback._undo()
+
+
+def end_changes(model: BaseAlgorithm) -> None:
+    """
+    Undo what callbacks changed for an update that an interrupt has prevented.
+
+    :param model: whose training has ended
+    """
+    training = vars(model).get("train")
+    if isinstance(training, _Training):
+        training.end()
 
 
 class WhileLearning(BaseCallback):
     """
     Base of callbacks that change the algorithm only while it learns.
 
-    They change it at the end of a rollout, and end that when the algorithm has learned from it, so
-    that models that other callbacks save are unchanged.
+    They change it when a rollout has ended and the algorithm begins to learn from it, and undo that
+    when it has learned, so that models that other callbacks save are unchanged.
     """
 
     def _on_step(self) -> bool:
@@ -85,16 +122,14 @@ class WhileLearning(BaseCallback):
 
     def _on_rollout_end(self) -> None:
         model: Any = self.model
-        if "train" not in vars(model):
-            model.train = _Training(model)
-        model.train.train = self._change() or model.train.train
-        model.train.undo.append(self._end)
+        training = vars(model).get("train") or _Training(model)
+        training.callbacks.append(self)
 
     def _on_training_end(self) -> None:
         self._end()
 
     def _end(self) -> None:
-        vars(self.model).pop("train", None)
+        end_changes(self.model)
         self._undo()
 
 
@@ -126,11 +161,16 @@ class GradientStepsCallback(WhileLearning):
             )
         self._algorithm, self._own = self.model, self.model.gradient_steps
 
-    def _change(self) -> None:
+    def _on_rollout_end(self) -> None:
+        super()._on_rollout_end()
+        # At once: the algorithm reads it before it calls `train`.
         buffer = self._algorithm.replay_buffer
         remembered = 0 if buffer is None else buffer.size() * buffer.n_envs
         if max(self.num_timesteps, remembered) <= self.timesteps:
             self._algorithm.gradient_steps = self.gradient_steps
+
+    def _change(self) -> None:
+        """Change nothing more."""
 
     def _undo(self) -> None:
         self._algorithm.gradient_steps = self._own
@@ -168,7 +208,7 @@ class LeanUpdatesCallback(WhileLearning):
         super()._on_rollout_start()
         if isinstance(self._updates, LeanPPO):
             self._updates.read_parameters()  # `forward` overlooks a change of `parameter.data`
-            self.model.policy.forward = self._updates.forward
+            self.model.policy.forward = LeanForward(self._updates)
 
     def _change(self) -> Callable[..., None] | None:
         self._undo()
@@ -301,6 +341,8 @@ def learn_values(model: PPO, timesteps: int) -> None:
     """
     Let the value function of a model learn, and leave its policy as it is; show the progress.
 
+    The next training begins with a fresh optimizer, and with the learning rate that it asks for.
+
     :param model: with a policy that drives already
     :param timesteps: to learn from
     """
@@ -313,6 +355,9 @@ def learn_values(model: PPO, timesteps: int) -> None:
             AdaptiveLearningRateCallback(kl=0.03),
         ],
     )
+    # What they hold is about updates of the policy that were taken back.
+    vars(model).pop("learning_rate_factor", None)
+    model.policy.optimizer.state.clear()
 
 
 class MirrorCallback(WhileLearning):

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from types import MethodType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,7 +31,7 @@ from sb3_torcs.policies.optimizers import adam_factors, adam_state, is_usual
 from sb3_torcs.policies.ppo_passes import decide, find_policy_gradient, find_value_gradient
 from sb3_torcs.policies.threads import Helper, two_threads
 
-__all__ = ["LeanPPO", "is_for"]
+__all__ = ["LeanForward", "LeanPPO", "is_for"]
 
 ENTROPY = 0.5 + 0.5 * math.log(math.tau)  # of a Gaussian whose standard deviation is 1
 SPARE = 1e-6  # PyTorch adds it to the norm by which it divides
@@ -280,6 +281,27 @@ class LeanPPO:
             own.copy_(view)
 
 
+class LeanForward:
+    """
+    Replaces a policy's ``forward`` during a rollout; copies of the policy have their own.
+
+    :param lean: that decides
+    """
+
+    def __init__(self, lean: LeanPPO) -> None:
+        self._lean = lean
+
+    def __call__(
+        self, obs: th.Tensor, deterministic: bool = False
+    ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+        """Decide; see :meth:`LeanPPO.forward`."""
+        return self._lean.forward(obs, deterministic)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        policy = self._lean.policy
+        return MethodType, (type(policy).forward, policy)
+
+
 def _views(vector: np.ndarray, slots: Sequence[Slot]) -> list[th.Tensor]:
     """Look at the part of each parameter, in the form that the model gives it."""
     parts = th.from_numpy(vector).split([math.prod(slot.shape) for slot in slots])
@@ -304,7 +326,8 @@ def is_for(model: PPO) -> bool:
         type(model).train is PPO.train
         and type(policy) in (ActorCriticPolicy, BoundedPolicy)
         and isinstance(model.observation_space, spaces.Box)
-        and len(model.observation_space.shape) == 1
+        and isinstance(model.action_space, spaces.Box)
+        and len(model.observation_space.shape) == len(model.action_space.shape) == 1
         and type(policy.action_dist) is DiagGaussianDistribution
         and _plain(policy.pi_features_extractor) in (FlattenExtractor, SensorInputs)
         and _plain(policy.vf_features_extractor) in (FlattenExtractor, SensorInputs)

@@ -36,6 +36,7 @@ from sb3_torcs.agents.saved.algorithm import algorithm_class
 from sb3_torcs.agents.saved.record import STATISTICS
 from sb3_torcs.agents.saved.writing import RecordCallback, recipe
 from sb3_torcs.callbacks import RacingProgressCallback
+from sb3_torcs.callbacks.learning import end_changes
 from sb3_torcs.errors import (
     InvalidOption,
     Sb3TorcsError,
@@ -329,6 +330,7 @@ class Manager(_Threaded):
             if model.num_timesteps == 0 and isinstance(error, InvalidOption):
                 self._leave_nothing()  # a callback has refused to begin
                 raise
+            end_changes(model)
             try:
                 with contextlib.suppress(OSError):
                     self.keeper.keep()
@@ -347,7 +349,7 @@ class Manager(_Threaded):
 
         :param model: that was trained
         """
-        del model  # which the callback knows
+        end_changes(model)
         try:
             with self._named_errors(), counted_interrupts(1, SAVING):
                 self.keeper.keep()
