@@ -1,6 +1,7 @@
 """A Gaussian policy whose mean cannot leave the action space."""
 
 import copy
+import pickle
 
 import gymnasium as gym
 import numpy as np
@@ -12,7 +13,7 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from torch import nn
 from toy import ToyRace
 
-from sb3_torcs.callbacks import LeanUpdatesCallback
+from sb3_torcs.callbacks import AdaptiveLearningRateCallback, LeanUpdatesCallback
 from sb3_torcs.callbacks.learning import learn_values
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.policies import BoundedPolicy
@@ -332,6 +333,44 @@ def test_before_its_first_update_an_average_leaves_the_driving_to_the_actor(tmp_
     np.testing.assert_array_equal(model.predict(seen, deterministic=True)[0], expected)
     model.learn(8)
     assert np.any(model.predict(seen, deterministic=True)[0] != expected)
+
+
+def test_after_its_values_a_model_learns_by_the_rate_that_is_asked_for():
+    kwargs = {"net_arch": [8], "activation_fn": nn.ReLU}
+    model = PPO(BoundedPolicy, ToyRace(), policy_kwargs=kwargs, n_steps=8, batch_size=8)
+    learn_values(model, 64)
+    rate = AdaptiveLearningRateCallback(first_factor=0.1)
+    rate.init_callback(model)
+    assert rate.factor == 0.1
+    assert not model.policy.optimizer.state
+
+
+@pytest.mark.parametrize("change", ["vector", "data"])
+def test_a_policy_drives_by_values_that_it_has_just_got(change):
+    """As evolution strategies set them."""
+    model = PPO(BoundedPolicy, ToyRace(), policy_kwargs={"net_arch": [8]}, n_steps=8, batch_size=8)
+    seen = np.zeros(29, np.float32)
+    first, _ = model.predict(seen, deterministic=True)
+    vector = model.policy.parameters_to_vector() + 0.3
+    if change == "vector":
+        model.policy.load_from_vector(vector)
+    else:
+        for own in model.policy.parameters():
+            own.data = own.data + 0.3
+    expected = model.policy.exact_driver()(th.zeros(1, 29)).detach().numpy()[0]
+    found, _ = model.predict(seen, deterministic=True)
+    np.testing.assert_array_equal(found, expected)
+    assert np.any(found != first)
+
+
+def test_a_policy_with_an_average_can_be_pickled():
+    kwargs = {"net_arch": [8], "ema_decay": 0.9}
+    model = PPO(BoundedPolicy, ToyRace(), policy_kwargs=kwargs, n_steps=8, batch_size=8)
+    model.learn(8)
+    other = pickle.loads(pickle.dumps(model.policy))
+    seen = np.zeros(29, np.float32)
+    found, expected = (each.predict(seen, deterministic=True)[0] for each in (other, model.policy))
+    np.testing.assert_array_equal(found, expected)
 
 
 def test_the_average_of_a_copy_follows_the_copy():

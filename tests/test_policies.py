@@ -11,11 +11,13 @@ import time
 from copy import deepcopy
 from functools import partial
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -23,7 +25,8 @@ from torch import nn
 from toy import ToyRace
 
 from sb3_torcs.bench.policy import PlainSplitHeadPolicy, measure, updater
-from sb3_torcs.callbacks import LeanUpdatesCallback
+from sb3_torcs.callbacks import GradientStepsCallback, LeanUpdatesCallback
+from sb3_torcs.callbacks.learning import end_changes
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.policies import SplitHeadPolicy, fast_matmul
 from sb3_torcs.policies import updates as lean_updates
@@ -671,7 +674,68 @@ def test_a_model_is_a_stock_one_whenever_it_may_be_saved(tmp_path):
     assert "train" not in vars(model)
 
 
+class Interrupt(BaseCallback):
+    """Ctrl-C when a rollout has ended and its update has not begun."""
+
+    def _on_step(self):
+        return True
+
+    def _on_rollout_end(self):
+        if self.n_calls >= 10:
+            raise KeyboardInterrupt
+
+
+def test_a_model_that_is_interrupted_before_an_update_is_saved(tmp_path):
+    model = make_model()
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(20, callback=[LeanUpdatesCallback(), Interrupt()])
+    model.save(tmp_path / "model.zip")
+    model = DDPG.load(tmp_path / "model.zip", DummyVecEnv([ToyRace]))
+    assert not {"train", "_excluded_save_params"} & vars(model).keys()
+    before = deepcopy(model.policy.state_dict())
+    model.learn(20)
+    after = model.policy.state_dict()
+    assert any(not th.equal(own, after[name]) for name, own in before.items())
+
+
+def test_gradient_steps_of_the_beginning_end_with_an_interrupted_training():
+    model = make_model()
+    change = GradientStepsCallback(gradient_steps=7, timesteps=100)
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(20, callback=[change, Interrupt()])
+    assert model.gradient_steps == 7
+    end_changes(model)
+    assert model.gradient_steps == 1
+    assert "train" not in vars(model)
+
+
+@pytest.mark.parametrize("space", [
+    spaces.Box(-1.0, 1.0, (4, 3), np.float32), spaces.Box(-1.0, 1.0, (4,), np.float64),
+    spaces.Discrete(5),
+])  # fmt: skip
+def test_observations_that_lean_updates_do_not_know_learn_as_ever(space):
+    env = gym.wrappers.TransformObservation(ToyRace(), lambda _: space.sample(), space)
+    model = DDPG(
+        "SplitHeadPolicy", env, policy_kwargs={"net_arch": SMALL}, learning_starts=5, batch_size=8,
+        buffer_size=500, device="cpu",
+    )  # fmt: skip
+    assert not is_for(model)
+    model.learn(10, callback=LeanUpdatesCallback())
+
+
 # ------------------------------------------------------------------------------ files
+
+
+def test_a_copy_keeps_and_saves_the_state_of_its_optimizers(tmp_path):
+    model = make_model(ema_decay=0.9)
+    model.learn(20)
+    other = deepcopy(model)
+    for name in ("actor", "critic"):
+        one, two = (getattr(each.policy, name).optimizer.state_dict() for each in (model, other))
+        assert one["state"].keys() == two["state"].keys()
+    other.save(tmp_path / "copy.zip")
+    loaded = DDPG.load(tmp_path / "copy.zip")
+    assert_same(list(loaded.policy.parameters()), list(model.policy.parameters()))
 
 
 @pytest.mark.parametrize("lean", [False, True])

@@ -10,6 +10,7 @@ import copy
 from collections.abc import Iterator, Mapping
 from typing import Any, cast
 
+import numpy as np
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import preprocess_obs
@@ -110,7 +111,12 @@ class ExactDriver(nn.Module):
 
 
 class ExactPolicy(BasePolicy):
-    """A policy that drives exactly whenever ``predict`` is ``deterministic``."""
+    """
+    A policy that drives exactly whenever ``predict`` is ``deterministic``.
+
+    It keeps the copy that drives until a parameter changes. PyTorch does not tell of changes within
+    ``parameter.data``: after them call ``set_training_mode(True)``.
+    """
 
     _exact: tuple[list[int], ExactDriver] | None = None
 
@@ -121,11 +127,24 @@ class ExactPolicy(BasePolicy):
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         if not deterministic:
             return super()._predict(observation, deterministic)  # type: ignore[safe-super]
-        versions = [number for own in self.parameters() for number in (id(own), own._version)]
+        versions = [
+            number
+            for own in self.parameters()
+            for number in (id(own), own.data_ptr(), own._version)
+        ]
         if self._exact is None or self._exact[0] != versions:
             self._exact = (versions, self.exact_driver())
         actions: th.Tensor = self._exact[1](observation)
         return actions
+
+    def load_from_vector(self, vector: np.ndarray) -> None:
+        """
+        Set all parameters.
+
+        :param vector: as of SB3's ``parameters_to_vector``
+        """
+        super().load_from_vector(vector)
+        self._exact = None  # new values may lie where older ones lay
 
     def set_training_mode(self, mode: bool) -> None:
         """

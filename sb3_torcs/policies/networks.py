@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, cast
 
 import torch as th
@@ -203,7 +204,7 @@ class ActorAverage(AveragedModel):
     """
 
     def __init__(self, actor: nn.Module, decay: float) -> None:
-        super().__init__(actor, multi_avg_fn=get_ema_multi_avg_fn(decay))
+        super().__init__(actor, multi_avg_fn=partial(_follow, decay))
         self.decay = decay
         self.requires_grad_(False)
 
@@ -220,6 +221,11 @@ class ActorAverage(AveragedModel):
     def has_begun(self) -> bool:
         """Whether there was an update. Loaded weights may come without an average of theirs."""
         return int(self.n_averaged) > 0
+
+
+def _follow(decay: float, averages: Any, current: Any, count: Any) -> None:
+    """Follow as PyTorch's function does, which cannot be pickled."""
+    get_ema_multi_avg_fn(decay)(averages, current, count)
 
 
 class LateActionQ(nn.Module):

@@ -135,23 +135,27 @@ class SplitHeadPolicy(ExactPolicy, TD3Policy):
         self.actor.optimizer = self._optimizer(self.actor, 1.0, lr_schedule)
         self.critic.optimizer = self._optimizer(self.critic, scale, lr_schedule)
         decay = self.own_kwargs["ema_decay"]
-        self.average: ActorAverage | None = None
-        if decay is not None:
-            self.average = ActorAverage(self.actor, decay)
-            self.average.follow(self.actor, self.actor.optimizer)
+        self.average = None if decay is None else ActorAverage(self.actor, decay)
+        self._hook_optimizers()
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Become a copy, whose average follows it."""
+        """Become a copy. Copies of optimizers leave their hooks behind."""
         super().__setstate__(state)
+        self._hook_optimizers()
+
+    def _hook_optimizers(self) -> None:
+        """Let the optimizers keep the plain networks' state, and the average follow the actor."""
+        for network in (self.actor, self.critic):
+            for part in _flat_parts(network):
+                keep_plain_state(network.optimizer, part)
         if self.average is not None:
             self.average.follow(self.actor, self.actor.optimizer)
 
     def _optimizer(
         self, network: nn.Module, scale: float, lr_schedule: Schedule
     ) -> th.optim.Optimizer:
-        """Make an optimizer, whose state is that of the plain network's."""
-        flat = [part for part in network.modules() if isinstance(part, FlatParameters)]
-        last = [part.flat for part in flat]
+        """Make an optimizer; the vectors of a network are its last parameters."""
+        last = [part.flat for part in _flat_parts(network)]
         others = [param for param in network.parameters() if all(param is not p for p in last)]
         group: dict[str, Any] = {"params": [*others, *last]}
         optimizer_class = self.optimizer_class
@@ -160,10 +164,7 @@ class SplitHeadPolicy(ExactPolicy, TD3Policy):
             if not issubclass(optimizer_class, LeanAdam):
                 optimizer_class = with_lr_scale(optimizer_class)
         rate = lr_schedule(1)
-        optimizer = optimizer_class([group], lr=rate, **self.optimizer_kwargs)  # type: ignore[call-arg]
-        for part in flat:
-            keep_plain_state(optimizer, part)
-        return optimizer
+        return optimizer_class([group], lr=rate, **self.optimizer_kwargs)  # type: ignore[call-arg]
 
     @property
     def driver(self) -> Actor:
@@ -211,6 +212,10 @@ class SplitHeadPolicy(ExactPolicy, TD3Policy):
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {**super()._get_constructor_parameters(), **self.own_kwargs}
+
+
+def _flat_parts(network: nn.Module) -> list[FlatParameters]:
+    return [part for part in network.modules() if isinstance(part, FlatParameters)]
 
 
 def heads_for(action_space: spaces.Box) -> tuple[str, ...]:

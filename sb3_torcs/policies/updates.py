@@ -8,6 +8,7 @@ from typing import Any, cast
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from stable_baselines3 import TD3
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
@@ -279,6 +280,9 @@ def is_for(model: TD3) -> bool:
     optimizers = policy.actor.optimizer, policy.critic.optimizer
     return (
         type(model).train is TD3.train
+        and isinstance(model.observation_space, spaces.Box)
+        and len(model.observation_space.shape) == 1
+        and model.observation_space.dtype == np.float32
         and policy.fuses
         and all(own.dtype == th.float32 for own in policy.parameters())
         and type(policy.actor.features_extractor) is FlattenExtractor
