@@ -330,6 +330,10 @@ def test_another_script_is_told(words):
     [
         ({"frame_stack": 0}, "frame_stack is 0; expected a whole number >= 1"),
         ({"learning_rate": -1}, "learning_rate is -1; expected a number >= 0"),
+        ({"ent_coef": "1e-3"}, "ent_coef is '1e-3'; expected a number, e.g. 1.0e-3 .*auto"),
+        ({"train_freq": 0}, "train_freq is 0; expected a whole number >= 1, or e.g. .1, episode."),
+        ({"train_freq": [1, "lap"]}, "expected a whole number >= 1, or e.g. .1, episode."),
+        ({"target_update_interval": 0}, "target_update_interval is 0; expected a whole number"),
         ({"noise_type": "foo"}, "noise_type is 'foo'; expected one of normal, ornstein-uhlenbeck"),
         ({"noise_type": "normal"}, "needs a noise_std, and that is None; expected a number >= 0"),
         ({"noise_type": "normal", "noise_std": -0.1}, "that is -0.1; expected a number >= 0"),

@@ -203,8 +203,8 @@ def check_entry(entry: Entry, algo: str, env_id: str, place: Place, *, trust: bo
     for key in REQUIRED:
         if key not in entry:
             raise ZooConfigError(f"{place}: key '{key}' is missing")
-    check_numbers(entry, str(place))
     constructor = (_arguments(algorithm) or set()) - set(GIVEN_BY_ZOO)
+    check_numbers(entry, constructor, str(place))
     _check_keys(entry, ZOO_KEYS | constructor, "key", place)
     check_noise(entry, "action_noise" in constructor, algo, str(place))
     policy = _policy(entry["policy"], algorithm, place)

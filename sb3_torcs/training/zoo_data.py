@@ -7,7 +7,7 @@ import contextlib
 import copy
 import importlib
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Container, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -161,11 +161,29 @@ def _is_schedule(value: Any) -> bool:
     return value is None or (is_number(value) and value >= 0.0)
 
 
+def _is_entropy_weight(value: Any) -> bool:
+    return is_number(value) or bool(isinstance(value, str) and re.fullmatch(AUTO, value))
+
+
+def _is_frequency(value: Any) -> bool:
+    if isinstance(value, list | tuple):
+        return len(value) == 2 and is_count(value[0]) and value[1] in ("step", "episode")
+    return is_count(value)
+
+
 def _is_share(value: Any) -> bool:
     return is_number(value) and 0.0 <= value <= 1.0
 
 
+AUTO = r"auto(_\d+(\.\d*)?(e[+-]?\d+)?)?"
+"""A weight of the entropy that SAC and its like learn, and with which value they begin."""
+
 NOISE_TYPES = ("normal", "ornstein-uhlenbeck")
+
+COUNTS = (
+    "n_envs", "batch_size", "buffer_size", "n_steps", "n_epochs", "policy_delay",
+    "target_update_interval",
+)  # fmt: skip
 
 SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf", "delta_std")
 """What the zoo lets fall to 0 over a training if it is written as ``lin_…``."""
@@ -178,9 +196,26 @@ NUMBERS: tuple[tuple[tuple[str, ...], Callable[[Any], bool], str], ...] = (
         "a number >= 0 (for YAML 1e-3 is text, and 1.0e-3 a number), or lin_NUMBER to fall to 0",
     ),
     (
-        ("n_envs", "batch_size", "buffer_size", "n_steps", "n_epochs", "policy_delay"),
+        COUNTS,
         is_count,
         "a whole number >= 1, e.g. 64",
+    ),
+    (("train_freq",), _is_frequency, "a whole number >= 1, or e.g. [1, episode]"),
+    (
+        ("ent_coef",),
+        _is_entropy_weight,
+        "a number, e.g. 1.0e-3 (for YAML 1e-3 is text); SAC, TQC and CrossQ also learn it: auto, "
+        "or auto_0.1 to begin with 0.1",
+    ),
+    (
+        ("vf_coef", "max_grad_norm"),
+        is_number,
+        "a number, e.g. 5.0e-1 (for YAML 5e-1 is text)",
+    ),
+    (
+        ("target_kl",),
+        lambda value: value is None or is_number(value),
+        "a number, e.g. 1.0e-2 (for YAML 1e-2 is text)",
     ),
     (
         ("frame_stack",),
@@ -202,11 +237,12 @@ NUMBERS: tuple[tuple[tuple[str, ...], Callable[[Any], bool], str], ...] = (
 """Numbers that are read, or used, only when the training has begun: keys, rule, and its words."""
 
 
-def check_numbers(entry: Mapping[str, Any], place: str) -> None:
+def check_numbers(entry: Mapping[str, Any], taken: Container[str], place: str) -> None:
     """
     Make sure that numbers have values with which a training can run.
 
     :param entry: of a hyperparameter file
+    :param taken: names of the arguments that the algorithm takes
     :param place: where it stands, for the message
     :raises ZooConfigError: for the first one that has not
     """
@@ -214,6 +250,12 @@ def check_numbers(entry: Mapping[str, Any], place: str) -> None:
         for key in keys:
             if key in entry and not good(entry[key]):
                 raise ZooConfigError(f"{place}: {key} is {entry[key]!r}; expected {words}")
+    weight = entry.get("ent_coef")
+    if isinstance(weight, str) and "target_entropy" not in taken:
+        raise ZooConfigError(
+            f"{place}: ent_coef is '{weight}', which this algorithm does not learn; expected a "
+            "number, e.g. 1.0e-3"
+        )
 
 
 def check_noise(entry: Mapping[str, Any], exploring: bool, algo: str, place: str) -> None:
