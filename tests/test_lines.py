@@ -58,7 +58,7 @@ def driven(oval, distance, lap_time=None):
     return DrivenLine(oval, x, np.zeros(3), np.full(3, 20.0), distance, lap_time)
 
 
-def learned(oval, lines, *states, stream=None, callbacks=(), shown=True):
+def learned(oval, lines, *states, stream=None, callbacks=(), shown=True, before=0):
     env = DummyVecEnv([lambda: RacingEnv(ScriptedBackend(oval, *states))])
     model = PPO(
         "MlpPolicy", env, n_steps=32, batch_size=32, n_epochs=1, policy_kwargs={"net_arch": [4]},
@@ -66,7 +66,12 @@ def learned(oval, lines, *states, stream=None, callbacks=(), shown=True):
     )  # fmt: skip
     metrics = DrivingMetricsCallback()
     progress = [RacingProgressCallback(stream=stream or io.StringIO())] if shown else []
-    model.learn(64, [*progress, metrics, *callbacks, Evaluations(env, metrics, lines)])
+    model.num_timesteps = before
+    model.learn(
+        64,
+        [*progress, metrics, *callbacks, Evaluations(env, metrics, lines)],
+        reset_num_timesteps=not before,
+    )
 
 
 # ------------------------------------------------------------------------------ told
@@ -154,12 +159,15 @@ def test_pictures_come_at_their_interval(oval, clock, tmp_path):
     assert [lap.picture for lap in driven_laps(tmp_path)] == ["001.png", "", "002.png", ""]
 
 
-def test_a_training_that_goes_on_continues_the_series(oval, clock, tmp_path):
-    for _ in range(2):
+@pytest.mark.parametrize("before", [0, 16])
+def test_a_training_that_goes_on_continues_the_series(oval, clock, tmp_path, before):
+    """Whether its model counts on, or begins to count again."""
+    for timesteps in (0, before):
         learned(
             oval,
             [driven(oval, 900.0, 104.2)],
             callbacks=[LinePicturesCallback(folder=str(tmp_path))],
+            before=timesteps,
         )
     assert driven_laps(tmp_path) == [
         DrivenLap(0.0, 16, 900.0, 104.2, "001.png"),

@@ -100,7 +100,7 @@ class LinePicturesCallback(BaseCallback):
         if self._take not in drivers[0].listeners:
             drivers[0].listeners.append(self._take)
         self._progress = [item for item in callbacks if isinstance(item, RacingProgressCallback)]
-        self._begun = time.monotonic()
+        self._begun, self._first = time.monotonic(), self.model.num_timesteps
         self._due = -math.inf  # [s] since then
         writable_folder(self.folder)
         self._before = driven_laps(self.folder)
@@ -117,7 +117,7 @@ class LinePicturesCallback(BaseCallback):
         last = self._before[-1] if self._before else DrivenLap(0.0, 0, 0.0, None, "")
         lap = DrivenLap(
             now + last.seconds,
-            self.num_timesteps + last.timesteps,
+            self.num_timesteps - self._first + last.timesteps,
             line.distance,
             line.lap_time,
             "",
