@@ -361,7 +361,7 @@ def range_finder_angles(choice: RangeFinderName | Sequence[float]) -> FloatArray
         choice = RANGE_FINDERS[choice]
     try:
         angles = np.array(choice, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise InvalidOption(f"range_finders is {choice!r}; {allowed}") from None
     if angles.shape != (19,) or not np.all(np.abs(angles) <= 90.0):
         what = f"{len(angles)} angles" if angles.ndim == 1 else f"shape {angles.shape}"

@@ -20,6 +20,7 @@ __all__ = [
     "listed",
     "path_and_arguments",
     "read_yaml",
+    "readable",
     "whole_file",
     "writable_file",
     "writable_folder",
@@ -31,6 +32,15 @@ IN_A_FOLDER = "choose a file in an existing folder that you may write to"
 MAX_LENGTH = 2**16  # [characters] PyYAML takes about a second for as many
 MAX_BRACKETS = 100  # open at once: PyYAML's time grows with their square
 MAX_NODES = 100_000  # after aliases are expanded
+
+
+def readable(name: str) -> str:
+    r"""
+    Make text of a file's name, for tables and pictures: a byte that is none is written as ``\xff``.
+
+    :param name: as Python reads it from the system
+    """
+    return os.fsencode(name).decode("utf-8", "backslashreplace")
 
 
 def import_advice(module: str) -> str:

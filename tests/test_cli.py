@@ -371,6 +371,7 @@ def test_an_evaluation_takes_any_argument_of_the_environment(capsys):
     ("car=car1-ow1", "type --car car1-ow1 instead"),
     ("action_repeat=2", "type --action-repeat 2 instead"),
     ("range_finders=scr", "type --range-finders scr instead"),
+    ("render_mode=5", "type --video FILE.mp4 for a film"),
 ])  # fmt: skip
 def test_an_argument_that_has_an_option_is_given_by_it(capsys, setting, advice):
     """One of the two would be dropped without a word."""
@@ -636,6 +637,13 @@ def test_an_evaluation_is_of_something_that_drives(driver):
         message = f"driver is {driver!r}, which has no predict; .*load_driver"
         with pytest.raises(InvalidOption, match=message):
             evaluation.evaluate(env, driver)
+
+
+@pytest.mark.parametrize("seed", [-1, 0.5, None])
+def test_the_seed_of_an_evaluation_is_a_whole_number(seed):
+    with gym.make("TorcsLite-v0") as env:
+        with pytest.raises(InvalidOption, match=f"seed is {seed}; expected a whole number >= 0"):
+            evaluation.evaluate(env, ScriptedDriver(), seed=seed)
 
 
 def test_an_evaluation_is_of_one_environment():

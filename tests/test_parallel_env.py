@@ -171,6 +171,7 @@ def test_a_wrong_action_drives_nobody(make, actions, message):
         ({"opponents": None}, "opponents is None; expected a list"),
         ({"flagged": "x"}, "flagged is 'x'; expected True or False"),
         ({"sensor_noise": 0.01}, "sensor_noise is 0.01; expected True or False"),
+        ({"render_size": np.array([320, 240])}, "render_size is .* for a race of one agent"),
         ({"backend": "scr"}, "backend is 'scr', which is for a race of one agent"),
         ({"render_mode": "rgb_array"}, "render_mode is for Torcs-v0"),
     ],

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from conftest import ScriptedBackend
@@ -266,6 +267,7 @@ def test_a_bad_option_says_what_is_allowed(oval, options, message):
     [
         ({"place": 3.0}, "unknown reset option 'place'"),
         (["distance"], "options of reset is .* expected a dict"),
+        (np.array([1, 2]), "options of reset is .* expected a dict"),
         ({"speed": math.nan}, "reset option speed is nan"),
         ({"speed": -1.0}, "expected 0 to 150"),
         ({"speed": 5000.0}, "speed is 5000 m/s; expected 0 to 150"),
@@ -277,6 +279,17 @@ def test_a_bad_option_says_what_is_allowed(oval, options, message):
 def test_a_bad_reset_option_says_what_is_allowed(oval, options, message):
     with pytest.raises(InvalidOption, match=message):
         RacingEnv(ScriptedBackend(oval)).reset(options=options)
+
+
+def test_a_place_just_before_the_line_is_on_the_lap():
+    """Rounding would put it a whole lap further on, where the world begins to count elsewhere."""
+    with gym.make("sb3_torcs:TorcsLite-v0") as env:
+        cars = []
+        for distance in (0.0, -1e-14):
+            env.reset(seed=0, options={"distance": distance, "speed": 20.0})
+            cars.append(env.unwrapped.car)
+    assert cars[0].laps == cars[1].laps
+    assert cars[0].distance_from_start == cars[1].distance_from_start
 
 
 @pytest.mark.parametrize("actuator", ["steering", "throttle", "brake"])

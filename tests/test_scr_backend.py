@@ -194,6 +194,7 @@ def test_a_lost_or_doubled_datagram_changes_nothing(backend):
         ({"grid_place": 2}, InvalidOption, "expected 1 to 1"),
         ({"sensor_noise": True}, InvalidOption, "-noisy"),
         ({"port": 3001}, InvalidOption, "add host='localhost'"),
+        ({"host": 5}, InvalidOption, "host is 5; expected a name, e.g. 'localhost', or None"),
         ({"host": "localhost", "port": 99999}, InvalidOption, "expected 1 to 65535"),
         ({"host": "localhost", "opponents": ["inferno"]}, InvalidOption, "serve --robots"),
         ({"backend": "native", "host": "localhost"}, InvalidOption, "add backend='scr'"),

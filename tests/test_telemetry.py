@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 
 import gymnasium as gym
@@ -12,6 +13,7 @@ from conftest import car_state
 from made_drives import drive, log_of
 from pyarrow import parquet
 
+from sb3_torcs.agents.models import driver_name
 from sb3_torcs.agents.robots import race
 from sb3_torcs.agents.scripted import ScriptedDriver
 from sb3_torcs.car import Controls
@@ -93,6 +95,42 @@ def test_an_agents_drive_is_noted_tick_by_tick_and_stays_the_same():
     assert len(frame) % 5 == 0
     assert set(frame["driver"]) | set(frame["world"]) == {"scripted", "TorcsLite-v0"}
     assert (set(frame["track"]), set(frame["episode"])) == ({"g-track-1"}, {1})
+
+
+@pytest.mark.usefixtures("game")
+def test_the_car_of_an_episode_is_noted():
+    cars = ["car1-trb1", "155-DTM"]
+    with gym.make("sb3_torcs:Torcs-v0", track="g-track-1", car=cars) as env:
+        log = log_drives(env, "x")
+        driven = []
+        for seed in range(4):
+            env.reset(seed=seed)
+            driven.append(env.unwrapped.backend.car)
+            env.step(env.action_space.sample())
+    noted = log.frame().groupby("episode")["car"].first().tolist()
+    assert noted == driven
+    assert set(driven) == set(cars)
+
+
+def test_an_environment_whose_drives_are_noted_can_be_copied():
+    env = gym.make("sb3_torcs:TorcsLite-v0", track="g-track-1")
+    log_drives(env, "x")
+    env.reset(seed=0)
+    action = env.action_space.sample()
+    other = copy.deepcopy(env)
+    assert np.array_equal(env.step(action)[0], other.step(action)[0])
+
+
+def test_names_that_are_no_text_are_written(tmp_path):
+    """A path may hold any bytes."""
+    name = os.fsdecode(b"bad\xff")
+    assert driver_name(f"{name}.zip") == r"bad\xff"
+    with gym.make("sb3_torcs:TorcsLite-v0", track="g-track-1") as env:
+        log = log_drives(env, name)
+        env.reset(seed=0)
+        env.step(env.action_space.sample())
+    log.write(tmp_path / "x.parquet")
+    assert set(read_drives(tmp_path / "x.parquet")["driver"]) == {r"bad\xff"}
 
 
 @pytest.mark.usefixtures("game")

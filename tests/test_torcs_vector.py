@@ -193,6 +193,7 @@ def test_a_race_can_be_copied_out_of_the_fleet(make):
         ({"max_episode_steps": 0}, InvalidOption, "max_episode_steps is 0; .* or -1 for no limit"),
         ({"track": "aalburg"}, TrackNotFound, "aalborg"),
         ({"reward": {"speed": 1.0}}, LookupError, "no reward term 'speed'"),
+        ({"opponents": np.array(["bt", "tita"])}, InvalidOption, "opponents is .*expected a list"),
     ],
 )
 def test_a_wrong_option_is_told_as_by_a_single_environment(make, options, error, message):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import multiprocessing
 import pickle
+import signal
 import time
 from collections.abc import Mapping
 from functools import partial
@@ -467,6 +468,9 @@ class Own(TorcsLiteEnv):
             "wrapped in RecordEpisodeStatistics.* use DummyVecEnv",
         ),
         ({"races": [Own]}, "Own has a step of its own"),
+        ({"races": [None]}, "races has None in it; give functions that make environments"),
+        ({"env_id": None}, "env_id is None; expected 'Torcs-v0' or 'TorcsLite-v0'"),
+        ({"max_episode_steps": np.array([3, 4])}, "max_episode_steps is array"),
         ({"races": 2, "max_episode_steps": []}, "max_episode_steps is an empty list"),
         (
             {"races": [partial(gym.make, LITE), partial(gym.make, LITE, action="pedal")]},
@@ -603,6 +607,25 @@ def test_an_interrupt_leaves_races_that_can_be_reset(env_id, make, monkeypatch):
             envs.step(np.stack([GAS, GAS]))
     assert_same(envs.reset(), fresh.reset())
     assert_same(envs.step(np.stack([GAS, GAS])), fresh.step(np.stack([GAS, GAS])))
+
+
+@pytest.mark.parametrize("method", ["_finish", "_go_on"])
+def test_an_interrupt_between_two_episodes_waits(env_id, make, monkeypatch, method):
+    """All begin their next one, and drive on."""
+    envs = make(3, env_id=env_id, max_episode_steps=2)
+    envs.reset()
+    envs.step(np.stack([GAS] * 3))
+    step = getattr(envs, method)
+
+    def interrupted(number, answer):
+        if number == 1:
+            signal.raise_signal(signal.SIGINT)
+        return step(number, answer)
+
+    monkeypatch.setattr(envs, method, interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        envs.step(np.stack([GAS] * 3))
+    assert not envs.step(np.stack([GAS] * 3))[2].any()
 
 
 def test_before_a_reset_and_after_close_there_is_no_step(env_id, make):

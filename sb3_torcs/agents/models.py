@@ -41,6 +41,7 @@ from sb3_torcs.errors import (
     ModelNotTrusted,
     near_miss,
 )
+from sb3_torcs.files import readable
 from sb3_torcs.sensors import view_of
 from sb3_torcs.torcs.installation import INSTALL, find_game
 
@@ -191,7 +192,7 @@ def driver_name(driver: str | Path) -> str:
     given = Path(os.path.expanduser(driver))
     if given.name == BEST_MODEL or given.name == Path(BEST_MODEL).stem:
         given = given.absolute().parent
-    return given.absolute().name.removesuffix(".zip").removesuffix(".npz")
+    return readable(given.absolute().name.removesuffix(".zip").removesuffix(".npz"))
 
 
 def one_of(option: str, choice: Any) -> Any:

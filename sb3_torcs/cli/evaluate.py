@@ -206,6 +206,11 @@ def _check_options(settings: Sequence[tuple[str, Any]]) -> None:
     for name, value in settings:
         if names.count(name) > 1:
             raise InvalidOption(f"--env-kwargs has {name} twice; give it one value")
+        if name == "render_mode":
+            raise InvalidOption(
+                f"--env-kwargs has {name}={value}; type --video FILE.mp4 for a film, or "
+                "sb3-torcs watch MODEL for the game's window"
+            )
         if name == TIME_LIMIT:
             raise InvalidOption(
                 f"--env-kwargs has {name}={value}, but the time limit follows from the laps; "

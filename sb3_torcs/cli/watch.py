@@ -114,7 +114,7 @@ def _size(text: str) -> tuple[int, int]:
     :return: width and height [pixels]
     """
     width, _, height = text.partition("x")
-    if not (width.isdigit() and height.isdigit()):
+    if not (width.isdecimal() and height.isdecimal()):
         raise argparse.ArgumentTypeError(f"{text!r}: expected WIDTHxHEIGHT, e.g. 1280x720")
     return int(width), int(height)
 

@@ -46,7 +46,7 @@ def checked_time_limit(steps: Any, env_id: str, *, unlimited: str = "-1") -> int
     """
     if steps is None:
         return gym.spec(env_id).max_episode_steps or NO_LIMIT
-    if not is_count(steps) and steps != NO_LIMIT:
+    if not is_count(steps, NO_LIMIT) or steps == 0:
         raise InvalidOption(
             f"max_episode_steps is {steps!r}; expected a whole number >= 1, or {unlimited} for no "
             "limit"
@@ -80,6 +80,8 @@ def env_makers(races: int, agents: int, env_id: str, env_kwargs: dict[str, Any])
     :param env_kwargs: of all races; ``max_episode_steps`` may be a list, which goes round
     :raises InvalidOption: if there are no such races
     """
+    if not isinstance(env_id, str):
+        raise InvalidOption(f"env_id is {env_id!r}; expected 'Torcs-v0' or 'TorcsLite-v0'")
     module, _, env_id = env_id.rpartition(":")
     if module:
         importlib.import_module(module)

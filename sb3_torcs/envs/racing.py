@@ -20,7 +20,6 @@ from sb3_torcs.car import (
     CarState,
     Controls,
     FloatArray,
-    Start,
     StartName,
     checked_hard_starts,
     checked_laps,
@@ -81,7 +80,8 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
     :param sensors: which groups of sensors an observation has; see :mod:`sb3_torcs.sensors`
     :param reward: a preset, or a mapping from terms to weights; see :mod:`sb3_torcs.rewards`
     :param action_repeat: control ticks of 0.02 s per timestep
-    :param start: ``"grid"``, or ``"random"``: anywhere on the track, moving
+    :param start: ``"grid"``, or ``"random"``: anywhere on the track, moving, and one time in ten
+        on the grid
     :param laps: whole laps after which the episode is truncated; ``None`` drives on
     :param runoff: how far the mass centre may be beside the road before the episode ends [m]
     :param recovery: how long a car may stand, or face backwards, before the episode ends [s]; 0
@@ -267,15 +267,15 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         self.car = None  # if the reset fails, no step is possible
         if self._draw_track is not None:
             self._draw_track(self.np_random)
-        if options:
-            start: Start | None = read_start(options, self.track.length)
+        if options is None or (isinstance(options, Mapping) and not options):
+            start, is_drawn = self._starts.draw(self.np_random, self.track), True
         else:
-            start = self._starts.draw(self.np_random, self.track)
+            start, is_drawn = read_start(options, self.track.length), False
         self.delay = self.conditions.draw(self.np_random, self.backend, self.action_repeat)
         try:
             self.car = self.backend.reset(self.np_random, start)
         except StartBlocked:
-            if options or start is None:
+            if start is None or not is_drawn:
                 raise
             # A wall stands where a start was drawn: rare, but a training draws thousands.
             start = None

@@ -76,7 +76,7 @@ class Starts:
         places = self.mishaps.get(track.name)
         if places and self.hard > 0.0 and rng.uniform() < self.hard:
             ahead = rng.uniform(*HARD_AHEAD)
-            where = (places[int(rng.integers(len(places)))] - ahead) % track.length
+            where = _on_lap(places[int(rng.integers(len(places)))] - ahead, track.length)
             speed = min(self.speed, safe_speed(ahead))
         else:
             where, speed = rng.uniform(0.0, track.length), self.speed
@@ -86,6 +86,12 @@ class Starts:
             rng.uniform(-RANDOM_HEADING_ERROR, RANDOM_HEADING_ERROR),
             rng.uniform(0.0, speed),
         )
+
+
+def _on_lap(distance: float, length: float) -> float:
+    """Find the place on a lap, from 0 to less than the length: tiny negative ones are rounded."""
+    place = distance % length
+    return place if place < length else 0.0
 
 
 def read_start(options: Any, length: float) -> Start:
@@ -117,7 +123,7 @@ def read_start(options: Any, length: float) -> Start:
     if abs(values["heading_error"]) > math.pi:
         raise InvalidOption(f"heading_error is {values['heading_error']:g} rad; expected -pi to pi")
     return Start(
-        values["distance"] % length,
+        _on_lap(values["distance"], length),
         values["track_position"],
         values["heading_error"],
         values["speed"],

@@ -53,7 +53,8 @@ class TorcsLiteEnv(RacingEnv):
         See :data:`sb3_torcs.rewards.PRESETS`; ``info["reward_terms"]`` sums to the reward.
 
     Starting state
-        ``"grid"``: standing in the first grid slot. ``"random"``: anywhere, moving.
+        ``"grid"``: standing in the first grid slot. ``"random"``: anywhere, moving, and one
+        time in ten on the grid.
         ``reset(options={"distance": 100.0, "speed": 20.0})`` starts at a given point.
 
     Episode end

@@ -9,6 +9,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from sb3_torcs.actions import ActionName, GearboxName, used_gearbox
 from sb3_torcs.backends.native import load_race
 from sb3_torcs.backends.seats import Grid, Seat, SeatWorld, SharedRace
@@ -162,7 +164,7 @@ def _of_several_agents(options: dict[str, Any]) -> dict[str, Any]:
             raise TypeError(f"a race has no option '{name}'{near_miss(name, sorted(every))}")
     for name, usual in OF_ONE_AGENT.items():
         given = options.get(name, usual)
-        if (tuple(given) if isinstance(given, list) else given) != usual:
+        if (tuple(given) if isinstance(given, (list, np.ndarray)) else given) != usual:
             raise InvalidOption(
                 f"{name} is {given!r}, which is for a race of one agent against robots; leave it "
                 "out"

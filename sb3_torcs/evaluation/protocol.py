@@ -16,7 +16,7 @@ import gymnasium as gym
 
 from sb3_torcs.agents.rollout import Driver, Timestep, drive
 from sb3_torcs.agents.saved.record import DRIVEN_WITH
-from sb3_torcs.car import CONTROL_TICK, check_count
+from sb3_torcs.car import CONTROL_TICK, MANY_LAPS, check_count
 from sb3_torcs.errors import InvalidOption, near_miss
 from sb3_torcs.torcs.track_names import RANDOM_TRACK, kind_without_game
 
@@ -182,7 +182,7 @@ def race_environment(
     """
     from sb3_torcs.agents.wrapping import wrapped
 
-    check_count("laps", laps)
+    check_count("laps", laps, MANY_LAPS)
     if not isinstance(env_id, str):
         raise InvalidOption(
             f"env_id is {env_id!r}, as in the record of a model that does not tell where it was "
@@ -224,10 +224,11 @@ def evaluate(
     :param episodes: how many
     :param seed: of the first reset; the next episodes go on from it
     :return: the results of each
-    :raises InvalidOption: if ``episodes`` is no whole number of at least 1, ``env`` is no single
-        environment, or ``driver`` cannot drive
+    :raises InvalidOption: if ``episodes`` is no whole number of at least 1, ``seed`` none of at
+        least 0, ``env`` no single environment, or ``driver`` cannot drive
     """
     check_count("episodes", episodes)
+    check_count("seed", seed, least=0)
     if not isinstance(env, gym.Env):
         raise InvalidOption(
             f"{type(env).__name__} is no single environment; evaluate drives one that gym.make or "
@@ -242,7 +243,7 @@ def evaluate(
     for number in range(episodes):
         lap_times, total = [], 0.0
         info: dict[str, Any] = {}
-        for timestep in drive(env, driver, seed=seed if number == 0 else None):
+        for timestep in drive(env, driver, seed=int(seed) if number == 0 else None):
             info = timestep.info
             total += timestep.reward
             if info["lap_time"]:

@@ -48,6 +48,8 @@ class TickedWorld:
         return state
 
     def __getattr__(self, name: str) -> Any:
+        if name == "_world":  # of a copy that is being made
+            raise AttributeError(name)
         return getattr(self._world, name)
 
 
@@ -63,13 +65,15 @@ class LoggedWorld(TickedWorld):
 
     def __init__(self, world: Backend, log: DriveLog, driver: str, env_id: str) -> None:
         super().__init__(world, lambda car, controls: log.add(self._label, car, controls))
-        self._label = DriveLabel(driver, "", world.car, env_id, episode=0)
+        self._label = DriveLabel(driver, "", "", env_id, episode=0)
 
     def reset(self, rng: np.random.Generator, start: Start | None) -> CarState:
         """Begin an episode; see :class:`~sb3_torcs.backends.base.Backend`."""
         state = super().reset(rng, start)
-        track = lasting_name(self._world.track)  # a random one is drawn before the reset
-        self._label = self._label._replace(track=track, episode=self._label.episode + 1)
+        track = lasting_name(self._world.track)  # track and car may be drawn before the reset
+        self._label = self._label._replace(
+            track=track, car=self._world.car, episode=self._label.episode + 1
+        )
         return state
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from sb3_torcs.car import CarState, Controls
 from sb3_torcs.errors import DriveFileError
-from sb3_torcs.files import whole_file
+from sb3_torcs.files import readable, whole_file
 from sb3_torcs.sensors import SENSORS
 from sb3_torcs.telemetry.table import CONTROL_FIELDS, STATE_FIELDS
 
@@ -114,7 +114,9 @@ class DriveLog:
         self._close()
         numbers = np.concatenate(self._numbers or [np.empty((0, len(COLUMNS)))])
         columns: dict[str, pa.Array] = {
-            name: pa.array([getattr(label, name) for label in self._labels]).dictionary_encode()
+            name: pa.array(
+                [readable(getattr(label, name)) for label in self._labels]
+            ).dictionary_encode()
             for name in LABELS[:-1]
         }
         columns["episode"] = pa.array([label.episode for label in self._labels], pa.int32())

@@ -23,6 +23,7 @@ from sb3_torcs.envs.info import RacingInfo
 from sb3_torcs.envs.making import MANY_RACES, EnvMaker, checked_threads, env_makers
 from sb3_torcs.envs.racing import RacingEnv
 from sb3_torcs.errors import EnvClosed, InvalidOption
+from sb3_torcs.signals import held_back
 
 __all__ = ["RaceInfo", "TorcsVecEnv", "glance"]
 
@@ -164,6 +165,12 @@ class TorcsVecEnv(DummyVecEnv):
                     f"agents is {agents}, with functions that make environments of one; give the "
                     "number of races"
                 )
+            for maker in races:
+                if not callable(maker):
+                    raise InvalidOption(
+                        f"races has {maker!r} in it; give functions that make environments, e.g. "
+                        "[lambda: gym.make('Torcs-v0')], or the number of races"
+                    )
             makers = list(races)
         else:
             check_count("races", races, MANY_RACES)
@@ -227,19 +234,22 @@ class TorcsVecEnv(DummyVecEnv):
         dones = np.zeros(self.num_envs, np.bool_)
         infos: list[Any] = [RaceInfo(timestep, i) for i in range(self.num_envs)]
         over = timestep.ended | (self._elapsed + 1 >= self._limits)
-        self._end_races(over)
-        self._elapsed += ~over
-        for i in np.flatnonzero(~over).tolist():
-            self._races[i].append(timestep.rewards[i])
         failures: list[Exception] = []
-        last: dict[int, Any] = {}
-        for i in np.flatnonzero(over).tolist():
-            with self._kept(failures, i):
-                last[i] = self._finish(i, timestep)
-        # Only now, since the cars of a race share its track, which a reset may change.
-        for i, answer in last.items():
-            with self._kept(failures, i):
-                timestep.observations[i], rewards[i], dones[i], infos[i] = self._go_on(i, answer)
+        # Ctrl-C waits meanwhile: a race between two episodes could not be driven on.
+        with held_back() if over.any() else contextlib.nullcontext():
+            self._end_races(over)
+            self._elapsed += ~over
+            for i in np.flatnonzero(~over).tolist():
+                self._races[i].append(timestep.rewards[i])
+            last: dict[int, Any] = {}
+            for i in np.flatnonzero(over).tolist():
+                with self._kept(failures, i):
+                    last[i] = self._finish(i, timestep)
+            # Only now, since the cars of a race share its track, which a reset may change.
+            for i, answer in last.items():
+                with self._kept(failures, i):
+                    answer = self._go_on(i, answer)
+                    timestep.observations[i], rewards[i], dones[i], infos[i] = answer
         if self._watched or failures:
             self._leave()
         for i in self._watched:
