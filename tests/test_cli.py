@@ -371,7 +371,7 @@ def test_an_evaluation_takes_any_argument_of_the_environment(capsys):
     ("car=car1-ow1", "type --car car1-ow1 instead"),
     ("action_repeat=2", "type --action-repeat 2 instead"),
     ("range_finders=scr", "type --range-finders scr instead"),
-    ("render_mode=5", "type --video FILE.mp4 for a film"),
+    ("render_mode=5", "type --video FILE.mp4 for a video"),
 ])  # fmt: skip
 def test_an_argument_that_has_an_option_is_given_by_it(capsys, setting, advice):
     """One of the two would be dropped without a word."""

@@ -208,7 +208,7 @@ def _check_options(settings: Sequence[tuple[str, Any]]) -> None:
             raise InvalidOption(f"--env-kwargs has {name} twice; give it one value")
         if name == "render_mode":
             raise InvalidOption(
-                f"--env-kwargs has {name}={value}; type --video FILE.mp4 for a film, or "
+                f"--env-kwargs has {name}={value}; type --video FILE.mp4 for a video, or "
                 "sb3-torcs watch MODEL for the game's window"
             )
         if name == TIME_LIMIT:
