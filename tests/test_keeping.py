@@ -13,6 +13,7 @@ import subprocess
 import sys
 import time
 from contextlib import nullcontext
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -366,7 +367,7 @@ def test_only_a_second_interrupt_ends_the_saving_of_what_was_learned(
     manager.files, manager.keeper = WholeFiles(tmp_path), Interrupted(times)
     manager.files.aside.mkdir()
     with nullcontext() if saved else pytest.raises(KeyboardInterrupt):
-        manager.save_trained_model(None)
+        manager.save_trained_model(SimpleNamespace())
     assert manager.keeper.done is saved
     assert ("Ctrl-C once more drops it" in capsys.readouterr().err) is (times > 0)
     assert not manager.files.aside.exists()

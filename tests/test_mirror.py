@@ -213,7 +213,7 @@ def test_a_buffer_that_is_saved_while_the_algorithm_learns_is_a_stock_one(tmp_pa
     callback = MirrorCallback()
     callback.init_callback(model)
     callback.on_training_start({}, {})
-    callback.on_rollout_end()
+    callback._change()
     model.save_replay_buffer(tmp_path / "replay.pkl")
     assert not all(known(buffer.sample(8).observations, buffer))
     model.load_replay_buffer(tmp_path / "replay.pkl")

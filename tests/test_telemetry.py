@@ -24,6 +24,7 @@ from sb3_torcs.evaluation.ticks import log_drives
 from sb3_torcs.sensors import SENSORS
 from sb3_torcs.telemetry import STATE_FIELDS, DriveLabel, DriveLog, read_drives
 from sb3_torcs.telemetry.drives import COLUMNS, LABELS
+from sb3_torcs.telemetry.laps import drives_of
 
 LABEL = DriveLabel("ana", "aalborg", "car1-trb1", "Torcs-v0", 2)
 
@@ -110,6 +111,22 @@ def test_the_car_of_an_episode_is_noted():
     noted = log.frame().groupby("episode")["car"].first().tolist()
     assert noted == driven
     assert set(driven) == set(cars)
+
+
+@pytest.mark.usefixtures("game")
+@pytest.mark.parametrize("env_id", ["Torcs-v0", "TorcsLite-v0"])
+@pytest.mark.parametrize("start", [None, {"distance": 300.0, "speed": 20.0}])
+def test_a_lap_is_cut_at_the_line_wherever_the_drive_begins(env_id, start):
+    with race_environment(env_id, {}, "g-track-1", laps=1) as env:
+        log, driver = log_drives(env, "x"), ScriptedDriver()
+        seen, _ = env.reset(seed=0, options=start)
+        over = False
+        while not over:
+            seen, _, _, over, _ = env.step(driver.predict(seen, deterministic=True)[0])
+    ((lap,),) = (drive.laps for drive in drives_of(log.frame()))
+    assert lap.standing is (start is None)
+    assert (np.diff(lap.rows["lap_time"]) > 0.0).all()
+    assert lap.rows["lap_time"].iloc[-1] == pytest.approx(lap.time, abs=0.021)
 
 
 def test_an_environment_whose_drives_are_noted_can_be_copied():

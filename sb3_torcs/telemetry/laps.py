@@ -29,11 +29,7 @@ class Lap:
     number: int  # from 1
     time: float  # [s]
     rows: pd.DataFrame
-
-    @property
-    def standing(self) -> bool:
-        """Whether it begins on the grid."""
-        return self.number == 1
+    standing: bool  # whether it begins on the grid
 
 
 @dataclass(frozen=True)
@@ -89,8 +85,16 @@ def _laps(rows: pd.DataFrame) -> list[Lap]:
         for done, part in parts.items():
             if done + 1 in parts:  # whose first row says how long this lap took
                 time = float(parts[done + 1]["last_lap_time"].iloc[0])
-                laps.append(Lap(int(done) + 1, time, part))
+                rows = _from_the_line(part)
+                on_grid = done == 0 and len(rows) == len(part)
+                laps.append(Lap(int(done) + 1, time, rows, on_grid))
     return laps
+
+
+def _from_the_line(rows: pd.DataFrame) -> pd.DataFrame:
+    """Leave out the way to the line, where the lap's clock begins anew, of a start elsewhere."""
+    (begins,) = np.nonzero(np.diff(rows["lap_time"].to_numpy(float)) < 0.0)
+    return rows.iloc[begins[-1] + 1 :] if begins.size else rows
 
 
 def grid_of(track: Track) -> FloatArray:

@@ -349,8 +349,8 @@ class Manager(_Threaded):
 
         :param model: that was trained
         """
-        end_changes(model)
         try:
+            end_changes(model)
             with self._named_errors(), counted_interrupts(1, SAVING):
                 self.keeper.keep()
         finally:
