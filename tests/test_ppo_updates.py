@@ -126,13 +126,17 @@ def test_what_was_learned_before_ctrl_c_is_kept(monkeypatch):
 
 
 def interrupted(model, when, *callbacks):
-    """Learn until Ctrl-C comes: in the third timestep, or in the first update."""
+    """Learn until Ctrl-C comes: in the third timestep, in the first update, or just before it."""
 
     class CtrlC(BaseCallback):
         def _on_step(self):
             if when == "rollout" and self.n_calls == 3:
                 raise KeyboardInterrupt
             return True
+
+        def _on_rollout_end(self):
+            if when == "before":
+                raise KeyboardInterrupt
 
     if when == "update":
         model.rollout_buffer.get = lambda batch_size: (_ for _ in ()).throw(KeyboardInterrupt)
@@ -141,7 +145,7 @@ def interrupted(model, when, *callbacks):
     vars(model.rollout_buffer).pop("get", None)
 
 
-@pytest.mark.parametrize("when", ["rollout", "update"])
+@pytest.mark.parametrize("when", ["rollout", "before", "update"])
 @pytest.mark.parametrize(
     "callbacks", [*permutations([LeanUpdatesCallback, AdaptiveLearningRateCallback])]
 )
@@ -328,27 +332,15 @@ def test_copies_of_a_policy_that_makes_a_rollout_stand_alone(policy, tmp_path):
     assert not th.equal(first(seen, deterministic=True)[1], expected[1])
 
 
-class Interrupt(BaseCallback):
-    """Ctrl-C when a rollout has ended and its update has not begun."""
-
-    def _on_step(self):
-        return True
-
-    def _on_rollout_end(self):
-        raise KeyboardInterrupt
-
-
 def test_a_model_that_is_interrupted_before_an_update_is_saved(tmp_path):
     model = make(policy=BoundedPolicy, tensorboard_log=str(tmp_path))
     callbacks = [
         AdaptiveLearningRateCallback(first_factor=0.1),
         ReuseRolloutsCallback(),
         LeanUpdatesCallback(),
-        Interrupt(),
     ]
     buffer, schedule = model.rollout_buffer, model.lr_schedule
-    with pytest.raises(KeyboardInterrupt):
-        model.learn(80, callback=callbacks)
+    interrupted(model, "before", *callbacks)
     assert (model.rollout_buffer, model.lr_schedule) == (buffer, schedule)
     model.save(tmp_path / "model.zip")
     again = PPO.load(tmp_path / "model.zip", ToyRace())

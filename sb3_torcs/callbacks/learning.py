@@ -170,7 +170,7 @@ class GradientStepsCallback(WhileLearning):
             self._algorithm.gradient_steps = self.gradient_steps
 
     def _change(self) -> None:
-        """Change nothing more."""
+        """Do nothing: the steps were changed at the end of the rollout."""
 
     def _undo(self) -> None:
         self._algorithm.gradient_steps = self._own
@@ -355,7 +355,7 @@ def learn_values(model: PPO, timesteps: int) -> None:
             AdaptiveLearningRateCallback(kl=0.03),
         ],
     )
-    # What they hold is about updates of the policy that were taken back.
+    # Both come of updates of the policy, too, which were taken back.
     vars(model).pop("learning_rate_factor", None)
     model.policy.optimizer.state.clear()
 

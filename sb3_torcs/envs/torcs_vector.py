@@ -77,8 +77,7 @@ class TorcsVectorEnv(SyncVectorEnv):
                 "others drive with gym.make_vec(..., vectorization_mode='async')"
             )
         opponents = options.get("opponents", ())
-        named = opponents if isinstance(opponents, (list, tuple)) else ()
-        if named and guests_of(named, find_game()):
+        if guests_of(opponents, find_game()):
             raise InvalidOption(
                 f"opponents is {opponents!r}, with agents among them; such races drive by "
                 "sb3_torcs.vec_env.TorcsVecEnv, or gym.make_vec(..., vectorization_mode='async')"

@@ -176,14 +176,9 @@ def _is_share(value: Any) -> bool:
 
 
 AUTO = r"auto(_\d+(\.\d*)?(e[+-]?\d+)?)?"
-"""A weight of the entropy that SAC and its like learn, and with which value they begin."""
+"""Lets SAC and its like learn the weight of the entropy, from the value that follows."""
 
 NOISE_TYPES = ("normal", "ornstein-uhlenbeck")
-
-COUNTS = (
-    "n_envs", "batch_size", "buffer_size", "n_steps", "n_epochs", "policy_delay",
-    "target_update_interval",
-)  # fmt: skip
 
 SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf", "delta_std")
 """What the zoo lets fall to 0 over a training if it is written as ``lin_…``."""
@@ -196,7 +191,15 @@ NUMBERS: tuple[tuple[tuple[str, ...], Callable[[Any], bool], str], ...] = (
         "a number >= 0 (for YAML 1e-3 is text, and 1.0e-3 a number), or lin_NUMBER to fall to 0",
     ),
     (
-        COUNTS,
+        (
+            "n_envs",
+            "batch_size",
+            "buffer_size",
+            "n_steps",
+            "n_epochs",
+            "policy_delay",
+            "target_update_interval",
+        ),
         is_count,
         "a whole number >= 1, e.g. 64",
     ),
