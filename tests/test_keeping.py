@@ -136,6 +136,19 @@ def test_a_signal_whose_exception_was_lost_ends_the_training_with_the_next_times
     assert model.num_timesteps == 4
 
 
+def test_a_rollout_that_was_not_learned_from_does_not_count(tmp_path):
+    callback, counted = keeper(tmp_path), []
+    callback._on_step = lambda: counted.append(callback.keep() or kept(tmp_path)) or True
+    model = tiny(algorithm=PPO, n_steps=4, batch_size=4).learn(10, callback=callback)
+    assert counted == [0, 0, 0, 0, 4, 4, 4, 4, 8, 8, 8, 8]
+    callback.keep()
+    assert kept(tmp_path) == model.num_timesteps == 12
+
+
+def kept(folder):
+    return models.saved_timesteps(folder / "last.zip")
+
+
 def test_statistics_are_kept_where_the_zoo_looks_for_them(tmp_path):
     env = VecNormalize(DummyVecEnv([ToyRace]))
     tiny(env, PPO, n_steps=8, batch_size=8).learn(8, callback=keeper(tmp_path))
@@ -182,6 +195,22 @@ def test_a_model_that_has_diverged_does_not_replace_a_good_one(tmp_path):
     with pytest.raises(TrainingDiverged, match="after 0 timesteps its model computes no numbers"):
         callback.keep()
     assert model.read_bytes() == before
+
+
+@pytest.mark.slow
+def test_the_best_model_counts_as_kept_where_the_last_one_had_no_room(
+    capsys, tmp_path, monkeypatch
+):
+    def full(self):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(KeepCallback, "keep", full)
+    assert main([*words_of(tmp_path), "--eval-freq", "30"]) == 2
+    said = capsys.readouterr().err
+    best = run_folder(tmp_path) / "best_model.zip"
+    assert f"kept: '{best}', 30 of 60 timesteps; make room" in said
+    assert "--timesteps 30 " in said
+    assert f"--resume {best}" in said
 
 
 @pytest.mark.slow

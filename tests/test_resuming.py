@@ -9,13 +9,13 @@ import signal
 import pytest
 import yaml
 
-from sb3_torcs.agents.models import find_model
+from sb3_torcs.agents.models import find_model, saved_timesteps
 from sb3_torcs.agents.saved.record import _read_plain
 from sb3_torcs.cli import main
 from sb3_torcs.training.resuming import recorded_entry
 from sb3_torcs.training.run import OF_ONE_RUN, Run, TrainOptions, going_on
 
-INTERRUPT = {"test_cli.InterruptingCallback": {"at": 80}}
+INTERRUPT = {"test_cli.InterruptingCallback": {"at": 70}}
 METRICS = "sb3_torcs.callbacks.DrivingMetricsCallback"
 ENTRY = {
     "n_timesteps": 100,
@@ -32,7 +32,7 @@ ENTRY = {
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """A training of an own entry that was interrupted after 80 of its 100 timesteps."""
+    """A training of an own entry that was interrupted in the fourth of its five rollouts."""
     folder = tmp_path_factory.mktemp("begun")
     (folder / "own.yml").write_text(yaml.safe_dump({"mine": ENTRY}))
     words = ["train", "--algo", "ppo", "--conf-file", str(folder / "own.yml"), "--entry", "mine"]
@@ -50,9 +50,10 @@ def gone_on(run, tmp_path, *words):
 
 
 def test_it_goes_on_with_its_own_entry_for_what_is_left(run, tmp_path, capsys):
+    assert saved_timesteps(run / "TorcsLite-v0.zip") == 60  # it has learned from three rollouts
     entry = gone_on(run, tmp_path)
-    assert "learned from 20 of 20 timesteps" in capsys.readouterr().out
-    assert entry == {**ENTRY, "n_timesteps": 20, "learning_rate": "lin_0.0002"} | {
+    assert "learned from 40 of 40 timesteps" in capsys.readouterr().out
+    assert entry == {**ENTRY, "n_timesteps": 40, "learning_rate": "lin_0.0004"} | {
         "env_wrapper": ["gymnasium.wrappers.FlattenObservation"]
     }
 
@@ -69,11 +70,11 @@ def test_the_command_to_go_on_leaves_out_what_is_recorded(run, tmp_path):
     options = TrainOptions("ppo", entry="mine", conf_file=run.parents[1] / "own.yml")
     options = dataclasses.replace(options, folder=tmp_path, progress=False, zoo_args=words)
     model = run / "TorcsLite-v0.zip"
-    command = shlex.split(going_on(options, Run(run, 80, 100, signal.SIGINT, model, {})))
+    command = shlex.split(going_on(options, Run(run, 60, 100, signal.SIGINT, model, {})))
     assert not {"--entry", "--conf-file"} & set(command)
     assert command[-5:] == ["--", "--save-freq", "50", "--hyperparams", "gamma:0.5"]
     entry = gone_on(run, tmp_path, *command[2:])
-    assert (entry["learning_rate"], entry["gamma"]) == ("lin_0.0002", 0.5)
+    assert (entry["learning_rate"], entry["gamma"]) == ("lin_0.0004", 0.5)
 
 
 def test_a_given_entry_is_all_that_counts(run, tmp_path):

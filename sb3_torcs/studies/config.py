@@ -9,10 +9,11 @@ its own words for what to type instead, and most lie in the RL Zoo's entry, whic
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import chain
 from pathlib import Path
@@ -21,9 +22,18 @@ from typing import Any
 import yaml
 
 from sb3_torcs.agents.saved.algorithm import SBX
-from sb3_torcs.errors import StudyError, near_miss, with_new_names
+from sb3_torcs.errors import (
+    BackendUnavailable,
+    Sb3TorcsError,
+    StudyError,
+    ZooConfigError,
+    near_miss,
+    with_new_names,
+)
+from sb3_torcs.evaluation.protocol import GAME
 from sb3_torcs.files import listed, read_yaml
-from sb3_torcs.torcs.track_names import RANDOM_TRACK
+from sb3_torcs.torcs.installation import find_game
+from sb3_torcs.torcs.track_names import RANDOM_TRACK, find_track
 from sb3_torcs.tracks.catalogue import CATEGORIES, load_track, tracks_of
 from sb3_torcs.training import zoo
 from sb3_torcs.training.zoo_data import as_data
@@ -102,7 +112,6 @@ def read_study(path: str | Path) -> Study:
     :return: the study
     :raises StudyError: if the file has a mistake
     :raises ZooConfigError: if the hyperparameters of a variant have a mistake
-    :raises TrackNotFound: if there is no such track
     """
     file = Path(os.path.expanduser(path))
     said = _read(file)
@@ -268,12 +277,13 @@ def _trials(
     env_kwargs = entry.get("env_kwargs") or {}
     own = env_kwargs.get("track", "aalborg")
     given = source["eval_tracks"]
-    eval_tracks = _tracks(own if given is None else given, f"{place}: eval_tracks")
+    with _told_at(place):
+        zoo.checked_env(entry, env_id, place).close()
+    eval_tracks = _tracks(own if given is None else given, env_id, f"{place}: eval_tracks")
     final_tracks = eval_tracks
     if said.get("final_tracks") is not None:
-        chosen = _tracks(said["final_tracks"], f"{file}: final_tracks")
+        chosen = _tracks(said["final_tracks"], env_id, f"{file}: final_tracks")
         final_tracks = _united(eval_tracks, chosen)
-    zoo.checked_env(entry, env_id, place).close()
     for seed in seeds:
         yield Trial(
             slug(said["name"]), variant, seed, algo, env_id, copy.deepcopy(entry), interval,
@@ -292,15 +302,31 @@ def _source(
     return source
 
 
-def _tracks(value: Any, what: str) -> tuple[str, ...]:
-    """Read a list of tracks; a category stands for all of its tracks."""
+@contextlib.contextmanager
+def _told_at(place: zoo.Place | str) -> Iterator[None]:
+    """Let an error tell where the file says what is wrong."""
+    try:
+        yield
+    except (BackendUnavailable, ZooConfigError):  # not the file's, or it tells the place itself
+        raise
+    except Sb3TorcsError as error:
+        raise StudyError(f"{place}: {error}") from error
+
+
+def _tracks(value: Any, env_id: str, what: str) -> tuple[str, ...]:
+    """Read a list of tracks of a world; a category stands for all of its tracks."""
     tracks = [value] if isinstance(value, str) else value
     named = isinstance(tracks, list) and all(isinstance(track, str) for track in tracks)
     if not named or not tracks:
         categories = ", ".join(f"'{category}'" for category in CATEGORIES)
         raise StudyError(f"{what} is {value!r}; expected a list of tracks, or of {categories}")
-    tracks = list(chain.from_iterable(map(tracks_of, tracks)))
-    names = [track_name(track) for track in tracks]
+    with _told_at(what):
+        tracks = list(chain.from_iterable(map(tracks_of, tracks)))
+        if env_id == GAME:
+            game = find_game()
+            for track in tracks:
+                find_track(track, game)
+        names = [track_name(track) for track in tracks]
     if len(set(names)) < len(names):
         raise StudyError(f"{what}: {', '.join(names)}: one is there twice; take it out")
     return tuple(tracks)

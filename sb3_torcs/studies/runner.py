@@ -22,7 +22,15 @@ from typing import Any
 
 from sb3_torcs import cores
 from sb3_torcs.agents.saved.record import BEST_MODEL
-from sb3_torcs.errors import OutputNotWritable, RayUnavailable, StudyError, TrainingDiverged
+from sb3_torcs.errors import (
+    InvalidOption,
+    OutputNotWritable,
+    RayUnavailable,
+    StudyError,
+    TrackFileError,
+    TrackNotFound,
+    TrainingDiverged,
+)
 from sb3_torcs.signals import answered, handlers_kept
 from sb3_torcs.studies.config import Study, Trial
 from sb3_torcs.studies.storage import Files, StudyFolder
@@ -139,7 +147,7 @@ def run_study(
         _remove_scratch(store.path / SESSION)  # of a run that was killed
         left = [trial for trial in study.trials if not store.ended(trial)]
         for trial in {trial.variant: trial for trial in left}.values():
-            _check_buildable(trial)
+            _check_buildable(trial, study.path)
         store.begin()
         store.write_results()
         for trial in study.trials:
@@ -155,14 +163,15 @@ def run_study(
     return store.results
 
 
-def _check_buildable(trial: Trial) -> None:
+def _check_buildable(trial: Trial, file: Path) -> None:
     """Build the agent of a trial, so that wrong values are reported before any training."""
     from sb3_torcs.studies.trial import Training
 
     try:
         Training(trial).close()
     except Exception as error:
-        raise StudyError(f"variant '{trial.variant}' cannot be trained: {error}") from error
+        why = f"variant '{trial.variant}' cannot be trained: {error}"
+        raise StudyError(f"{file}: {why}") from error
 
 
 def require_ray(address: str | None = None) -> None:
@@ -341,7 +350,7 @@ def _run_or_tell(trial: Trial, store: Any, report: Callable[[dict[str, Any]], No
     """Run a trial. An error that would recur is reported as a row, so that Tune does not retry."""
     try:
         run_trial(trial, store, report)
-    except (StudyError, OutputNotWritable) as error:
+    except (InvalidOption, OutputNotWritable, StudyError, TrackFileError, TrackNotFound) as error:
         report({"phase": FAILED, "error": _last_line(error)})
 
 

@@ -6,15 +6,17 @@ power cut or a full disk leaves what was saved before.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_torcs.agents.saved.record import STATISTICS
 from sb3_torcs.car import check_count
@@ -112,6 +114,17 @@ class KeepCallback(BaseCallback):
 
     def _init_callback(self) -> None:
         (self.files.aside / self.name).mkdir(parents=True, exist_ok=True)
+        self._count()
+
+    def _on_rollout_start(self) -> None:
+        self._count()
+
+    def _on_training_end(self) -> None:
+        self._count()
+
+    def _count(self) -> None:
+        """Note that the model has learned from all timesteps so far."""
+        self._learned_from = self.model.num_timesteps
 
     def _on_step(self) -> bool:
         if self._interrupts:
@@ -134,7 +147,7 @@ class KeepCallback(BaseCallback):
         check_healthy(self.model)
         self.files.drop()
         aside = self.files.aside
-        with (aside / f"{self.name}.zip").open("wb") as file:
+        with (aside / f"{self.name}.zip").open("wb") as file, self._without_unfinished():
             self.model.save(file)
         statistics = self.model.get_vec_normalize_env()
         if statistics is not None:
@@ -144,6 +157,17 @@ class KeepCallback(BaseCallback):
             with (aside / REPLAY_BUFFER).open("wb") as file:
                 self.model.save_replay_buffer(file)  # type: ignore[attr-defined]
             self.files.settle()
+
+    @contextlib.contextmanager
+    def _without_unfinished(self) -> Iterator[None]:
+        """Leave a rollout out of the model's count from which it has not learned yet."""
+        model, seen = self.model, self.model.num_timesteps
+        if isinstance(model, OnPolicyAlgorithm):
+            model.num_timesteps = self._learned_from
+        try:
+            yield
+        finally:
+            model.num_timesteps = seen
 
 
 def check_healthy(model: BaseAlgorithm) -> None:

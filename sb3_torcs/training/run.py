@@ -379,6 +379,8 @@ def _told(
     error: OSError | WorkerLost | TrainingDiverged, result: Run, options: TrainOptions
 ) -> Exception:
     """Compose a message: why a training ended, what is saved, and what to type."""
+    from sb3_torcs.agents.models import saved_timesteps
+
     why, kind = str(error), type(error)
     if isinstance(error, TrainingDiverged):
         remedy = "lower the learning_rate"
@@ -387,6 +389,9 @@ def _told(
     else:
         why = f"cannot write '{error.filename or result.folder}': {error.strerror or error}"
         kind, remedy = OutputNotWritable, "make room, or choose another folder"
+    best = result.best_model
+    if not result.timesteps and best is not None and best.is_file():  # a later file had no room
+        result = dataclasses.replace(result, last_model=best, timesteps=saved_timesteps(best))
     if result.timesteps >= result.wanted:
         learned = f"kept: '{result.last_model}', which has learned from all timesteps"
         return kind(f"{why}; {learned}; see it: sb3-torcs evaluate '{result.best_model}'")
