@@ -104,6 +104,19 @@ def test_what_it_waits_for_is_told_before_anything_is_loaded():
     assert not {"torch", "stable_baselines3", "numba"} & set(loaded)
 
 
+def test_an_agent_that_sees_the_road_tells_which_it_takes_the_track_to_be(monkeypatch, capsys):
+    monkeypatch.setattr("sb3_torcs.backends.scr.PATIENCE_WITH_OTHERS", 0.2)
+    (bound,) = open_ports(1)
+    port = str(bound.getsockname()[1])
+    bound.close()
+    assert main(["compete", "ppo-aalborg", "--port", port]) == 2
+    told = "ppo-aalborg takes aalborg to be the track; give another one with --track"
+    assert told in capsys.readouterr().out
+    for words in (["ppo-aalborg", "--track", "forza"], ["ppo-post-roads"]):
+        assert main(["compete", *words, "--port", port]) == 2
+        assert "to be the track" not in capsys.readouterr().out
+
+
 class Dying(Loopback):
     """A server that ends without a word."""
 

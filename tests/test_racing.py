@@ -336,6 +336,16 @@ def test_a_timestep_after_the_end_warns_once(oval):
         assert env.step(GAS)[2]
 
 
+def test_whoever_means_to_drive_on_is_not_warned(oval):
+    lost = {"distance_from_axis": 20.0}
+    env = RacingEnv(ScriptedBackend(oval, lost, lost))
+    env.warns_after_end = False
+    env.reset(seed=0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert [env.step(GAS)[2] for _ in range(2)] == [True, True]
+
+
 def test_an_environment_out_of_use_says_what_to_do(oval):
     env = RacingEnv(ScriptedBackend(oval))
     with pytest.raises(EnvClosed, match="call reset first"):

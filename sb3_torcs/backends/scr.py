@@ -341,7 +341,10 @@ class ScrBackend:
                     "road"
                 )
             client.send(_action(STANDING, lap_time))
-        raise ServerLost(f"the race at {client.address} ended before it began; call reset again")
+        raise ServerLost(
+            f"the race at {client.address} ended before it began; begin again when the next one "
+            "waits for its drivers"
+        )
 
     def _hold(self, client: ScrClient | Rehearsal, controls: Controls, ticks: int) -> int:
         """

@@ -26,8 +26,9 @@ server. The agent chooses an action as often as in its training, and repeats it 
 tick in between. It drives to the end of the race, even beside the road.
 
 The protocol does not tell the client which track and which car it drives. Give the car with --car:
-the gearbox is made for it. An agent that sees the road ahead, and a ghost, need the track, too:
---track. Others drive any road.
+the gearbox is made for it. An agent that sees the road ahead, and a ghost, need the track, too,
+with --track: without it they take the race to be on the track of their training. Others drive any
+road.
 """
 
 
@@ -48,7 +49,7 @@ def add_parser(subparsers: Any) -> None:
     add(
         "--track",
         metavar="T",
-        help="track of that race, for who needs it; default: that of the training",
+        help="track of that race, for an agent that sees the road; default: that of the training",
     )
     add("--car", metavar="C", help="car of that race; default: that of the training")
     add("--name", metavar="N", help="name of the driver, which `serve` shows; default: the model's")
@@ -87,6 +88,9 @@ def run(args: argparse.Namespace) -> int:
     with quiet_output(args.json):
         name = args.name or driver_name(args.model)
         agent = Agent(args.model, settings, args.algo, args.trust, name)
+        assumed = settings.get("track", "aalborg")
+        if args.track is None and assumed is not None:
+            print(f"{args.model} takes {assumed} to be the track; give another one with --track")
         print(f"waiting for the SCR server at {where} and the start of its race", flush=True)
     # A garbage collection over everything that was loaded would take longer than a tick.
     gc.collect()

@@ -160,7 +160,9 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         self._controls = RESTING
         self._viewer: Any = None
         self._closed = self._race_is_over = False
-        self._over = self._warned = False
+        self._over = False
+        self.warns_after_end = True
+        """Whether the next step after the end of an episode is worth a warning."""
         self.driven: Callable[[], CarState] | None = None
         """Returns the car after a timestep that a batch of races has driven."""
 
@@ -305,8 +307,8 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         parts = self.begin_step(action)
         result = self.finish_step(partial(self._hold, parts))
         # Whoever has gone back to a saved moment may step on.
-        if was_over and self._over and not self._warned:
-            self._warned = True
+        if was_over and self._over and self.warns_after_end:
+            self.warns_after_end = False
             gym.logger.warn(
                 "step after the end of an episode, where rewards mean nothing; call reset when "
                 "terminated or truncated is true"
