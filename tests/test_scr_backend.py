@@ -191,7 +191,7 @@ def test_a_lost_or_doubled_datagram_changes_nothing(backend):
         ({"opponents": ["nobody"]}, UnknownRobot, "nobody"),
         ({"opponents": ["ppo-any-road"]}, UnknownRobot, "agents are opponents with backend 'nat"),
         ({"opponents": "inferno"}, InvalidOption, "expected a list of names"),
-        ({"grid_place": 2}, InvalidOption, "expected 1 to 1"),
+        ({"grid_place": 2}, InvalidOption, "expected 1, since there are no opponents, or None"),
         ({"sensor_noise": True}, InvalidOption, "-noisy"),
         ({"port": 3001}, InvalidOption, "add host='localhost'"),
         ({"host": 5}, InvalidOption, "host is 5; expected a name, e.g. 'localhost', or None"),

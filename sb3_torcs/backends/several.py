@@ -42,7 +42,7 @@ def is_several(choice: Any, name: str = "track") -> TypeGuard[Sequence[Any]]:
     :param name: of the option
     :raises InvalidOption: if it is an empty list
     """
-    several = isinstance(choice, Sequence) and not isinstance(choice, str)
+    several = isinstance(choice, Sequence) and not isinstance(choice, (str, bytes))
     if several and not choice:
         raise InvalidOption(f"{name} is an empty list; give a name, or a list with one at least")
     return several

@@ -101,7 +101,7 @@ def _corner_row(number: int, driver: str, corner: dict[str, Any]) -> tuple[str, 
         str(number + 1),
         f"{corner['distance']:.0f}",
         driver,
-        "-" if brakes is None else f"{corner['distance'] - brakes:.0f}",
+        "-" if brakes is None else f"{round(corner['distance'] - brakes)}",
         *(f"{KMH * speed:.0f}" for speed in speeds),
         f"{corner['time_lost']:.3f}",
     )

@@ -217,10 +217,10 @@ def _check_options(settings: Sequence[tuple[str, Any]]) -> None:
                 "type --laps L instead"
             )
         if name in OPTIONS:
-            option = f"--{name.replace('_', '-')}"
+            one = value[0] if isinstance(value, list) and value else value
             raise InvalidOption(
                 f"--env-kwargs has {name}={value}, for which there is an option; type "
-                f"{option} {value} instead"
+                f"--{name.replace('_', '-')} {one} instead"
             )
 
 

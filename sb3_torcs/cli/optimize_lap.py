@@ -39,7 +39,8 @@ the same car. It drives the race again and again. On the way it restores the eng
 try some ten ways to go on, each a few seconds long, and takes the best.
 
 It uses all cores. With --rollouts the same seed finds the same ghost; what is found in --seconds
-depends on the machine, and is another ghost each time. Ctrl-C keeps what was found.
+depends on the machine, and is another ghost each time. Ctrl-C keeps what was found, once
+its first race is whole.
 """
 
 

@@ -127,7 +127,7 @@ def missing(comparison: Comparison) -> list[str]:
     :param comparison: of laps
     """
     notes = [
-        f"{drive.driver} drove no whole lap: it came {drive.distance:.0f} m far."
+        f"{drive.driver} drove no whole lap: it came {round(drive.distance)} m far."
         for drive in comparison.left_out
     ]
     drivers = comparison.drivers
@@ -186,7 +186,7 @@ def _corners(comparison: Comparison) -> str:
 
 def _pass_cells(place: int, one: DriverLap, own: CornerPass) -> list[Cell | str]:
     """Cells of a driver in a corner."""
-    brakes = "–" if own.braking_point is None else f"{own.distance - own.braking_point:.0f}"
+    brakes = "–" if own.braking_point is None else f"{round(own.distance - own.braking_point)}"
     speeds = (own.entry_speed, own.apex_speed, own.exit_speed)
     lost = "" if place == 0 else _signed(own.time_lost)
     return [_name(place, one), brakes.replace("-", "−"), *(f"{KMH * v:.0f}" for v in speeds), lost]

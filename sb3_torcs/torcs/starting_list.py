@@ -55,9 +55,8 @@ def starting_list(
     ]
     slot = len(entries) + 1 if grid_place is None else grid_place
     if not is_count(slot) or slot > len(entries) + 1:
-        raise InvalidOption(
-            f"grid_place is {grid_place!r}; expected 1 to {len(entries) + 1}, or None"
-        )
+        places = f"1 to {len(entries) + 1}" if entries else "1, since there are no opponents"
+        raise InvalidOption(f"grid_place is {grid_place!r}; expected {places}, or None")
     if agents == 1 and len(entries) >= GRID_SLOTS:  # gym.make has no ``agents``
         raise InvalidOption(
             f"opponents has {len(entries)} names; expected at most {GRID_SLOTS - 1}, since a grid "
