@@ -316,7 +316,7 @@ def tool(name: str) -> str:
 
 
 def again(folder: Path, how: str) -> str:
-    where = "" if folder == Path("demo") else f" --folder {folder}"
+    where = "" if folder == Path("demo") else f" --folder {shlex.quote(str(folder))}"
     words = f"{how}{where}"
     return f"make demo DEMO_ARGS={shlex.quote(words)}"
 

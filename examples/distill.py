@@ -109,6 +109,8 @@ def _same_for_all(teachers: Sequence[str]) -> dict:
     for teacher, options in zip(teachers, found, strict=True):
         if options != found[0]:
             raise SystemExit(f"{teacher} drives with {options}, and {teachers[0]} with {found[0]}")
+    if found[0].get("action") != "pedal":
+        raise SystemExit(f'{teachers[0]} does not drive with action="pedal"; give one that does')
     return found[0]
 
 

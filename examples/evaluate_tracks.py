@@ -8,7 +8,7 @@ import functools
 import statistics
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
-from math import inf, nan
+from math import inf, isnan, nan
 from multiprocessing import get_context
 from pathlib import Path
 from typing import NamedTuple
@@ -99,7 +99,8 @@ def summary(drives: list[Drive]) -> str:
     clean = sum(drive.damage == 0 for drive in whole)
     before_bt = sum(drive.flying_lap < drive.robots.get("bt", nan) for drive in whole)
     before_all = sum(drive.gap < 0 for drive in whole)
-    gap = statistics.median(drive.gap for drive in drives)  # without all laps it is infinite
+    # Without all laps a gap is infinite; where no robot finishes, there is none.
+    gap = statistics.median([drive.gap for drive in drives if not isnan(drive.gap)] or [inf])
     told = f"{gap:+.1f} %" if gap < inf else "unknown, since half of the tracks are not completed"
     return (
         f"completes {len(whole)} of {len(drives)}, {clean} without damage; median gap to the best "
@@ -109,9 +110,11 @@ def summary(drives: list[Drive]) -> str:
 
 def main() -> None:
     args = parser.parse_args()
-    listed = [track for name in args.track for track in tracks_of(name)]
-    names = [lasting_name(load_track(track)) for track in listed]
-    tracks = [name for name in names if name not in args.without]
+    names, without = (
+        [lasting_name(load_track(track)) for word in words for track in tracks_of(word)]
+        for words in (args.track, args.without)
+    )
+    tracks = [name for name in names if name not in without]
     if not tracks:
         parser.error("no track is left; name another --track")
     with ProcessPoolExecutor(args.jobs, mp_context=get_context("spawn")) as pool:

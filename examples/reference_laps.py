@@ -10,6 +10,7 @@ from sb3_torcs.agents.scripted import SCRIPTED, ScriptedDriver
 from sb3_torcs.car import DEFAULT_CAR
 from sb3_torcs.evaluation.ladder import REFERENCE_FIELDS, REFERENCE_FILE, ROBOTS
 from sb3_torcs.evaluation.protocol import RACE_LAPS, evaluate, race_environment
+from sb3_torcs.files import whole_file
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.tracks.catalogue import available_tracks
 
@@ -35,8 +36,7 @@ def robot(name, track):
     return [lap.time for lap in result.laps] if result.car == DEFAULT_CAR else []
 
 
-aside = args.out.with_name(f".{args.out.name}")
-with aside.open("w", newline="", encoding="utf-8") as file:
+with whole_file(args.out) as aside, aside.open("w", newline="", encoding="utf-8") as file:
     file.write(f"# python examples/reference_laps.py, sb3_torcs {sb3_torcs.__version__}\n")
     writer = csv.writer(file, lineterminator="\n")
     writer.writerow(REFERENCE_FIELDS)
@@ -47,4 +47,3 @@ with aside.open("w", newline="", encoding="utf-8") as file:
             times = (f"{laps[0]:.3f}", f"{min(laps[1:]):.3f}") if whole else ("", "")
             writer.writerow((track.rpartition("/")[2], driver, DEFAULT_CAR, *times))
             print(f"{track}: {driver} {', '.join(f'{lap:.3f}' for lap in laps) or 'no lap'}")
-aside.replace(args.out)  # whole, or what was there before

@@ -246,7 +246,7 @@ def learn_alone(args: argparse.Namespace, env_kwargs: dict, settings: Settings) 
     """Learn to drive where there is nobody, and return the policy's weights."""
     cars = mirrored(cars_alone(settings.cars_alone, args, env_kwargs, settings), settings)
     model = make_model(cars, args.seed, 128, 0.985, settings, UNITS)
-    timesteps = args.alone or settings.timesteps_alone
+    timesteps = settings.timesteps_alone if args.alone is None else args.alone
     model.learn(timesteps, callback=callbacks(env_kwargs, args, "alone", ALONE))
     cars.close()
     return model.policy.state_dict()

@@ -264,6 +264,25 @@ def test_stochastic_brake_overrides_its_share_of_the_timesteps(kind, n_envs):
     assert all(noise.stochastic_brake is None for noise in noises_of(model))
 
 
+class Raising(BaseCallback):
+    """Ends a training when its first rollout is over."""
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:
+        raise KeyboardInterrupt
+
+
+def test_a_brake_that_an_error_left_on_is_off_in_a_training_without_it():
+    model = make_model()
+    with pytest.raises(KeyboardInterrupt):
+        learn(model, 4, NoiseCallback(), StochasticBrakeCallback(), Raising())
+    assert noises_of(model)[0].stochastic_brake is not None
+    learn(model, 4, NoiseCallback())
+    assert noises_of(model)[0].stochastic_brake is None
+
+
 def test_the_brake_of_the_post_brakes_in_every_tenth_timestep():
     """mu 0.2 +- 0.1 in 10 % of the timesteps: above 5 % brake in 9.3 %, else in hardly any."""
     model = make_model()
@@ -434,6 +453,18 @@ def test_a_young_training_learns_more_from_each_timestep():
     assert updates.counts == [0, 3, 6, 9, 12, 13]
     assert updates.saved == [1] * 6
     assert (model._n_updates, model.gradient_steps) == (14, 1)
+
+
+def test_a_young_training_that_an_error_ended_leaves_the_steps_of_the_model():
+    model, young = (
+        make_model(gradient_steps=1),
+        GradientStepsCallback(gradient_steps=3, timesteps=8),
+    )
+    with pytest.raises(KeyboardInterrupt):
+        learn(model, 4, young, Raising())
+    assert model.gradient_steps == 3
+    learn(model, 4, young)
+    assert model.gradient_steps == 1
 
 
 @pytest.mark.parametrize("reset", [False, True])

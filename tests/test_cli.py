@@ -781,6 +781,7 @@ def test_an_output_that_takes_no_more_is_told():
         ({"zoo_args": ("-conf", "b.yml")}, "'--conf-file' after -- is refused"),
         ({"zoo_args": ("--save-freq", "5", "-uuid")}, "'--uuid' after -- is refused"),
         ({"zoo_args": ("--hyperparams", "batchsize:8")}, "unknown key 'batchsize'"),
+        ({"zoo_args": ("--hyperparams", "callback:'x.Own'")}, "'callback' after -- is refused"),
         ({"zoo_args": ("--hyperparams", "learning_rate:lin_1")}, "values are Python, e.g."),
         ({"zoo_args": ("--env-kwargs", "trak:'oval'")}, "did you mean 'track'?"),
     ],

@@ -304,6 +304,33 @@ def test_a_training_without_evaluations_is_kept_too(tmp_path):
     assert not (run_folder(tmp_path) / "best_model.zip").exists()
 
 
+def test_ctrl_c_before_the_first_timestep_leaves_no_folder(tmp_path, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(ExperimentManager, "create_callbacks", interrupted)
+    assert main(words_of(tmp_path)) == 130
+    assert list((tmp_path / "logs" / "ddpg").iterdir()) == []
+
+
+def test_the_environments_of_evaluations_are_closed(tmp_path, monkeypatch):
+    made, close = [], DummyVecEnv.close
+    closed = []
+    monkeypatch.setattr(DummyVecEnv, "__init__", noting(made, DummyVecEnv.__init__))
+    monkeypatch.setattr(DummyVecEnv, "close", noting(closed, close))
+    assert main([*words_of(tmp_path), "--eval-freq", "30"]) == 0
+    assert len(made) >= 2
+    assert {id(each) for each in made} == {id(each) for each in closed}
+
+
+def noting(calls, method):
+    def noted(self, *arguments):
+        calls.append(self)
+        return method(self, *arguments)
+
+    return noted
+
+
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Argument ``multivariate``")  # of the zoo's sampler
 def test_the_zoo_may_search_hyperparameters(capsys, tmp_path):

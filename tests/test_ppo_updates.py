@@ -158,6 +158,17 @@ def test_a_model_is_saved_after_ctrl_c(when, callbacks, tmp_path):
         assert PPO.load(tmp_path / "model").lr_schedule(1.0) == model.learning_rate
 
 
+def test_what_ctrl_c_left_behind_decides_no_more_after_an_update():
+    """A fused Adam changes parameters without a trace."""
+    model = make(policy_kwargs={**SMALL, "optimizer_kwargs": {"fused": True}})
+    interrupted(model, "rollout", LeanUpdatesCallback())
+    seen = th.zeros(1, model.observation_space.shape[0])
+    assert model.policy(seen)[1].requires_grad
+    model.learn(80)
+    with th.no_grad():
+        assert model.policy(seen)[1] == model.policy.predict_values(seen)
+
+
 def test_a_training_after_ctrl_c_needs_no_callback():
     model, reference = make(), make()
     for each in (model, reference):

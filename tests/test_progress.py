@@ -81,14 +81,28 @@ def test_lines_come_at_their_interval(oval, monkeypatch):
 
 
 def test_a_lap_of_an_evaluation_counts(oval):
-    metrics = DrivingMetricsCallback()
-    metrics.best_evaluation_lap_time = 55.0
+    class Evaluated(DrivingMetricsCallback):
+        def _on_training_start(self):
+            super()._on_training_start()
+            self.best_evaluation_lap_time = 55.0
+
+    metrics = Evaluated()
     stream = io.StringIO()
     _, progress = learned(
         oval, {"laps": 1, "last_lap_time": 60.0}, stream=stream, callbacks=[metrics]
     )
     assert progress.best_lap_time == 55.0
     assert "best lap 55.00 s" in stream.getvalue()
+
+
+def test_a_second_training_is_counted_anew(oval):
+    metrics = DrivingMetricsCallback()
+    lap = {"laps": 1, "last_lap_time": 60.0}
+    model, progress = learned(oval, lap, OFF, stream=io.StringIO(), callbacks=[metrics])
+    model.learn(64, callback=[progress, metrics], reset_num_timesteps=False)
+    assert (progress.best_lap_time, metrics.best_lap_time) == (60.0, 60.0)
+    model.learn(1, callback=[progress, metrics])
+    assert (progress.best_lap_time, metrics.best_lap_time) == (None, None)
 
 
 def test_ending_twice_does_no_harm(oval):

@@ -158,8 +158,9 @@ def test_a_silent_server_is_told_too():
 
 
 def test_a_host_without_an_address_is_told():
-    with pytest.raises(ServerNotFound, match="no such host:3001 cannot be reached"):
-        ScrClient("no such host", 3001, ANGLES)
+    for host in ("no such host", "b\u00fccher..de"):
+        with pytest.raises(ServerNotFound, match=f"{host}:3001 cannot be reached"):
+            ScrClient(host, 3001, ANGLES)
 
 
 def test_a_server_may_come_later():

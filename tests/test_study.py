@@ -2,6 +2,7 @@
 
 import contextlib
 import csv
+import dataclasses
 import errno
 import json
 import math
@@ -148,6 +149,10 @@ def test_an_agent_that_diverges_before_its_first_evaluation_counts_as_one_withou
     store.begin()
     write_report(tmp_path / "out", tmp_path / "report")
     assert "0 of 1" in (tmp_path / "report" / "report.md").read_text()
+    more = dataclasses.replace(trial, final_tracks=(*trial.final_tracks, "alpine-1"))
+    run_trial(more, store, lambda row: None)
+    assert store.ended(more)
+    assert results(tmp_path / "out")[-1]["end"] == "diverged"
 
 
 def test_the_table_shows_how_far_everybody_is_and_the_best_so_far(begun, monkeypatch, capsys):

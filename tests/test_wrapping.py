@@ -20,7 +20,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNorm
 import sb3_torcs  # noqa: F401  (registers the environments)
 from sb3_torcs.agents import remote as driving
 from sb3_torcs.agents.models import ModelDriver, load_driver
-from sb3_torcs.agents.wrapping import wrapped
+from sb3_torcs.agents.wrapping import normalizes, wrapped
 from sb3_torcs.cli import main
 from sb3_torcs.errors import ModelMismatch, ModelNotTrusted, PackageMissing
 from sb3_torcs.evaluation.protocol import evaluate
@@ -190,6 +190,13 @@ def test_a_model_that_would_see_something_else_is_refused(tmp_path, entry, says)
         (tmp_path / "args.yml").write_text(yaml.safe_dump({"algo": "ppo", "env": "TorcsLite-v0"}))
         with pytest.raises(ModelMismatch, match=says):
             load_driver(tmp_path / "m.zip", env)
+
+
+def test_what_normalizes_may_be_written_as_python():
+    for said in (True, {"norm_obs": True}, "True", "dict(norm_reward=False)", "{'norm_obs': True}"):
+        assert normalizes(said)
+    for said in (None, False, {"norm_obs": False}, "False", "dict(norm_obs=False)"):
+        assert not normalizes(said)
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ they belong to the driver (:class:`sb3_torcs.agents.models.ModelDriver`).
 from __future__ import annotations
 
 import importlib
+import re
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -112,8 +113,10 @@ def normalizes(normalize: Any) -> bool:
     """
     Read whether a training has normalized observations.
 
-    :param normalize: of its hyperparameters; a string is the zoo's to evaluate
+    :param normalize: of its hyperparameters; a string is Python that the zoo evaluates
     """
+    if isinstance(normalize, str):
+        return normalize != "False" and not re.search(r"norm_obs\W+False", normalize)
     if isinstance(normalize, Mapping):
         return bool(normalize and normalize.get("norm_obs", True))
     return normalize is True

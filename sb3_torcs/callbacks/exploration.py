@@ -79,6 +79,7 @@ class NoiseCallback(BaseCallback):
             self.model.action_noise = noise if n_envs == 1 else VectorizedActionNoise(noise, n_envs)
         for noise in bind(self.model):
             noise.parameters = self.parameters
+            noise.stochastic_brake = None  # of a training that an error has ended
             if isinstance(noise, OUNoise):
                 noise.dt = self.dt
 

@@ -121,8 +121,9 @@ class WhileLearning(BaseCallback):
         self._end()  # off-policy algorithms do not learn before `learning_starts`
 
     def _on_rollout_end(self) -> None:
-        model: Any = self.model
-        training = vars(model).get("train") or _Training(model)
+        training = vars(self.model).get("train")
+        if not isinstance(training, _Training):
+            training = _Training(self.model)
         training.callbacks.append(self)
 
     def _on_training_end(self) -> None:
@@ -159,6 +160,7 @@ class GradientStepsCallback(WhileLearning):
                 f"{type(self).__name__} sets the gradient steps of off-policy algorithms, but the "
                 f"model learns by {type(self.model).__name__}; take it out of the callbacks"
             )
+        end_changes(self.model)  # of a training that an error has ended
         self._algorithm, self._own = self.model, self.model.gradient_steps
 
     def _on_rollout_end(self) -> None:

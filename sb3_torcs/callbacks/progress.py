@@ -69,20 +69,26 @@ class RacingProgressCallback(BaseCallback):
         if not is_number(every) or every <= 0.0:
             raise InvalidOption(f"every is {every!r} s; expected more than 0")
         self.every = every
+        self._stream = stream
+        self._display: Display | None = None
+        self._ended = True  # has not begun
+        self._forget()
+
+    def _forget(self) -> None:
+        """Begin to count anew."""
         self.episodes = 0
         self.distance: float | None = None  # [m] of the last episode
         self.best_lap_time: float | None = None  # [s]
-        self._stream = stream
-        self._display: Display | None = None
         self._distances: list[float] = []  # [m] of the evaluations
         self._lap_times: list[float | None] = []  # [s]
         self._lap_length = 0.0  # [m]
-        self._ended = True  # has not begun
 
     def _on_training_start(self) -> None:
         stream: Any = Unbroken(self._stream or sys.stderr)
         self._out = stream
         self._ended = False
+        if self.model.num_timesteps == 0:  # a training of its own
+            self._forget()
         self._total = int(self.locals["total_timesteps"])
         self._first = self.model.num_timesteps
         self._started = self._spoken = time.monotonic()

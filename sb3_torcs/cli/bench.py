@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from typing import Any
 
@@ -78,8 +79,8 @@ def run(args: argparse.Namespace) -> int:
     from sb3_torcs.bench.stages import KEYS, stages
     from sb3_torcs.errors import InvalidOption
 
-    if not args.seconds > 0.0:
-        raise InvalidOption(f"--seconds is {args.seconds:g}; expected more than 0")
+    if not 0.0 < args.seconds < math.inf:
+        raise InvalidOption(f"--seconds is {args.seconds:g}; expected more than 0, e.g. 30")
     figures: dict[str, float | None] = dict.fromkeys(KEYS)
     measurements = stages(args.seconds)
     with (

@@ -45,15 +45,16 @@ class Probe(NamedTuple):
     speedup: float  # [-] time of the default kernel divided by the time of the other
 
 
-def enable(batch_size: int = 64, units: tuple[int, int] = (300, 600)) -> Probe:
+def enable(batch_size: int = 64) -> Probe:
     """
     Select the other kernel for this process if it is accurate and faster, else change nothing.
 
-    :param batch_size: rows of the products that matter
-    :param units: their other two sizes
+    That is measured with products of the post's networks.
+
+    :param batch_size: their rows
     :return: what was found; ``ok`` says whether the setting is now on
     """
-    found = probe(batch_size, units)
+    found = probe(batch_size)
     if found.ok:
         _matmul().fp32_precision = "bf16"
     return found

@@ -285,17 +285,24 @@ class LeanForward:
     """
     Replaces a policy's ``forward`` during a rollout; copies of the policy have their own.
 
+    An error or Ctrl-C may leave it behind. So it lets the policy itself decide after another
+    update, and where PyTorch records operations.
+
     :param lean: that decides
     """
 
     def __init__(self, lean: LeanPPO) -> None:
         self._lean = lean
+        self._updates = lean.model._n_updates
 
     def __call__(
         self, obs: th.Tensor, deterministic: bool = False
     ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         """Decide; see :meth:`LeanPPO.forward`."""
-        return self._lean.forward(obs, deterministic)
+        lean = self._lean
+        if lean.model._n_updates != self._updates or th.is_grad_enabled():
+            return type(lean.policy).forward(lean.policy, obs, deterministic)
+        return lean.forward(obs, deterministic)
 
     def __reduce__(self) -> tuple[Any, ...]:
         policy = self._lean.policy

@@ -103,7 +103,7 @@ class ScrClient:
         try:
             # A connected socket receives from this server only, and reports a closed port.
             self._socket.connect((host, port))
-        except (OSError, OverflowError) as error:
+        except (OSError, OverflowError, TypeError, UnicodeError) as error:  # of no name of a host
             self.close()
             raise ServerNotFound(
                 f"{self.address} cannot be reached ({error}); check --host and --port"
@@ -225,8 +225,8 @@ class ScrClient:
         :return: ``None`` if there was none
         """
         if pause != self._timeout:
-            seconds = max(int(pause * 1e6), 1)
-            times = struct.pack("ll", seconds // 1_000_000, seconds % 1_000_000)
+            microseconds = max(int(pause * 1e6), 1)
+            times = struct.pack("ll", *divmod(microseconds, 1_000_000))
             # Python's own time-out takes one more system call for each datagram.
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, times)
             self._timeout = pause

@@ -47,13 +47,14 @@ def open_ports(
             if not 0 <= wanted <= LAST_PORT:
                 raise OSError(errno.EINVAL, f"ports end at {LAST_PORT}")
             bound.bind((host, wanted))
-        except OSError as error:
+        except (OSError, TypeError, UnicodeError) as error:  # the last two of no name of a host
             for opened in sockets:
                 opened.close()
-            taken = error.errno == errno.EADDRINUSE
+            why = getattr(error, "strerror", None) or error
+            taken = getattr(error, "errno", None) == errno.EADDRINUSE
             remedy = "end the program that has it, or choose another" if taken else "choose another"
             raise PortTaken(
-                f"UDP port {wanted} at {host} cannot be had ({error.strerror or error}); {remedy} "
+                f"UDP port {wanted} at {host} cannot be had ({why}); {remedy} "
                 "with --port, or another address with --host"
             ) from error
     return sockets

@@ -205,6 +205,11 @@ def _ray(
     """Start Ray or join a cluster, with a folder for temporary files, and clean up."""
     import ray
 
+    if ray.is_initialized():
+        raise RayUnavailable(
+            "this process uses Ray already, and a study starts its own; call ray.shutdown() first, "
+            "or run the study in another process"
+        )
     session = store.path / SESSION
     scratch = Path(tempfile.mkdtemp(prefix=SCRATCH))
     enough = threading.Timer(GRACE, _end_by_force, (scratch, session))

@@ -7,6 +7,7 @@ is never killed. So a slice depends on nothing but the checkpoint before it.
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import tempfile
@@ -17,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecNormalize
@@ -31,6 +31,7 @@ from sb3_torcs.callbacks.tree import KeepsArrays, callbacks_in
 from sb3_torcs.errors import StudyError
 from sb3_torcs.evaluation.ladder import rung
 from sb3_torcs.evaluation.protocol import Episode, Merit, evaluate, merit, race_environment
+from sb3_torcs.policies.threads import one_thread
 from sb3_torcs.studies.config import FIELDS, Trial, track_name
 from sb3_torcs.studies.storage import DIVERGED
 from sb3_torcs.training.keeping import check_healthy
@@ -42,6 +43,7 @@ Row = dict[str, Any]
 
 LAST_MODEL, REPLAY, STATE = "last_model.zip", "replay.npz", "state.json"
 LAST_STATISTICS = "statistics.pkl"
+NOTHING_DRIVEN = Episode(0, [], 0.0, DIVERGED, 0.0, 0.0)  # by an agent that was never evaluated
 
 
 class Training:
@@ -54,7 +56,6 @@ class Training:
     """
 
     def __init__(self, trial: Trial, checkpoint: Path | None = None) -> None:
-        th.set_num_threads(1)  # trials run side by side: more threads of torch would slow them down
         self.trial = trial
         self.rows: list[Row] = []
         self.episodes = 0  # that have ended, in all training environments together
@@ -86,6 +87,7 @@ class Training:
         found: VecNormalize | None = self.model.get_vec_normalize_env()
         return found
 
+    @one_thread()
     def run(self, after_slice: Callable[[], None]) -> None:
         """
         Learn to the end of the budget.
@@ -152,11 +154,10 @@ class Training:
 
     def rows_of_nothing(self) -> list[Row]:
         """Return the rows of an agent that has diverged before its first evaluation."""
-        trial, race = self.trial, Episode(0, [], 0.0, DIVERGED, 0.0, 0.0)
-        progress = {**self._progress(), "kept": True}
+        trial, progress = self.trial, {**self._progress(), "kept": True}
         phases = [("train", track) for track in trial.eval_tracks]
         phases += [("final", track) for track in trial.final_tracks]
-        return [_row(trial, phase, track, race, progress) for phase, track in phases]
+        return [_row(trial, phase, track, NOTHING_DRIVEN, progress) for phase, track in phases]
 
     def save(self, folder: Path) -> None:
         """
@@ -281,21 +282,22 @@ class _Slices(BaseCallback):
         self.after_slice()
 
 
+@one_thread()
 def final_row(trial: Trial, model: Path, track: str, progress: Row) -> Row:
     """
     Measure a trial's best model on one track, in a fresh evaluation.
 
     :param trial: whose model it is
-    :param model: the file, its records beside it
+    :param model: the file, its records beside it; there is none of an agent that has diverged
+        before its first evaluation
     :param track: to drive on
     :param progress: the row of the evaluation that the model was kept for
     :return: a row of the results
     """
-    env = _race_environment(trial, track)
-    try:
-        (race,) = evaluate(env, load_driver(model, env, trial.algo))
-    finally:
-        env.close()
+    race = NOTHING_DRIVEN
+    if progress["end"] != DIVERGED:
+        with contextlib.closing(_race_environment(trial, track)) as env:
+            (race,) = evaluate(env, load_driver(model, env, trial.algo))
     kept_at = {name: progress[name] for name in ("decisions", "episodes", "wall_s", "cpu_s")}
     return _row(trial, "final", track, race, {**kept_at, "kept": True})
 

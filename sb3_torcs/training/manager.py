@@ -76,7 +76,7 @@ def build(algo: str, env_id: str, entry: Mapping[str, Any], *, seed: int = 0) ->
     """
     said = argparse.Namespace(algo=algo, env=env_id, seed=seed)
     with tempfile.TemporaryDirectory() as scratch, contextlib.redirect_stdout(io.StringIO()):
-        manager = _Threaded(
+        manager = _EntryManager(
             said, algo, env_id, scratch, eval_freq=-1, seed=seed, verbose=0, device="cpu",
             entry=entry,
         )  # fmt: skip
@@ -120,8 +120,12 @@ def train(
     names = {**vars(rl_zoo3.train), "ExperimentManager": manager}
     names["argparse"] = types.SimpleNamespace(ArgumentParser=_parser_of([*first, *words]))
     zoo_train = types.FunctionType(rl_zoo3.train.train.__code__, names)
-    with _command_as_text():
-        zoo_train()
+    try:
+        with _command_as_text():
+            zoo_train()
+    finally:
+        for made in managers:  # the zoo leaves those of evaluations open
+            made.close_envs()
 
 
 def _parser_of(words: list[str]) -> type[argparse.ArgumentParser]:
@@ -137,9 +141,12 @@ def _parser_of(words: list[str]) -> type[argparse.ArgumentParser]:
     return Parser
 
 
-class _Threaded(ExperimentManager):
+class _EntryManager(ExperimentManager):
     """
-    The zoo's manager of an entry, which lets several cars of a training drive on threads.
+    The zoo's manager of an entry.
+
+    It lets several cars of a training drive on threads, or in processes that Ctrl-C cannot hang,
+    and resumes a training with the statistics of its model.
 
     :param arguments: of the zoo's own
     :param entry: of a hyperparameter file
@@ -216,7 +223,7 @@ class _Threaded(ExperimentManager):
         return self.env_name.gym_id in OURS and self.env_wrapper is None and world == "native"
 
 
-class Manager(_Threaded):
+class Manager(_EntryManager):
     """
     The zoo's manager of one training. It saves the model at each evaluation.
 
@@ -229,8 +236,8 @@ class Manager(_Threaded):
     """Signals so far; with one of them the training ends."""
 
     def __init__(self, *arguments: Any, **keywords: Any) -> None:
-        log_folder = arguments[3]
-        with _alone(Path(log_folder) / arguments[1]):
+        _, algo, _, log_folder, *_ = arguments
+        with _alone(Path(log_folder) / algo):
             # The zoo numbers a run by the folders that exist. Two runs that begin at the same time
             # would write into one folder.
             super().__init__(*arguments, **keywords)
@@ -253,9 +260,10 @@ class Manager(_Threaded):
         """
         try:
             return super().setup_experiment()
-        except (AssertionError, NotImplementedError, TypeError, ValueError) as error:
+        except BaseException as error:  # Ctrl-C, too
             self._leave_nothing()
-            if isinstance(error, Sb3TorcsError):
+            refused = AssertionError, NotImplementedError, TypeError, ValueError
+            if isinstance(error, Sb3TorcsError) or not isinstance(error, refused):
                 raise
             why = " ".join(str(error).split())
             raise ZooConfigError(

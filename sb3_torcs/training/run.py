@@ -229,6 +229,12 @@ def _changes(zoo_args: Sequence[str]) -> dict[str, Any]:
             )
     if known.n_eval_envs < 1:
         raise InvalidOption(f"--n-eval-envs is {known.n_eval_envs}; expected at least 1")
+    for key in ("callback", "env_wrapper"):
+        if key in known.hyperparams:  # the zoo would drop ours, such as the progress bar
+            raise InvalidOption(
+                f"'{key}' after -- is refused; write it into a hyperparameter file, and give that "
+                "with --conf-file"
+            )
     if known.env_kwargs is None:
         return dict(known.hyperparams)
     return {**known.hyperparams, "env_kwargs": known.env_kwargs}

@@ -157,7 +157,7 @@ def _is_budget(value: Any) -> bool:
 
 def _is_schedule(value: Any) -> bool:
     if isinstance(value, str):
-        return bool(re.fullmatch(r"lin_[\d.]+(e[+-]?\d+)?", value))
+        return bool(re.fullmatch(f"lin_{NUMBER}", value))
     return value is None or (is_number(value) and value >= 0.0)
 
 
@@ -175,7 +175,8 @@ def _is_share(value: Any) -> bool:
     return is_number(value) and 0.0 <= value <= 1.0
 
 
-AUTO = r"auto(_\d+(\.\d*)?(e[+-]?\d+)?)?"
+NUMBER = r"(\d+\.?\d*|\.\d+)(e[+-]?\d+)?"  # in texts that SB3 or the zoo read
+AUTO = f"auto(_{NUMBER})?"
 """Lets SAC and its like learn the weight of the entropy, from the value that follows."""
 
 NOISE_TYPES = ("normal", "ornstein-uhlenbeck")
