@@ -54,6 +54,7 @@ __all__ = [
     "WorkerLost",
     "ZooConfigError",
     "ends_in_a_line",
+    "keywords_of",
     "near_miss",
     "renamed",
     "unknown_argument",
@@ -259,7 +260,7 @@ def with_known_arguments(init: Function) -> Function:
 
     :param init: that takes keyword arguments
     """
-    known = inspect.signature(init).parameters
+    known = keywords_of(init)
     owner = init.__qualname__.partition(".")[0]  # also for a class that is made from it
 
     @functools.wraps(init)
@@ -270,6 +271,16 @@ def with_known_arguments(init: Function) -> Function:
         init(self, *positional, **arguments)
 
     return cast("Function", checked)
+
+
+def keywords_of(function: Callable[..., Any]) -> list[str]:
+    """
+    List the arguments that a function takes by name, but for those that it only passes on.
+
+    :param function: or a class, for its constructor
+    """
+    parameters = inspect.signature(function).parameters.values()
+    return [each.name for each in parameters if each.kind is not each.VAR_KEYWORD]
 
 
 def unknown_argument(owner: str, name: str, known: Iterable[str]) -> TypeError:

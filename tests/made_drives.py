@@ -29,7 +29,8 @@ def drive(log, road, driver="ana", *, speed=lambda place: 20.0, laps=2, brake=la
             over = raced % road.length / now
             last, lap_begin, done = time - over - lap_begin, time - over, done + 1
         car = car_state(
-            time=time, speed_x=now, distance_from_start=raced % road.length, distance_raced=raced,
+            time=time, speed_x=now if time > CONTROL_TICK else 0.0,
+            distance_from_start=raced % road.length, distance_raced=raced,
             laps=done, lap_time=time - lap_begin, last_lap_time=last,
             wheel_speeds=np.full(4, now / 0.3),
         )  # fmt: skip

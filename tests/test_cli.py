@@ -705,6 +705,17 @@ def test_an_episode_is_driven_again_exactly(recorded):
     env.close()
 
 
+def test_an_episode_is_driven_again_from_its_own_seed_and_start():
+    recorder = recording.Recorder("TorcsLite-v0", {"track": "aalborg", "start": "random"}, 100)
+    begun = [{"seed": 1}, {"seed": 2}, {"options": {"distance": 500.0}}, {}]
+    firsts = [recorder.reset(**each)[1]["car"].x for each in begun]
+    for episode, x in enumerate(firsts):
+        env = recorder._again(episode)
+        assert env.unwrapped.car.x == x
+        env.close()
+    recorder.close()
+
+
 def test_a_video_shows_the_drive_with_its_aids_and_delay(monkeypatch):
     """An aid steps in at the beginning of a timestep, and not between."""
     kwargs = {"track": "g-track-1", "unstick": True, "recovery": 20.0, "runoff": 5.0, "delay": 3}

@@ -11,11 +11,12 @@ from conftest import segment
 from made_drives import drive, log_of
 
 from sb3_torcs.errors import DriveFileError
+from sb3_torcs.evaluation.comparing import _told_apart
 from sb3_torcs.telemetry import DriveLog
 from sb3_torcs.telemetry.comparison import compare_drives
 from sb3_torcs.telemetry.corners import Corner, corners_of, stretches
 from sb3_torcs.telemetry.laps import drives_of, grid_of, sample
-from sb3_torcs.telemetry.page import lap_report, missing, summary
+from sb3_torcs.telemetry.page import _signed, lap_report, missing, summary
 from sb3_torcs.tracks.catalogue import load_track
 from sb3_torcs.tracks.track import Track
 
@@ -130,6 +131,25 @@ def test_a_lap_from_the_grid_begins_behind_the_line(oval):
     sampled = sample(whole.laps[0], grid_of(oval))
     assert sampled.time[0] == pytest.approx(5.0, abs=0.05)  # 100 m at 20 m/s
     assert (np.diff(sampled.time) >= 0.0).all()
+
+
+def test_a_start_on_the_line_at_speed_is_no_start_from_the_grid(oval):
+    frame = log_of(oval, ("ana", 20.0)).frame()
+    (standing,) = drives_of(frame)
+    assert standing.laps[0].standing
+    frame.loc[:0, "speed_x"] = 20.0
+    (rolling,) = drives_of(frame)
+    assert not rolling.laps[0].standing
+
+
+def test_drivers_of_one_name_are_numbered(oval):
+    (one,) = drives_of(log_of(oval, ("a", 20.0)).frame())
+    drives = [dataclasses.replace(one, driver=name) for name in ("a", "a (2)", "a")]
+    assert [each.driver for each in _told_apart(drives)] == ["a", "a (2)", "a (3)"]
+
+
+def test_a_difference_that_is_none_has_no_sign():
+    assert [_signed(each) for each in (-0.0001, 0.02, -0.02)] == ["±0.000", "+0.020", "−0.020"]
 
 
 def test_nobody_with_a_whole_lap_is_an_error(oval):

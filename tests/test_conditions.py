@@ -198,6 +198,8 @@ def test_conditions_end_with_their_episode(env_id, options):
         grips.append(env.unwrapped.conditions.grip)
     assert drives[0] == drives[2] != drives[1]
     assert grips[0] == grips[2] != grips[1]
+    env.unwrapped.set_conditions({"delay": 2})  # from the next episode on
+    assert env.unwrapped.conditions.grip == grips[2]
     env.close()
 
 

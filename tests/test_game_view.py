@@ -348,7 +348,9 @@ def test_what_cannot_be_drawn_is_refused_at_once(options, message):
         make(**options)
 
 
-@pytest.mark.parametrize("size", [(640,), 640, ("a", "b"), (640.5, 480), (10, 480), (640, 10000)])
+@pytest.mark.parametrize(
+    "size", [(640,), 640, ("a", "b"), (640.5, 480), (10, 480), (640, 10000), [(1, 2), 3]]
+)
 def test_sizes_that_cannot_be_drawn_are_refused_at_once(size):
     with pytest.raises(InvalidOption, match="size is"):
         make(render_size=size)

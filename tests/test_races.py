@@ -166,6 +166,13 @@ def test_a_driver_that_cannot_take_part(drivers, message, game):
         find_entrants(drivers, game)
 
 
+def test_races_that_cannot_be_held_are_refused_at_once(game):
+    entrants = find_entrants(["bt", "inferno"], game)
+    for wrong in ({"races": 0}, {"races": 1, "grid": "x"}, {"races": 1, "field_size": 3}):
+        with pytest.raises(InvalidOption):
+            run_races(entrants, lambda order, seed: None, **wrong)
+
+
 def test_models_of_one_file_name_are_told_apart_by_their_folders(game, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     shipped = find_model("ddpg-roads").read_bytes()

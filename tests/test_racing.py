@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -321,6 +322,24 @@ def test_after_a_reset_that_failed_there_is_no_step(oval, monkeypatch):
         env.reset(options={"distance": 10.0})
     with pytest.raises(EnvClosed, match="call reset first"):
         env.step(GAS)
+
+
+def test_a_wrong_option_of_a_reset_leaves_the_episode_as_it_is(oval):
+    env = RacingEnv(ScriptedBackend(oval))
+    env.reset(seed=0)
+    before = env.np_random.bit_generator.state
+    with pytest.raises(InvalidOption, match="unknown reset option 'speeed'"):
+        env.reset(seed=1, options={"speeed": 1.0})
+    assert env.np_random.bit_generator.state == before
+    env.step(GAS)
+
+
+def test_a_window_that_fails_to_close_does_not_keep_the_world_open(oval):
+    env = RacingEnv(ScriptedBackend(oval))
+    env._viewer = SimpleNamespace(close=lambda: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        env.close()
+    assert env.backend.closed == 1
 
 
 def test_a_timestep_after_the_end_warns_once(oval):

@@ -187,7 +187,7 @@ def test_evaluations_drive_one_car_of_several(tmp_path, monkeypatch):
     )
     wanted = trial(tmp_path, {"env_kwargs": {"car": cars}}, env="Torcs-v0")
     with pytest.raises(ZeroDivisionError):
-        final_row(wanted, tmp_path / "best_model.zip", "aalborg", {})
+        final_row(wanted, tmp_path / "best_model.zip", "aalborg", {"end": "laps"})
     race = Episode(1, [80.0], 2587.5, "laps", 0.0, 0.0)
     assert built == ["car1-trb1"]
     times = dict.fromkeys(("decisions", "episodes", "wall_s", "cpu_s", "kept"))

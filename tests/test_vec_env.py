@@ -628,6 +628,17 @@ def test_an_interrupt_between_two_episodes_waits(env_id, make, monkeypatch, meth
     assert not envs.step(np.stack([GAS] * 3))[2].any()
 
 
+def test_a_race_that_fails_to_close_does_not_keep_the_others_open():
+    cars = TorcsVecEnv(2, env_id=LITE, threads=1)
+    cars.reset()
+    first, second = (env.unwrapped for env in cars._envs)
+    first.backend.close = lambda: 1 / 0
+    with pytest.raises(ZeroDivisionError):
+        cars.close()
+    assert second._closed
+    cars.close()
+
+
 def test_before_a_reset_and_after_close_there_is_no_step(env_id, make):
     envs = make(2, env_id=env_id)
     with pytest.raises(EnvClosed, match="step before reset; call reset first"):

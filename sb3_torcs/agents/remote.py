@@ -40,7 +40,8 @@ class Agent:
     ) -> None:
         bare = gym.make("sb3_torcs:Torcs-v0", backend="scr", max_episode_steps=-1, **settings)
         self.env = wrapped(bare, driver_record(model).hyperparameters, trust=trust)
-        self.env.unwrapped.warns_after_end = False  # it drives on beside the road, too
+        racing: Any = self.env.unwrapped
+        racing.warns_after_end = False  # it drives on beside the road, too
         self.driver = load_driver(model, self.env, algo, trust)
         self.backend.driver_name = name
         track = lasting_name(self.backend.track)

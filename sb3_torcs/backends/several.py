@@ -213,6 +213,8 @@ class Turn(Generic[World]):
         self.__dict__.update(state)
         self.pool = WorldPool(state["pool"])
         self.pool.join()
+        if self._closed:  # so is the copy
+            self.pool.leave()
 
 
 class Drawn(ABC):

@@ -79,6 +79,7 @@ class Conditions:
                 )
         changed = Conditions(**{**self.choice, **choice})
         changed._tells |= self._tells  # a world keeps what it was told last
+        changed.grip, changed.mass = self.grip, self.mass  # of the present episode
         return changed
 
     def check(self, world: Any) -> None:

@@ -265,19 +265,23 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         """
         if self._closed:
             raise EnvClosed("reset after close; make a new environment")
+        is_given = options is not None and not (isinstance(options, Mapping) and not options)
+        if is_given:
+            read_start(options, self.track.length)  # a wrong one leaves the episode as it is
         super().reset(seed=seed)
         self.car = None  # if the reset fails, no step is possible
         if self._draw_track is not None:
             self._draw_track(self.np_random)
-        if options is None or (isinstance(options, Mapping) and not options):
-            start, is_drawn = self._starts.draw(self.np_random, self.track), True
-        else:
-            start, is_drawn = read_start(options, self.track.length), False
+        start = (
+            read_start(options, self.track.length)
+            if is_given
+            else self._starts.draw(self.np_random, self.track)
+        )
         self.delay = self.conditions.draw(self.np_random, self.backend, self.action_repeat)
         try:
             self.car = self.backend.reset(self.np_random, start)
         except StartBlocked:
-            if start is None or not is_drawn:
+            if start is None or is_given:
                 raise
             # A wall stands where a start was drawn: rare, but a training draws thousands.
             start = None
@@ -424,9 +428,11 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         if self._closed:
             return
         self._closed = True
-        if self._viewer is not None:
-            self._viewer.close()
-        self.backend.close()
+        try:
+            if self._viewer is not None:
+                self._viewer.close()
+        finally:
+            self.backend.close()
 
     def arrive(self, car: CarState, controls: Controls, standing: int, patience: int) -> None:
         """

@@ -336,7 +336,8 @@ def _window(size: Any, view: Any, boards: Any, picture: str) -> Window:
     :return: the window that the game would show
     :raises InvalidOption: if the game cannot draw this, or another picture is chosen
     """
-    if isinstance(size, str) or np.shape(size) != (2,) or not all(map(is_count, size)):
+    is_pair = isinstance(size, (list, tuple, np.ndarray)) and len(size) == 2
+    if not is_pair or not all(map(is_count, size)):
         raise InvalidOption(
             f"render_size is {size!r}; expected width and height in pixels, e.g. (640, 480)"
         )

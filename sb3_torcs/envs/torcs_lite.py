@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from inspect import signature
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,7 +12,7 @@ from sb3_torcs.backends.lite.backend import LiteBackend
 from sb3_torcs.backends.several import one_or_several
 from sb3_torcs.car import DEFAULT_CAR, RangeFinderName, StartName
 from sb3_torcs.envs.racing import RacingEnv, RenderMode
-from sb3_torcs.errors import InvalidOption, unknown_argument
+from sb3_torcs.errors import InvalidOption, keywords_of, unknown_argument
 from sb3_torcs.rewards import RewardChoice
 from sb3_torcs.sensors import SensorsName
 from sb3_torcs.tracks.track import Track
@@ -168,7 +167,7 @@ def _refuse(options: Mapping[str, Any]) -> None:
     """
     for name, value in options.items():
         if name not in OF_THE_GAME:
-            raise unknown_argument("TorcsLiteEnv", name, signature(TorcsLiteEnv).parameters)
+            raise unknown_argument("TorcsLiteEnv", name, keywords_of(TorcsLiteEnv))
         raise InvalidOption(
             f"{name} is {value!r}, which needs the installed game, so it is for Torcs-v0; leave it "
             "out for TorcsLite-v0"

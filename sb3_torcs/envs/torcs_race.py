@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import itertools
 from collections.abc import Sequence
 from functools import partial
@@ -24,7 +23,7 @@ from sb3_torcs.car import (
     range_finder_angles,
 )
 from sb3_torcs.envs.racing import RacingEnv
-from sb3_torcs.errors import InvalidOption, near_miss
+from sb3_torcs.errors import InvalidOption, keywords_of, near_miss
 from sb3_torcs.torcs.drivers import crew_of
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.starting_list import guests_of, starting_list
@@ -157,10 +156,10 @@ def _of_several_agents(options: dict[str, Any]) -> dict[str, Any]:
     :return: those of :class:`~sb3_torcs.envs.racing.RacingEnv`
     :raises TypeError: if there is no such option
     """
-    known = {*inspect.signature(RacingEnv).parameters, *OF_ONE_AGENT}
+    known = {*keywords_of(RacingEnv), *OF_ONE_AGENT}
     for name in options:
         if name not in known:
-            every = known.union(inspect.signature(make_race).parameters)
+            every = known.union(keywords_of(make_race))
             raise TypeError(f"a race has no option '{name}'{near_miss(name, sorted(every))}")
     for name, usual in OF_ONE_AGENT.items():
         given = options.get(name, usual)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -15,7 +14,7 @@ from typing import TYPE_CHECKING
 from sb3_torcs.agents.models import agent_record, driver_name, load_driver, one_of
 from sb3_torcs.agents.robots import drive_log
 from sb3_torcs.agents.rollout import drive
-from sb3_torcs.car import check_count, checked_laps
+from sb3_torcs.car import MANY_LAPS, check_count
 from sb3_torcs.errors import BackendUnavailable, DriveFileError, InvalidOption
 from sb3_torcs.evaluation.protocol import RACE_LAPS, choose_world, race_environment
 from sb3_torcs.evaluation.ticks import log_drives
@@ -90,8 +89,7 @@ def compare(
     :raises InvalidOption: if there is no such driver, or a drive is of another track
     :raises DriveFileError: if a file cannot be read, or nobody drives a whole lap
     """
-    check_count("laps", laps)
-    checked_laps(laps)
+    check_count("laps", laps, MANY_LAPS)
     if not drivers:
         raise InvalidOption("there is nobody to compare; name drivers, e.g. ddpg-aalborg inferno")
     for driver in drivers:
@@ -243,10 +241,11 @@ def _ready(
 
 def _told_apart(drives: Sequence[Drive]) -> list[Drive]:
     """Number drivers of one name."""
-    seen: Counter[str] = Counter()
-    told = []
+    told: dict[str, Drive] = {}
     for one in drives:
-        seen[one.driver] += 1
-        count = seen[one.driver]
-        told.append(one if count == 1 else replace(one, driver=f"{one.driver} ({count})"))
-    return told
+        name, count = one.driver, 1
+        while name in told:
+            count += 1
+            name = f"{one.driver} ({count})"
+        told[name] = replace(one, driver=name)
+    return [*told.values()]

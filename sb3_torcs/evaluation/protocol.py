@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from inspect import signature
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -17,7 +16,7 @@ import gymnasium as gym
 from sb3_torcs.agents.rollout import Driver, Timestep, drive
 from sb3_torcs.agents.saved.record import DRIVEN_WITH
 from sb3_torcs.car import CONTROL_TICK, MANY_LAPS, check_count
-from sb3_torcs.errors import InvalidOption, near_miss
+from sb3_torcs.errors import BackendUnavailable, InvalidOption, keywords_of, near_miss
 from sb3_torcs.torcs.track_names import RANDOM_TRACK, kind_without_game
 
 __all__ = [
@@ -116,7 +115,6 @@ def choose_world(driver: str, trained_on: str | None, track: Any = None) -> Worl
     :return: the environment
     """
     from sb3_torcs.backends.native import check_layout
-    from sb3_torcs.errors import BackendUnavailable
     from sb3_torcs.torcs.installation import find_game
 
     if trained_on is not None:
@@ -205,7 +203,7 @@ def _check_names(env_kwargs: Mapping[str, Any], env_id: str) -> None:
         return  # somebody's own, whose arguments are not known here
     known = {"max_episode_steps", "flagged"}  # of gym.make, and of races of several agents
     for kind in (TorcsEnv, TorcsLiteEnv):  # a record of one may be driven in the other
-        known.update(signature(kind).parameters)
+        known.update(keywords_of(kind))
     for name in env_kwargs:
         if name not in known:
             raise InvalidOption(

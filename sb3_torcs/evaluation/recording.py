@@ -76,7 +76,7 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
         self._tracks: list[Track] = []  # of the episodes
         self._kwargs = kwargs
         self._limit = max_episode_steps
-        self._seed: int | None = None
+        self._resets: list[dict[str, Any]] = []  # what began the episodes
         super().__init__(gym.make(env_id, max_episode_steps=max_episode_steps, **kwargs))
 
     def reset(
@@ -89,9 +89,9 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
         :param options: of the environment
         :return: observation and info
         """
-        self._seed = seed if seed is not None else self._seed
-        self.episodes.append([])
         begun = self.env.reset(seed=seed, options=options)
+        self.episodes.append([])
+        self._resets.append({"seed": seed, "options": options})
         self._tracks.append(self.get_wrapper_attr("backend").track)
         return begun
 
@@ -183,7 +183,6 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
         """Build the environment anew with pictures, at the beginning of an episode."""
         kwargs = {**self._kwargs, "render_mode": "rgb_array"}
         env = gym.make(self.env_id, max_episode_steps=self._limit + 1, **kwargs)
-        env.reset(seed=self._seed)
-        for _ in range(episode):  # each reset draws from the same generator
-            env.reset()
+        for begun in self._resets[: episode + 1]:  # each reset draws from the same generator
+            env.reset(**begun)
         return env

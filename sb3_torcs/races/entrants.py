@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -32,7 +32,7 @@ class Entrant:
     agent: CarOfAnAgent | None = None
 
 
-def find_entrants(drivers: Sequence[str], game: Game, aids: Iterable[str] = ()) -> list[Entrant]:
+def find_entrants(drivers: Sequence[str], game: Game, aids: Sequence[str] = ()) -> list[Entrant]:
     """
     Find drivers by their names.
 
@@ -50,7 +50,7 @@ def find_entrants(drivers: Sequence[str], game: Game, aids: Iterable[str] = ()) 
     return _told_apart(entrants)
 
 
-def _find(driver: str, game: Game, aids: Iterable[str]) -> Entrant:
+def _find(driver: str, game: Game, aids: Sequence[str]) -> Entrant:
     if not game.has_robot(driver):
         return Entrant(driver_name(driver), agent=CarOfAnAgent(driver, aids))
     robot = name, index = game.parse_robot(driver)

@@ -11,7 +11,14 @@ import numpy as np
 from sb3_torcs.agents.pilots import Pilots
 from sb3_torcs.backends.native import load_race
 from sb3_torcs.backends.seats import SeatWorld, SharedRace
-from sb3_torcs.car import CONTROL_TICK, Controls, FloatArray, checked_choice, checked_laps
+from sb3_torcs.car import (
+    CONTROL_TICK,
+    Controls,
+    FloatArray,
+    check_count,
+    checked_choice,
+    checked_laps,
+)
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.races.entrants import Entrant
 from sb3_torcs.telemetry import DriveLabel, DriveLog
@@ -140,18 +147,23 @@ def run_races(
     :raises InvalidOption: if no such races can be held
     """
     checked_choice("grid", grid, GRIDS)
+    check_count("races", races)
     size = len(entrants) if field_size is None else field_size
     if not 1 <= size <= min(len(entrants), GRID_SLOTS):
         raise InvalidOption(
             f"{len(entrants)} drivers, {size} in a race; expected no more than there are, and 1 to "
             f"{GRID_SLOTS}, which is what a grid has room for"
         )
-    before: list[str] = []
-    for number in range(seed, seed + races):
-        order = _grid(entrants, size, grid, before, np.random.default_rng(number))
-        race = hold(order, number)
-        before = [standing.driver for standing in race.standings]
-        yield race
+
+    def held() -> Iterator[Race]:
+        before: list[str] = []
+        for number in range(seed, seed + races):
+            order = _grid(entrants, size, grid, before, np.random.default_rng(number))
+            race = hold(order, number)
+            before = [standing.driver for standing in race.standings]
+            yield race
+
+    return held()
 
 
 def _grid(

@@ -102,10 +102,10 @@ def compare_drives(drives: Sequence[Drive], track: Track) -> Comparison:
         )
     flying = all(drive.best(flying=True) for drive in able)
     grid = grid_of(track)
-    laps = [drive.best(flying=flying) for drive in able]
-    for drive, lap in zip(able, laps, strict=True):
+    laps = [(drive, lap) for drive in able if (lap := drive.best(flying=flying))]
+    for drive, lap in laps:
         _check_road(drive, lap, track)
-    sampled = [sample(lap, grid) for lap in laps if lap is not None]
+    sampled = [sample(lap, grid) for _, lap in laps]
     corners = corners_of(track)
     first = sampled[0]
     drivers = [
@@ -122,10 +122,8 @@ def compare_drives(drives: Sequence[Drive], track: Track) -> Comparison:
     return Comparison(track, grid, corners, drivers, left_out, list(drives))
 
 
-def _check_road(drive: Drive, lap: Lap | None, track: Track) -> None:
+def _check_road(drive: Drive, lap: Lap, track: Track) -> None:
     """Refuse a lap of a road that only has the same name."""
-    if lap is None:
-        return
     reached = float(lap.rows["distance_from_start"].max())
     longest = float(lap.rows["distance_raced"].diff().max())  # [m] between two rows
     if abs(reached - track.length) > max(NEAR_THE_LINE, longest):

@@ -18,6 +18,7 @@ __all__ = ["Drive", "Lap", "SampledLap", "drives_of", "grid_of", "sample"]
 
 STEP = 1.0  # [m] between two samples of a lap
 MOST_SAMPLES = 5000  # of a lap; longer tracks get longer steps
+STANDING_SPEED = 5.0  # [m/s] of a car that has just set off from the grid, at most
 ROLLING = 10.0  # [m/s] from which a wheel's radius can be measured
 PEDAL_UP = 0.1  # [-] of a pedal's travel; below, a wheel rolls freely
 
@@ -85,9 +86,9 @@ def _laps(rows: pd.DataFrame) -> list[Lap]:
         for done, part in parts.items():
             if done + 1 in parts:  # whose first row says how long this lap took
                 time = float(parts[done + 1]["last_lap_time"].iloc[0])
-                rows = _from_the_line(part)
-                on_grid = done == 0 and len(rows) == len(part)
-                laps.append(Lap(int(done) + 1, time, rows, on_grid))
+                driven = _from_the_line(part)
+                standing = done == 0 and len(driven) == len(part) and not _is_flying(driven)
+                laps.append(Lap(int(done) + 1, time, driven, standing))
     return laps
 
 
@@ -95,6 +96,12 @@ def _from_the_line(rows: pd.DataFrame) -> pd.DataFrame:
     """Leave out the way to the line, where the lap's clock begins anew, of a start elsewhere."""
     (begins,) = np.nonzero(np.diff(rows["lap_time"].to_numpy(float)) < 0.0)
     return rows.iloc[begins[-1] + 1 :] if begins.size else rows
+
+
+def _is_flying(rows: pd.DataFrame) -> bool:
+    """Tell whether a drive begins behind the line at speed; the grid lies before it."""
+    place = rows["distance_from_start"]
+    return bool(place.iloc[0] < 0.5 * place.max() and rows["speed_x"].iloc[0] > STANDING_SPEED)
 
 
 def grid_of(track: Track) -> FloatArray:

@@ -69,7 +69,7 @@ def lap_report(comparison: Comparison) -> str:
             "<h2>Laps</h2>",
             _laps(comparison),
             "</main>",
-            "<footer>Made by sb3-torcs compare. Works offline; nothing is sent anywhere.</footer>",
+            "<footer>Made by sb3-torcs. Works offline; nothing is sent anywhere.</footer>",
         ]
     )
     return document(title, body, _data(comparison), ["page.js"])
@@ -89,7 +89,8 @@ def clock(seconds: float) -> str:
 
 
 def _signed(seconds: float) -> str:
-    return f"{seconds:+.3f}".replace("-", "−")
+    sign = "±" if abs(seconds) < EQUAL else "+" if seconds > 0.0 else "−"
+    return f"{sign}{abs(seconds):.3f}"
 
 
 def summary(comparison: Comparison) -> list[str]:

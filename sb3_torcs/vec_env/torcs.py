@@ -331,11 +331,13 @@ class TorcsVecEnv(DummyVecEnv):
         )
 
     def close(self) -> None:
-        """Close all races and end the threads. Calling it twice does no harm."""
-        super().close()
-        if self._batch is not None:
-            self._batch.close()
-            self._batch = None
+        """Close all races, also those after one that fails to, and end the threads."""
+        with contextlib.ExitStack() as closing:
+            if self._batch is not None:
+                closing.callback(self._batch.close)
+                self._batch = None
+            for env in reversed(self._envs):
+                closing.callback(env.close)
 
 
 class _Race:
