@@ -341,10 +341,7 @@ class ScrBackend:
                     "road"
                 )
             client.send(_action(STANDING, lap_time))
-        raise ServerLost(
-            f"the race at {client.address} ended before it began; begin again when the next one "
-            "waits for its drivers"
-        )
+        raise ServerLost(f"the race at {client.address} ended before it began; begin again")
 
     def _hold(self, client: ScrClient | Rehearsal, controls: Controls, ticks: int) -> int:
         """

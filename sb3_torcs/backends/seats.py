@@ -186,8 +186,10 @@ class SharedRace:
         if self.grid.crew is not None and self._asked != self._tick:
             engine = self.world(0).engine
             muted = engine.mute_noise(False)  # opponents see with noise, whoever looks on
-            self.grid.crew.act(self._tick)
-            engine.mute_noise(muted)
+            try:
+                self.grid.crew.act(self._tick)
+            finally:
+                engine.mute_noise(muted)
             self._asked = self._tick
 
     def advance(self, ticks: int) -> None:

@@ -37,7 +37,7 @@ def default_updates(seconds: float) -> Figures:
     """
     Measure updates as the default entry makes them, and products, in turns, on one core.
 
-    :param seconds: [s] processor time to spend in all, at least
+    :param seconds: [s] processor time to spend on one core, at least; half as much on two threads
     :return: ``core_gflops``, ``ddpg_updates_per_s``, both of the best turn, and
         ``ddpg_update_gflop``; and ``ddpg_two_threads_ratio``, the best rate of updates on two
         threads divided by the best on one, both by the wall clock; ``None`` on a single core

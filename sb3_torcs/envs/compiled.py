@@ -57,14 +57,22 @@ def _derived(name: str) -> None:
 
 for _name in ("track_position", "off_track", "gap_ahead", "gap_behind", "contacts", "faults"):
     _derived(_name)
-_readers = _read_pedals, _read_pedal, _read_manual = tuple(
+_read_pedals, _read_pedal, _read_manual = (
     actions.action_layout(name).read for name in ("pedals", "pedal", "manual")
 )
 _aids = (
     needed_brake, needed_turn, needs_freeing, freeing_controls, sideslip, slides, caught_steering,
     aided,
 )  # fmt: skip
-for _function in (end_of, stands, rewards.safe_speed, *_aids, *_readers):
+for _function in (
+    end_of,
+    stands,
+    rewards.safe_speed,
+    *_aids,
+    _read_pedals,
+    _read_pedal,
+    _read_manual,
+):
     register_jitable(_function)
 
 

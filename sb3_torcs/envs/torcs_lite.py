@@ -59,7 +59,8 @@ class TorcsLiteEnv(RacingEnv):
     Episode end
         Terminated: ``"off_track"`` (the mass centre is more than ``runoff`` beside the road),
         ``"backwards"`` (more than 90 degrees off its direction, without ``recovery``), ``"stuck"``
-        (below 5 km/h for 1.5 s; 3 s after a standing start), ``"damage"`` (10,000 points).
+        (below 5 km/h for 1.5 s; 3 s after a standing start), ``"damage"`` (10,000 points),
+        ``"lost"`` (the car has no position any more).
         Truncated: ``"laps"`` driven, or the time limit of the registration. ``info["end"]`` says
         which.
 

@@ -20,6 +20,7 @@ from sb3_torcs.errors import BackendUnavailable, InvalidOption, keywords_of, nea
 from sb3_torcs.torcs.track_names import RANDOM_TRACK, kind_without_game
 
 __all__ = [
+    "GAME",
     "KEPT",
     "RACE_LAPS",
     "Driver",

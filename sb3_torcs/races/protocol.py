@@ -70,13 +70,13 @@ class Standing:
 
 @dataclass(frozen=True)
 class Race:
-    """One race. A row of the trace is a moment, a column a grid slot."""
+    """One race. In its arrays a row is a moment, and a column a grid slot."""
 
     seed: int
     standings: list[Standing]  # the winner first
     failures: dict[str, str]  # why drivers were taken out: what they answered, or a lost car
     drivers: list[str]  # by grid slot
-    distances: Any  # (moments, cars) [m] from the start line on
+    distances: FloatArray  # (moments, cars) [m] from the start line on
     places: Any  # (moments, cars)
 
 

@@ -36,7 +36,8 @@ FIELDS = len(STATE_FIELDS)
 NOTHING_SENSED = {
     "wheel_speeds": np.zeros(4), "range_finders": np.zeros(19), "opponents": np.zeros(36),
 }  # fmt: skip
-OTHERS, RED_HUES = 0.62, 0.08  # share of the hues that cars get which are not followed
+HUE_STEP = 0.62  # of all hues, from one car to the next: so neighbours differ most
+RED_MARGIN = 0.08  # of all hues, on both sides of red, which is for the car that is followed
 
 
 class Moment(NamedTuple):
@@ -242,7 +243,7 @@ def _colours(cars: int, followed: int) -> list[Colour]:
     """Choose a colour for each car by its slot; red is for the one that is followed."""
     from sb3_torcs.rendering.highway import RaceCar
 
-    hues = RED_HUES + (1.0 - 2.0 * RED_HUES) * (np.arange(cars) * OTHERS % 1.0)
+    hues = RED_MARGIN + (1.0 - 2.0 * RED_MARGIN) * (np.arange(cars) * HUE_STEP % 1.0)
     drawn = [colorsys.hsv_to_rgb(hue, 0.65, 0.95) for hue in hues]
     colours: list[Colour] = [(round(255 * r), round(255 * g), round(255 * b)) for r, g, b in drawn]
     colours[followed] = RaceCar.color

@@ -232,8 +232,7 @@ def _changes(zoo_args: Sequence[str]) -> dict[str, Any]:
     for key in ("callback", "env_wrapper"):
         if key in known.hyperparams:  # the zoo would drop ours, such as the progress bar
             raise InvalidOption(
-                f"'{key}' after -- is refused; write it into a hyperparameter file, and give that "
-                "with --conf-file"
+                f"'{key}' after -- is refused; write it into a file, and give --conf-file FILE.yml"
             )
     if known.env_kwargs is None:
         return dict(known.hyperparams)
@@ -395,8 +394,8 @@ def _told(
     else:
         why = f"cannot write '{error.filename or result.folder}': {error.strerror or error}"
         kind, remedy = OutputNotWritable, "make room, or choose another folder"
-    best = result.best_model
-    if not result.timesteps and best is not None and best.is_file():  # a later file had no room
+    # A later file may have had no room.
+    if not result.timesteps and (best := result.best_model) is not None and best.is_file():
         result = dataclasses.replace(result, last_model=best, timesteps=saved_timesteps(best))
     if result.timesteps >= result.wanted:
         learned = f"kept: '{result.last_model}', which has learned from all timesteps"
