@@ -109,8 +109,6 @@ def _same_for_all(teachers: Sequence[str]) -> dict:
     for teacher, options in zip(teachers, found, strict=True):
         if options != found[0]:
             raise SystemExit(f"{teacher} drives with {options}, and {teachers[0]} with {found[0]}")
-    if found[0].get("action") != "pedal":
-        raise SystemExit(f'{teachers[0]} does not drive with action="pedal"; give one that does')
     return found[0]
 
 
@@ -119,6 +117,8 @@ def _policy(name: str) -> ActorCriticPolicy:
     file = find_model(name)
     if told_algorithm(saved_data(file)) != "ppo":
         raise SystemExit(f"{name} is no model of PPO; give one, e.g. ppo-roads")
+    if driver_record(name).env_kwargs.get("action") != "pedal":
+        raise SystemExit(f'{name} does not drive with action="pedal"; give one that does')
     return PPO.load(file, device="cpu").policy
 
 

@@ -257,6 +257,17 @@ def test_who_cannot_teach_is_told_so(name, words, message, monkeypatch, tmp_path
         run(monkeypatch, name, *words, "--folder", str(tmp_path))
 
 
+@pytest.mark.parametrize(("name", "words"), [
+    ("specialize.py", ["--track", "forza"]), ("distill.py", ["forza"]),
+])  # fmt: skip
+def test_who_drives_with_two_pedals_cannot_teach(name, words, monkeypatch, tmp_path, game):
+    model = str(tmp_path / "model.zip")
+    PPO("MlpPolicy", gym.make("TorcsLite-v0"), device="cpu").save(model)
+    teach = ["--teach"] if name == "distill.py" else []
+    with pytest.raises(SystemExit, match=f"{model} does not drive with action=.pedal.; give one"):
+        run(monkeypatch, name, *teach, model, *words, "--folder", str(tmp_path))
+
+
 @pytest.mark.parametrize(
     ("script", "words"),
     [
