@@ -118,7 +118,7 @@ def _policy(name: str) -> ActorCriticPolicy:
     if told_algorithm(saved_data(file)) != "ppo":
         raise SystemExit(f"{name} is no model of PPO; give one, e.g. ppo-roads")
     if driver_record(name).env_kwargs.get("action") != "pedal":
-        raise SystemExit(f'{name} does not drive with action="pedal"; give one that does')
+        raise SystemExit(f'{name} does not drive with action="pedal"; give one, e.g. ppo-roads')
     return PPO.load(file, device="cpu").policy
 
 

@@ -120,7 +120,9 @@ def go_on(args: argparse.Namespace, tracks: list[str], settings: Settings) -> Pa
         raise SystemExit(f"{args.driver} is no model of PPO; give one, e.g. ppo-roads")
     trained = driver_record(args.driver).env_kwargs
     if trained.get("action") != "pedal":
-        raise SystemExit(f'{args.driver} does not drive with action="pedal"; give one that does')
+        raise SystemExit(
+            f'{args.driver} does not drive with action="pedal"; give one, e.g. ppo-roads'
+        )
     env_kwargs = {name: value for name, value in trained.items() if name not in NOT_DRIVING}
     env_kwargs["track"] = tracks if len(tracks) > 1 else tracks[0]
     cars = make_cars(args, env_kwargs, settings)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import itertools
 import os
@@ -19,6 +20,7 @@ __all__ = [
     "import_advice",
     "listed",
     "path_and_arguments",
+    "plain_python",
     "read_yaml",
     "readable",
     "whole_file",
@@ -32,6 +34,9 @@ IN_A_FOLDER = "choose a file in an existing folder that you may write to"
 MAX_LENGTH = 2**16  # [characters] PyYAML takes about a second for as many
 MAX_BRACKETS = 100  # open at once: PyYAML's time grows with their square
 MAX_NODES = 100_000  # after aliases are expanded
+
+TOO_MUCH = (RecursionError, MemoryError, SyntaxError, TypeError)
+"""What Python's parser raises for a text that is no expression, or nests too deep."""
 
 
 def readable(name: str) -> str:
@@ -196,3 +201,32 @@ def _written_out(node: yaml.Node, known: dict[int, int]) -> int:
         children = [child for part in parts for child in (part if type(part) is tuple else (part,))]
         known[id(node)] = 1 + sum(_written_out(child, known) for child in children)
     return known[id(node)]
+
+
+def plain_python(text: str, changes: ast.NodeTransformer | None = None) -> Any:
+    """
+    Read an expression like ``dict(net_arch=[64, 64])``, as the zoo's own files have them.
+
+    :param text: of literals, in ``{}``, ``[]`` and calls of ``dict``
+    :param changes: to the expression, before it is read
+    :return: their value; tuples become lists
+    :raises ValueError: if it is anything else
+    """
+    try:
+        expression = ast.parse(text.strip(), mode="eval")
+        return _value((changes.visit(expression) if changes else expression).body)
+    except TOO_MUCH as error:
+        raise ValueError(f"{text!r:.80} is not plain data") from error
+
+
+def _value(node: ast.expr) -> Any:
+    if isinstance(node, ast.List | ast.Tuple):
+        return [_value(item) for item in node.elts]
+    if isinstance(node, ast.Dict) and None not in node.keys:
+        keys = [ast.literal_eval(key) for key in node.keys if key is not None]
+        return dict(zip(keys, map(_value, node.values), strict=True))
+    if isinstance(node, ast.Call) and not node.args and ast.unparse(node.func) == "dict":
+        named = {keyword.arg: keyword.value for keyword in node.keywords}
+        if None not in named:  # of ``**``
+            return {str(name): _value(value) for name, value in named.items()}
+    return ast.literal_eval(node)

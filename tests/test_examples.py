@@ -264,7 +264,9 @@ def test_who_drives_with_two_pedals_cannot_teach(name, words, monkeypatch, tmp_p
     model = str(tmp_path / "model.zip")
     PPO("MlpPolicy", gym.make("TorcsLite-v0"), device="cpu").save(model)
     teach = ["--teach"] if name == "distill.py" else []
-    with pytest.raises(SystemExit, match=f"{model} does not drive with action=.pedal.; give one"):
+    with pytest.raises(
+        SystemExit, match=f"{model} does not drive with action=.pedal.; give one, e.g"
+    ):
         run(monkeypatch, name, *teach, model, *words, "--folder", str(tmp_path))
 
 

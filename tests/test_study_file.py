@@ -42,7 +42,7 @@ def test_the_shipped_studies_can_be_run(path):
         ({"sedes": 3}, "unknown key 'sedes'; did you mean 'seeds'?"),
         ({"eval_interval": 0}, "eval_interval is 0; expected timesteps, e.g. 5000"),
         ({"name": "..."}, "name is '...'; expected a word"),
-        ({"final_tracks": ["aalbrg"]}, "s.yml: final_tracks: no track 'aalbrg'; did you mean"),
+        ({"final_tracks": ["aalbrg"]}, "final_tracks: no track 'aalbrg'; did you mean 'aalborg'?"),
         (
             {"env": "Torcs-v0", "final_tracks": ["forza", "random"]},
             "s.yml: final_tracks: track is 'random'; Torcs-v0 takes the name of an installed",
@@ -70,7 +70,10 @@ def test_the_shipped_studies_can_be_run(path):
             {"variants": {"a": {"callback": {"sb3_torcs.callbacks.NoiseCallback": {"knd": 1}}}}},
             "argument 'knd'; did you mean 'kind'?",
         ),
-        ({"variants": {"a": {"env_kwargs": {"track": "nowhere"}}}}, "variants: a': no track"),
+        (
+            {"variants": {"a": {"env_kwargs": {"track": "nowhere"}}}},
+            "variants: a': no track 'nowhere'",
+        ),
         ({"variants": {"a": {"env_kwargs": 3}}}, "env_kwargs is 3; expected '{key: value}'"),
         ({"variants": {"a": {"env_kwargs": {"reward": "blgo"}}}}, "did you mean 'blog'?"),
         ({"variants": {"a": {"n_steps": None}}}, "null takes 'n_steps' away, but it is not there"),

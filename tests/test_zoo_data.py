@@ -7,7 +7,7 @@ import yaml
 
 from sb3_torcs.cli import main
 from sb3_torcs.errors import StudyError, ZooConfigError
-from sb3_torcs.files import read_yaml
+from sb3_torcs.files import plain_python, read_yaml
 from sb3_torcs.studies.config import read_study
 from sb3_torcs.training import zoo, zoo_data
 
@@ -27,7 +27,7 @@ def study(folder, **variant):
     ("dict(net_arch=dict(pi=(8,), qf=[8]))", {"net_arch": {"pi": [8], "qf": [8]}}),
 ])  # fmt: skip
 def test_the_strings_of_the_zoos_own_files_are_read_as_data(text, value):
-    assert zoo_data.plain_python(text) == value
+    assert plain_python(text) == value
     assert zoo_data.as_data({"policy_kwargs": text}) == {"policy_kwargs": value}
 
 

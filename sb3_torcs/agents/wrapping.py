@@ -8,7 +8,6 @@ they belong to the driver (:class:`sb3_torcs.agents.models.ModelDriver`).
 from __future__ import annotations
 
 import importlib
-import re
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -17,7 +16,7 @@ from gymnasium import spaces
 
 from sb3_torcs.agents.saved.file import as_mismatch
 from sb3_torcs.errors import ModelMismatch, ModelNotTrusted, PackageMissing
-from sb3_torcs.files import import_advice, listed, path_and_arguments
+from sb3_torcs.files import import_advice, listed, path_and_arguments, plain_python
 
 __all__ = ["LEFT_OUT", "frames_of", "normalizes", "stacked_space", "unrebuilt", "wrapped"]
 
@@ -116,7 +115,10 @@ def normalizes(normalize: Any) -> bool:
     :param normalize: of its hyperparameters; a string is Python that the zoo evaluates
     """
     if isinstance(normalize, str):
-        return normalize != "False" and not re.search(r"norm_obs\W+False", normalize)
+        try:
+            normalize = plain_python(normalize)
+        except ValueError:  # code: to take it for a yes asks for the statistics
+            return True
     if isinstance(normalize, Mapping):
         return bool(normalize and normalize.get("norm_obs", True))
     return normalize is True

@@ -341,7 +341,7 @@ class ScrBackend:
                     "road"
                 )
             client.send(_action(STANDING, lap_time))
-        raise ServerLost(f"the race at {client.address} ended before it began; begin again")
+        raise ServerLost(f"the race at {client.address} ended before it began; join the next one")
 
     def _hold(self, client: ScrClient | Rehearsal, controls: Controls, ticks: int) -> int:
         """

@@ -226,7 +226,7 @@ class DrivingMetricsCallback(BaseCallback):
         margin = SATURATED * (high - low)
         self._terms: list[dict[str, float]] = [{} for _ in range(self.training_env.num_envs)]
         self._limits = low + margin, high - margin
-        if self.model.num_timesteps == 0:  # a training of its own
+        if self.model.num_timesteps == 0:  # not one that goes on
             self.best_lap_time = self.best_evaluation_lap_time = None
         self._evaluations = [
             _Watched(callback, callback.n_calls)

@@ -87,7 +87,7 @@ class RacingProgressCallback(BaseCallback):
         stream: Any = Unbroken(self._stream or sys.stderr)
         self._out = stream
         self._ended = False
-        if self.model.num_timesteps == 0:  # a training of its own
+        if self.model.num_timesteps == 0:  # not one that goes on
             self._forget()
         self._total = int(self.locals["total_timesteps"])
         self._first = self.model.num_timesteps

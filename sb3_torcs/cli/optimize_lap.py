@@ -40,7 +40,7 @@ try some ten ways to go on, each a few seconds long, and takes the best.
 
 It uses all cores. With --rollouts the same seed finds the same ghost; what is found in --seconds
 depends on the machine, and is another ghost each time. Ctrl-C keeps what was found, once
-its first race is whole.
+the first race is whole.
 """
 
 

@@ -57,22 +57,13 @@ def _derived(name: str) -> None:
 
 for _name in ("track_position", "off_track", "gap_ahead", "gap_behind", "contacts", "faults"):
     _derived(_name)
-_read_pedals, _read_pedal, _read_manual = (
-    actions.action_layout(name).read for name in ("pedals", "pedal", "manual")
-)
+_readers = [actions.action_layout(name).read for name in ("pedals", "pedal", "manual")]
+_read_pedals, _read_pedal, _read_manual = _readers
 _aids = (
     needed_brake, needed_turn, needs_freeing, freeing_controls, sideslip, slides, caught_steering,
     aided,
 )  # fmt: skip
-for _function in (
-    end_of,
-    stands,
-    rewards.safe_speed,
-    *_aids,
-    _read_pedals,
-    _read_pedal,
-    _read_manual,
-):
+for _function in (end_of, stands, rewards.safe_speed, *_aids, *_readers):
     register_jitable(_function)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from contextlib import ExitStack
 from functools import partial
 from typing import Any
 
@@ -184,11 +185,12 @@ class TorcsParallelEnv(ParallelEnv[str, Observation, Action]):
         """Draw nothing: there are no modes."""
 
     def close(self) -> None:
-        """Close the race. A second call does nothing."""
+        """Close the race, whatever one of its cars raises. A second call does nothing."""
         self._closed = True
         self.agents = []
-        for env in self._envs.values():
-            env.close()
+        with ExitStack() as closing:
+            for env in self._envs.values():
+                closing.callback(env.close)
 
 
 def _car(env: RaceCarEnv, failure: Exception | None) -> CarState:

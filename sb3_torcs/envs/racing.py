@@ -273,7 +273,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         if self._draw_track is not None:
             self._draw_track(self.np_random)
         start = (
-            read_start(options, self.track.length)
+            read_start(options, self.track.length)  # of the track of this episode
             if is_given
             else self._starts.draw(self.np_random, self.track)
         )

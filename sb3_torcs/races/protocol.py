@@ -155,7 +155,7 @@ def run_races(
             f"{GRID_SLOTS}, which is what a grid has room for"
         )
 
-    def held() -> Iterator[Race]:
+    def held() -> Iterator[Race]:  # what is checked above is refused before the first race
         before: list[str] = []
         for number in range(seed, seed + races):
             order = _grid(entrants, size, grid, before, np.random.default_rng(number))

@@ -103,7 +103,7 @@ class ScrClient:
         try:
             # A connected socket receives from this server only, and reports a closed port.
             self._socket.connect((host, port))
-        except (OSError, OverflowError, TypeError, UnicodeError) as error:  # of no name of a host
+        except (OSError, OverflowError, TypeError, UnicodeError) as error:  # no name of a host
             self.close()
             raise ServerNotFound(
                 f"{self.address} cannot be reached ({error}); check --host and --port"

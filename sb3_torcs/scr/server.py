@@ -47,7 +47,7 @@ def open_ports(
             if not 0 <= wanted <= LAST_PORT:
                 raise OSError(errno.EINVAL, f"ports end at {LAST_PORT}")
             bound.bind((host, wanted))
-        except (OSError, TypeError, UnicodeError) as error:  # the last two of no name of a host
+        except (OSError, TypeError, UnicodeError) as error:  # the last two: no name of a host
             for opened in sockets:
                 opened.close()
             why = getattr(error, "strerror", None) or error

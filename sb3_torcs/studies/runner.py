@@ -170,8 +170,7 @@ def _check_buildable(trial: Trial, file: Path) -> None:
     try:
         Training(trial).close()
     except Exception as error:
-        why = f"variant '{trial.variant}' cannot be trained: {error}"
-        raise StudyError(f"{file}: {why}") from error
+        raise StudyError(f"{file}: variant '{trial.variant}' cannot be trained: {error}") from error
 
 
 def require_ray(address: str | None = None) -> None:

@@ -87,7 +87,7 @@ class Training:
         found: VecNormalize | None = self.model.get_vec_normalize_env()
         return found
 
-    @one_thread()
+    @one_thread()  # trials run side by side: more threads of torch would slow them down
     def run(self, after_slice: Callable[[], None]) -> None:
         """
         Learn to the end of the budget.

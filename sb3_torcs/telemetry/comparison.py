@@ -116,7 +116,7 @@ def compare_drives(drives: Sequence[Drive], track: Track) -> Comparison:
             corners=_passes(own, first, grid, corners),
             sectors=_sectors(own, grid),
         )
-        for drive, own in zip(able, sampled, strict=True)
+        for (drive, _), own in zip(laps, sampled, strict=True)
     ]
     left_out = [drive for drive in drives if not drive.laps]
     return Comparison(track, grid, corners, drivers, left_out, list(drives))

@@ -16,6 +16,7 @@ from torch.nn.modules import activation
 
 from sb3_torcs.car import is_count, is_number
 from sb3_torcs.errors import ZooConfigError, near_miss
+from sb3_torcs.files import plain_python
 
 __all__ = [
     "EVALUATED",
@@ -27,7 +28,6 @@ __all__ = [
     "check_noise",
     "check_numbers",
     "check_sight",
-    "plain_python",
     "policy_arguments",
     "told_entries",
 ]
@@ -36,9 +36,6 @@ EVALUATED = (
     "monitor_kwargs", "normalize", "policy_kwargs", "replay_buffer_class", "replay_buffer_kwargs",
 )  # fmt: skip
 """What the zoo evaluates as Python where it is a string."""
-
-TOO_MUCH = (RecursionError, MemoryError, SyntaxError, TypeError)
-"""What Python's parser raises for a text that is no expression, or nests too deep."""
 
 
 def as_data(entry: Mapping[str, Any]) -> dict[str, Any]:
@@ -292,20 +289,6 @@ def check_noise(entry: Mapping[str, Any], exploring: bool, algo: str, place: str
         )
 
 
-def plain_python(text: str) -> Any:
-    """
-    Read an expression like ``dict(net_arch=[64, 64])``, as the zoo's own files have them.
-
-    :param text: of literals, in ``{}``, ``[]`` and calls of ``dict``
-    :return: their value; tuples become lists
-    :raises ValueError: if it is anything else
-    """
-    try:
-        return _value(ast.parse(text.strip(), mode="eval").body)
-    except TOO_MUCH as error:
-        raise ValueError(f"{text!r:.80} is not plain data") from error
-
-
 def policy_arguments(entry: Mapping[str, Any]) -> Any:
     """
     Read the ``policy_kwargs`` of an entry, also those that name activations.
@@ -329,23 +312,7 @@ def _with_activations(text: str) -> Any:
             known = owner == "nn" and name in activation.__all__
             return ast.Constant(name) if known else node
 
-    try:
-        return _value(Named().visit(ast.parse(text.strip(), mode="eval")).body)
-    except TOO_MUCH as error:
-        raise ValueError(f"{text!r:.80} is not plain data") from error
-
-
-def _value(node: ast.expr) -> Any:
-    if isinstance(node, ast.List | ast.Tuple):
-        return [_value(item) for item in node.elts]
-    if isinstance(node, ast.Dict) and None not in node.keys:
-        keys = [ast.literal_eval(key) for key in node.keys if key is not None]
-        return dict(zip(keys, map(_value, node.values), strict=True))
-    if isinstance(node, ast.Call) and not node.args and ast.unparse(node.func) == "dict":
-        named = {keyword.arg: keyword.value for keyword in node.keywords}
-        if None not in named:  # of ``**``
-            return {str(name): _value(value) for name, value in named.items()}
-    return ast.literal_eval(node)
+    return plain_python(text, Named())
 
 
 def told_entries(name: str, known: Iterable[str], path: Path) -> str:
