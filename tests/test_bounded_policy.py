@@ -141,7 +141,9 @@ def make_asymmetric(**policy_kwargs):
     env = gym.make("TorcsLite-v0", sensors=SEES)
     kwargs = {"activation_fn": nn.ReLU, "net_arch": [8], "actor_sensors": ["base"], **policy_kwargs}
     with pytest.warns(UserWarning, match="truncated mini-batch"):
-        return PPO(BoundedPolicy, env, policy_kwargs=kwargs, n_steps=40, batch_size=16, seed=0)
+        model = PPO(BoundedPolicy, env, policy_kwargs=kwargs, n_steps=40, batch_size=16, seed=0)
+    model.observation_space.seed(0)
+    return model
 
 
 @pytest.mark.parametrize(
@@ -167,8 +169,9 @@ def test_an_actor_may_see_less_than_its_value_function(actor_sensors, names, tmp
         both = th.as_tensor(np.stack((first, second)))
         with th.no_grad():
             means, values = policy.get_distribution(both).mode(), policy.predict_values(both)
-        assert means[0].allclose(means[1])  # rows of one product are added up in different orders
-        assert values[0].allclose(values[1]) is (names == SEES)
+        # Rows of one product are added up in different orders: equal but for the last digits.
+        assert means[0].allclose(means[1], atol=1e-5)
+        assert values[0].allclose(values[1], atol=1e-5) is (names == SEES)
 
 
 SCALE = {"range_finders": 3.0, "heading_error": 0.2, "bends_ahead": 0.1}

@@ -455,6 +455,7 @@ def test_a_driver_of_ppo_leaves_out_what_only_its_value_function_saw(tmp_path, n
             "input_scale": scale,
         }  # fmt: skip
         model = trained(PPO, BoundedPolicy, env, n_steps=8, batch_size=8, policy_kwargs=kwargs)
+        env.observation_space.seed(0)
         seen = np.stack([env.observation_space.sample() for _ in range(4)])
     model.save(tmp_path / "whole.zip")
     expected, _ = model.predict(seen, deterministic=True)
@@ -476,6 +477,7 @@ def test_a_driver_keeps_the_statistics_of_what_it_sees(tmp_path):
     where = DummyVecEnv([lambda: gym.make("TorcsLite-v0", sensors=["base", "line"])])
     env, kwargs = VecNormalize(where), {"net_arch": [8], "actor_sensors": ["base"]}
     model = trained(PPO, BoundedPolicy, env, n_steps=8, batch_size=8, policy_kwargs=kwargs)
+    env.observation_space.seed(0)
     seen = np.stack([env.observation_space.sample() for _ in range(4)])
     expected, _ = model.predict(env.normalize_obs(seen), deterministic=True)
     env.close()
