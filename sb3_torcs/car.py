@@ -427,12 +427,12 @@ class CarState(NamedTuple):
 
     @property
     def gap_ahead(self) -> float:
-        """To the car a place before [m of road]; 200 if this is the first."""
+        """To the car a place before [m of road], also if that is out; 200 if this is the first."""
         return float(self.race[0])
 
     @property
     def gap_behind(self) -> float:
-        """To the car a place after [m of road]; 200 if this is the last."""
+        """To the car a place after [m of road], also if that is out; 200 if this is the last."""
         return float(self.race[1])
 
     @property

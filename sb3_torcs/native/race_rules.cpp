@@ -121,6 +121,7 @@ bool Race::cross_line(CarElement& car, Record& record) {
         record_lap(car, record);
     } else if (record.flying) {
         record.lap_began = static_cast<float>(situation.time);
+        race.best_lap_counts = true;  // whatever was hit on the way here
     }
     record.top_speed = record.lowest_speed = race.lowest_speed = car.pub.local.vel.x;
     // In a race without a flag, environments decide when it is over.

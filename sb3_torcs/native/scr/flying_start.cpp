@@ -90,12 +90,14 @@ void FlyingStart::drive_off(Situation& situation) {
 void FlyingStart::start_clocks(const Situation& situation) {
     if (!flying_) return;
     for (int i = 0; i < field_.number; i++) {
-        const CarElement& car = field_.cars[i];
+        CarElement& car = field_.cars[i];
         CarProgress& progress = ReInfo->progress[i];
         if (car.race.crossings == 0 && progress.backwards == 0 &&
             progress.previous.segment->race_info & BEFORE_LINE &&
-            car.pub.track.segment->race_info & AFTER_LINE)
+            car.pub.track.segment->race_info & AFTER_LINE) {
             progress.lap_began = static_cast<float>(situation.time);
+            car.race.best_lap_counts = true;  // whatever was hit on the way here
+        }
     }
 }
 
