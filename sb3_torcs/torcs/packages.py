@@ -17,6 +17,7 @@ from typing import IO, Any
 
 from sb3_torcs.errors import BackendUnavailable, InstallFailed
 from sb3_torcs.files import writable_folder
+from sb3_torcs.signals import held_back
 from sb3_torcs.torcs.installation import HOME_VARIABLE, Game, find_game, user_folder
 
 __all__ = ["VIDEO_PACKAGES", "Tell", "install_display", "install_game"]
@@ -144,10 +145,27 @@ def _unpack_for_user(target: Path) -> Game:
         root = staging / "root"
         _unpack(archives, root, staging)
         _verify(find_game(root))
-        if target.exists():
-            target.rename(staging / "old")
-        root.rename(target)
+        with held_back():  # Ctrl-C in between would leave no game
+            _replace(target, root, staging / "old")
     return find_game()
+
+
+def _replace(target: Path, root: Path, old: Path) -> None:
+    """
+    Put a folder in the place of another, which stays there if that fails.
+
+    :param target: the place
+    :param root: the folder
+    :param old: where the one before goes
+    """
+    if target.exists():
+        target.rename(old)
+    try:
+        root.rename(target)
+    except OSError:
+        if old.exists():
+            old.rename(target)
+        raise
 
 
 def _apt_options(staging: Path) -> list[str]:
