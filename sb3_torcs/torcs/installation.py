@@ -5,6 +5,7 @@ All searches for files of TORCS are here. Nothing is loaded or run.
 
 from __future__ import annotations
 
+import functools
 import os
 import re
 import sys
@@ -425,13 +426,21 @@ def _drivers(path: Path) -> list[RobotEntry]:
     :return: its drivers, by index
     """
     try:
-        listed = read_params(path).child("Robots", "index").children
+        return list(_drivers_of(path, path.stat().st_mtime_ns))
     except (TrackFileError, OSError) as error:
         raise GameIncomplete(
             f"a robot's description is broken: {error}; type: {INSTALL}"
         ) from error
-    return sorted(
+
+
+@functools.lru_cache(maxsize=256)
+def _drivers_of(path: Path, changed: int) -> tuple[RobotEntry, ...]:
+    """Read a description once, until it changes: each race asks for those of its field."""
+    del changed
+    listed = read_params(path).child("Robots", "index").children
+    drivers = (
         RobotEntry(int(index), section.texts.get("name", ""), section.texts.get("car name", ""))
         for index, section in listed.items()
         if index.isascii() and index.isdigit() and section.texts.get("type", "robot") == "robot"
     )
+    return tuple(sorted(drivers))
