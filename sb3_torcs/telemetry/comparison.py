@@ -142,7 +142,7 @@ def _passes(
     passes = []
     lost_before = 0.0
     for corner, (begin, end) in zip(corners, borders, strict=True):
-        within = speed[(grid >= corner.begin) & (grid <= corner.end)]
+        within = speed[(grid >= corner.begin) & (grid <= corner.end)].tolist()
         entry_speed, exit_speed = np.interp([corner.begin, corner.end], grid, speed).tolist()
         lost_so_far = float(np.interp(end, grid, delta))
         passes.append(
@@ -150,7 +150,7 @@ def _passes(
                 distance=corner.begin,
                 braking_point=_braking_point(own, grid, begin, corner),
                 entry_speed=entry_speed,
-                apex_speed=min(float(within.min()), entry_speed, exit_speed),
+                apex_speed=min(*within, entry_speed, exit_speed),
                 exit_speed=exit_speed,
                 time_lost=lost_so_far - lost_before,
             )
@@ -170,7 +170,8 @@ def _braking_point(own: SampledLap, grid: FloatArray, begin: float, corner: Corn
     :return: the first place on the brake up to the slowest one of the corner [m]
     """
     inside = (grid >= corner.begin) & (grid <= corner.end)
-    slowest = grid[inside][own.channels["speed"][inside].argmin()]
+    speed = own.channels["speed"][inside]
+    slowest = grid[inside][speed.argmin()] if len(speed) else corner.begin  # between two places
     before = (grid >= begin) & (grid <= slowest)
     braking = grid[before & (own.channels["brake"] > BRAKE_THRESHOLD)]
     return float(braking[0]) if braking.size else None

@@ -336,11 +336,10 @@ def check_racing(env_id: str) -> None:
     :raises ZooConfigError: if it is not
     """
     from sb3_torcs.envs.racing import RacingEnv
-    from sb3_torcs.envs.torcs import TorcsEnv
 
     check_registered(env_id)
     built = _env_class(env_id)
-    if not (isinstance(built, type) and issubclass(built, (RacingEnv, TorcsEnv))):
+    if not (isinstance(built, type) and issubclass(built, RacingEnv)):
         raise ZooConfigError(f"{env_id} is not a racing environment; ours: {', '.join(OURS)}")
 
 

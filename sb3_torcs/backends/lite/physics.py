@@ -26,6 +26,9 @@ DT = CONTROL_TICK / SUBSTEPS  # [s]
 STEPS_PER_SECOND = 500.0  # time is counted in steps, so that it never drifts
 
 # Walls
+# Of a wall, in columns behind that of its friction.
+REBOUND = column.LEFT_WALL_REBOUND - column.LEFT_WALL_FRICTION
+DAMAGE_RATE = column.LEFT_WALL_DAMAGE - column.LEFT_WALL_FRICTION
 WALL_SPIN = 10.0  # how much a hit turns the car, simuv2's VELSCALE
 WALL_SPIN_MAX = 6.0  # [rad/s]
 DAMAGE_FACTOR = 0.8  # for a driver of the level "semi-pro"
@@ -136,14 +139,14 @@ def _hit_walls(state: Floats, track: Floats) -> None:
         speed = max(1.0, math.hypot(state[VX], state[VY]))
         normal_speed = nx * state[VX] + ny * state[VY]
         cosine = normal_speed / speed
-        friction, rebound = track[segment, wall], track[segment, wall + 1]
+        friction, rebound = track[segment, wall], track[segment, wall + REBOUND]
         state[VX] -= nx * impact * friction
         state[VY] -= ny * impact * friction
         turn = (nx * dx + ny * dy) * impact * friction / WALL_SPIN
         state[YAW_RATE] = min(max(state[YAW_RATE] - turn, -WALL_SPIN_MAX), WALL_SPIN_MAX)
         if impact < 0.0:
             blow = 0.5 * (normal_speed * cosine) ** 2 + 0.005 * abs(1.0 - cosine) * speed
-            state[DAMAGE] += math.floor(track[segment, wall + 2] * blow * DAMAGE_FACTOR)
+            state[DAMAGE] += math.floor(track[segment, wall + DAMAGE_RATE] * blow * DAMAGE_FACTOR)
             state[VX] -= nx * impact * rebound
             state[VY] -= ny * impact * rebound
     state[OFFSET] = offset

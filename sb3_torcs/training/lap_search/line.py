@@ -157,14 +157,14 @@ def blended(launch: FloatArray, flying: FloatArray) -> FloatArray:
     first = int(np.argmax(similar))
     share = np.clip((distance - distance[first]) / BLEND, 0.0, 1.0)[:, None]
     mixed = launch + share * (other - launch)
-    mixed[:, DISTANCE] = launch[:, DISTANCE]
-    last = int(np.searchsorted(distance, distance[first] + BLEND))
     # A line's time goes on without a jump, whatever either drive took before.
-    steps = np.diff(launch[: last + 1, TIME], prepend=launch[0, TIME])
-    mixed[: last + 1, TIME] = launch[0, TIME] + np.cumsum(steps)
-    end = int(np.searchsorted(flying[:, DISTANCE], distance[min(last, len(distance) - 1)], "right"))
+    mixed[:, [TIME, DISTANCE]] = launch[:, [TIME, DISTANCE]]
+    last = int(np.searchsorted(distance, distance[first] + BLEND))
+    if last >= len(distance):
+        return launch
+    end = int(np.searchsorted(flying[:, DISTANCE], distance[last], "right"))
     rest = flying[end:].copy()
-    if last >= len(distance) or not len(rest):
+    if not len(rest):
         return launch
     reached = np.interp(distance[last], flying[:, DISTANCE], flying[:, TIME])
     rest[:, TIME] += mixed[last, TIME] - reached
