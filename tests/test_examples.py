@@ -20,7 +20,7 @@ from sb3_torcs.agents.saved.writing import RecordCallback
 from sb3_torcs.callbacks.lines import DrivenLap, driven_laps
 from sb3_torcs.envs.aids import AIDS
 from sb3_torcs.errors import OutputNotWritable
-from sb3_torcs.evaluation.protocol import World
+from sb3_torcs.evaluation.protocol import ChosenWorld
 from sb3_torcs.races.entrants import find_entrants
 from sb3_torcs.studies.config import read_study
 from sb3_torcs.training import zoo
@@ -401,7 +401,7 @@ def test_ctrl_c_during_the_training_still_shows_and_says_how_to_go_on(
 
 @pytest.mark.parametrize("env", ["Torcs-v0", "TorcsLite-v0"])
 def test_the_demo_learns_where_this_machine_can(demo, monkeypatch, tmp_path, env):
-    monkeypatch.setattr(demo, "choose_world", lambda *asked: World(env, "as the test says"))
+    monkeypatch.setattr(demo, "choose_world", lambda *asked: ChosenWorld(env, "as the test says"))
     assert demo.course_of(tmp_path) == demo.Course("ppo", env, "Torcs-v0")
     first, *_ = demo.first_words(tmp_path, demo.course_of(tmp_path), 1, False)
     assert ("in TORCS itself" in first) == (env == "Torcs-v0")

@@ -23,11 +23,11 @@ __all__ = [
     "GAME",
     "KEPT",
     "RACE_LAPS",
+    "ChosenWorld",
     "Driver",
     "Episode",
     "Merit",
     "Timestep",
-    "World",
     "choose_world",
     "drive",
     "evaluate",
@@ -99,14 +99,14 @@ def merit(races: Sequence[Episode]) -> Merit:
     return Merit(len(finished), sum(others), -sum(race.race_time for race in finished))
 
 
-class World(NamedTuple):
+class ChosenWorld(NamedTuple):
     """An environment and the reason for its choice."""
 
     env_id: str
     reason: str
 
 
-def choose_world(driver: str, trained_on: str | None, track: Any = None) -> World:
+def choose_world(driver: str, trained_on: str | None, track: Any = None) -> ChosenWorld:
     """
     Choose the environment: that of the training, or else the game if it runs here.
 
@@ -119,18 +119,18 @@ def choose_world(driver: str, trained_on: str | None, track: Any = None) -> Worl
     from sb3_torcs.torcs.installation import find_game
 
     if trained_on is not None:
-        return World(trained_on, f"'{driver}' was trained there")
+        return ChosenWorld(trained_on, f"'{driver}' was trained there")
     unknown = f"'{driver}' does not say where it was trained"
     kind = kind_without_game(track)
     if kind is not None:
-        return World(WITHOUT_GAME, f"{unknown}, and {kind} tracks are there alone")
+        return ChosenWorld(WITHOUT_GAME, f"{unknown}, and {kind} tracks are there alone")
     try:
         check_layout(find_game())
     except BackendUnavailable:
         missing = "and Torcs-v0 does not run here, `sb3-torcs doctor` says why"
-        return World(WITHOUT_GAME, f"{unknown}, {missing}")
+        return ChosenWorld(WITHOUT_GAME, f"{unknown}, {missing}")
     other = f"--env {WITHOUT_GAME} drives it without the game"
-    return World(GAME, f"{unknown}, and the game is installed; {other}")
+    return ChosenWorld(GAME, f"{unknown}, and the game is installed; {other}")
 
 
 def time_limit(kwargs: Mapping[str, Any]) -> int:
