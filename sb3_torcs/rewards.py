@@ -269,7 +269,8 @@ class Reward:
 
         :param before: the car at the beginning of the timestep
         :param after: the car at its end
-        :param controls: that were held in between
+        :param controls: that were asked for, after the aids have changed them; with a delay,
+            earlier ones were held meanwhile
         :param end: why the episode ended, or ``None``
         :return: the weighted terms, ``crash`` last; their sum is the reward
         :raises InvalidOption: if a term that was added returns no finite number

@@ -17,7 +17,7 @@ from game_copy import python
 
 from sb3_torcs.actions import controls_from_action
 from sb3_torcs.agents.scripted import ScriptedDriver
-from sb3_torcs.backends.native import Fleet, NativeBackend, make_engine
+from sb3_torcs.backends.native import NativeBackend, NativeFleet, make_engine
 from sb3_torcs.car import Controls, Start
 from sb3_torcs.errors import CarLost, InvalidOption
 from sb3_torcs.sensors import encode
@@ -125,7 +125,7 @@ class TestEqualToItself:
         for backend in (*together, *alone):
             backend.reset(rng, Start(50.0, 0.0, 0.0, 20.0))
         controls = [Controls(0.01 * i, 0.5, 0.0) for i in range(3)]
-        fleet = Fleet(together, threads)
+        fleet = NativeFleet(together, threads)
         for step in range(30):
             expected = [b.step(c, 3) for b, c in zip(alone, controls, strict=True)]
             for i in range(3):
@@ -512,6 +512,22 @@ class TestLaps:
             over = terminated or truncated
         assert (info["end"], info["laps"], len(times)) == ("laps", 2, 2)
         assert info["best_lap_time"] in (0.0, *times)
+
+    def test_a_wall_before_the_line_voids_no_lap(self):
+        """The car hits it on its way to the line, where its first lap begins, and then no more."""
+        options = {"runoff": 30.0, "recovery": 20.0, "unstick": True}
+        env = gym.make("Torcs-v0", track="g-track-1", laps=1, **options)
+        before = env.unwrapped.track.length - 400.0
+        driver, gas = ScriptedDriver(), np.array([0.0, 1.0, 0.0], np.float32)
+        seen, _ = env.reset(options={"distance": before, "speed": 20.0, "heading_error": -0.5})
+        for _ in range(25):
+            seen, *_, info = env.step(gas)
+        damage, over = info["damage"], False
+        assert damage > 0.0
+        while not over:
+            seen, _, _, over, info = env.step(driver.predict(seen)[0])
+        assert info["damage"] == damage
+        assert info["best_lap_time"] == info["lap_time"] > 50.0
 
 
 class TestAmongRobots:

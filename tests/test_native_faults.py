@@ -49,7 +49,7 @@ INFERNO = [["inferno", 3]]
 BEGIN = """
 import json, math, os, sys, threading, numpy as np
 from sb3_torcs import errors
-from sb3_torcs.backends.native import Fleet, NativeBackend, make_engine
+from sb3_torcs.backends.native import NativeBackend, NativeFleet, make_engine
 from sb3_torcs.torcs.starting_list import AGENT
 from sb3_torcs.car import Controls, Start
 from sb3_torcs.torcs.installation import find_game

@@ -105,6 +105,17 @@ def test_a_time_limit_truncates_all(make):
     assert (any(terminations.values()), all(truncations.values()), env.agents) == (False, True, [])
 
 
+def test_who_ends_is_seen_by_those_who_end_with_it(make):
+    """Each car is on the road in the last observation of the others."""
+    env = make(3, max_episode_steps=3, sensors=("base", "rivals"))
+    env.reset(seed=0)
+    for _ in range(3):
+        *_, infos = env.step({name: GAS for name in env.possible_agents})
+    assert env.agents == []
+    nearest = [infos[name]["car"].opponents.min() for name in env.possible_agents]
+    assert max(nearest) < 20.0
+
+
 def test_a_race_that_is_lost_ends_for_all(make, monkeypatch):
     env = make(2)
     env.reset(seed=0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import pickle
+from functools import partial
 
 import gymnasium as gym
 import numpy as np
@@ -15,10 +16,10 @@ from stable_baselines3 import DDPG, PPO
 from sb3_torcs.agents import driver_record
 from sb3_torcs.agents.saved.writing import RecordCallback
 from sb3_torcs.agents.scripted import ScriptedDriver
-from sb3_torcs.backends.native import Fleet, make_engine
+from sb3_torcs.backends.native import NativeFleet, make_engine
 from sb3_torcs.backends.seats import REJOIN_SPEED
 from sb3_torcs.car import CAR_RECORD, CONTROL_TICK, RIVALS
-from sb3_torcs.envs.torcs_race import make_grid, make_race
+from sb3_torcs.envs.torcs_race import load_shared_race, make_race
 from sb3_torcs.errors import CarLost, InvalidAction, InvalidOption
 from sb3_torcs.evaluation.ticks import log_drives
 from sb3_torcs.policies.mirror import mirror_image, mirror_observations
@@ -113,7 +114,7 @@ class TestEngine:
         controls = random_controls(60)
         states = np.empty((2, CAR_RECORD.itemsize // 8))
         grid = [_Seat(other, car) for car in other.agents]
-        fleet = Fleet(grid, threads=2)
+        fleet = NativeFleet(grid, threads=2)
         for row in controls:
             hold(one, row)
             one.drive(5)
@@ -264,7 +265,7 @@ class TestMistakes:
 
     def test_more_cars_than_grid_slots(self):
         with pytest.raises(InvalidOption, match=r"agents is 19, with 2 opponents; .* 20 cars"):
-            make_grid(TRACK, "car1-trb1", agents=19, opponents=["bt", "inferno"])
+            load_shared_race(TRACK, "car1-trb1", agents=19, opponents=["bt", "inferno"])
 
     @pytest.mark.parametrize("agents", [0, -1, 1.5, True, None])
     def test_no_number_of_agents(self, agents):
@@ -304,6 +305,8 @@ class TestMistakes:
             InvalidOption, match=r"flagged is True, .* race by sb3_torcs\.parallel_env"
         ):
             TorcsVecEnv(agents=2, laps=1, flagged=True)
+        with pytest.raises(InvalidOption, match="flagged is True"):
+            TorcsVecEnv([partial(next, iter(make_race(2, laps=1, flagged=True)))] * 2)
         with pytest.raises(InvalidOption, match="environments of one; give the number of races"):
             TorcsVecEnv([lambda: gym.make("Torcs-v0")], 2)
 
@@ -316,11 +319,24 @@ class TestMistakes:
         with pytest.raises(InvalidOption, match="cannot be copied"):
             pickle.dumps(env.unwrapped)
 
+    def test_a_wrong_start_leaves_all_races(self, make):
+        """Who leaves the road ends its own episode, as if nobody had asked for a reset."""
+        envs = make(1, 3)
+        envs.reset()
+        envs.set_options({"distance": "x"})
+        with pytest.raises(InvalidOption, match="distance"):
+            envs.reset()
+        envs.set_options()
+        dones = np.zeros(3, np.bool_)
+        while not dones.any():
+            *_, dones, infos = envs.step(np.array([TURN, GAS, GAS], np.float32))
+        assert [info.get("end") for info in infos] == ["off_track", "", ""]
+
     def test_no_number_drives_nobody(self, make):
         envs = make(1, 3)
         envs.reset()
         before = [car.time for car in envs.get_attr("car")]
-        with pytest.raises(InvalidAction, match="steering is nan"):
+        with pytest.raises(InvalidAction, match="environment 1: steering is nan"):
             envs.step(np.array([GAS, [np.nan, 0.0, 0.0], GAS], np.float32))
         assert [car.time for car in envs.get_attr("car")] == before
         envs.step(np.array([GAS] * 3, np.float32))

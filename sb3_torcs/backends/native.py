@@ -41,8 +41,8 @@ if TYPE_CHECKING:
     from sb3_torcs._engine import Engine, Rollouts
 
 __all__ = [
-    "Fleet",
     "NativeBackend",
+    "NativeFleet",
     "check_layout",
     "load_race",
     "make_engine",
@@ -272,7 +272,7 @@ class NativeBackend(EngineWorld):
 
     def arrive(self, controls: Controls, ticks: int, state: CarState) -> None:
         """
-        Take the result of a step. The engine may have been driven by a :class:`Fleet`.
+        Take the result of a step. The engine may have been driven by a :class:`NativeFleet`.
 
         :param controls: as of ``step``
         :param ticks: as of ``step``
@@ -331,7 +331,7 @@ class NativeBackend(EngineWorld):
             self.step(controls, ticks)
 
 
-class Fleet:
+class NativeFleet:
     """
     Several worlds that are driven at once, by threads that live as long as this object.
 
@@ -364,7 +364,7 @@ class Fleet:
         """
         self._begun[race] = controls, ticks
         steering, throttle, brake, gear, clutch = controls
-        self._fleet.begin(race, steering, throttle, brake, gear, ticks, clutch)
+        self._fleet.begin(int(self._engines[race]), steering, throttle, brake, gear, ticks, clutch)
 
     def wait(self, race: int) -> CarState:
         """
@@ -373,7 +373,7 @@ class Fleet:
         :param race: which
         :return: as of ``step``
         """
-        state: CarState = self._fleet.wait(race)
+        state: CarState = self._fleet.wait(int(self._engines[race]))
         self._worlds[race].arrive(*self._begun[race], state)
         return state
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "REJOIN_SPEED",
-    "Grid",
+    "LoadedRace",
     "LoneSeat",
     "Seat",
     "SeatWorld",
@@ -49,11 +49,12 @@ class SeatWorld(EngineWorld):
         """Take the result of a step, of which nothing has to be remembered."""
 
 
-class Grid(NamedTuple):
+class LoadedRace(NamedTuple):
     """A race that is loaded."""
 
     worlds: Sequence[SeatWorld]  # the cars of its agents
     crew: Any = None  # drives the opponents that are agents; see ``agents.pilots.Crew``
+    flagged: bool = False  # whether its agents are flagged off after the last lap
 
     def close(self) -> None:
         """Close the race."""
@@ -70,15 +71,15 @@ class SharedRace:
     ended the episode that they began the race with, the race is over, and the next reset begins
     another one, on a track and in a field that are drawn again.
 
-    :param grids: of each race that can be drawn
+    :param races: among which it is drawn
     :param noise: whether sensors err as those of the SCR server's ``-noisy``
     """
 
-    def __init__(self, grids: WorldPool[Grid], noise: bool = False) -> None:
-        self._turn = Turn(grids)
+    def __init__(self, races: WorldPool[LoadedRace], noise: bool = False) -> None:
+        self._turn = Turn(races)
         self._tick = 0  # control ticks since the race began
         self._asked = -1  # when the crew was asked
-        self.agents = len(self.grid.worlds)
+        self.agents = len(self.loaded.worlds)
         self._noise = noise
         self._waiting: set[int] = set()  # agents that have not begun an episode in this race
         self._lasting: set[int] = set()  # agents whose first episode in this race goes on
@@ -92,10 +93,10 @@ class SharedRace:
 
         :param worlds: the cars of its agents
         """
-        return cls(WorldPool([lambda: Grid(worlds)]))
+        return cls(WorldPool([lambda: LoadedRace(worlds)]))
 
     @property
-    def grid(self) -> Grid:
+    def loaded(self) -> LoadedRace:
         """The present race."""
         return self._turn.world
 
@@ -105,7 +106,7 @@ class SharedRace:
 
         :param number: of the agent
         """
-        return self.grid.worlds[number]
+        return self.loaded.worlds[number]
 
     def gears(self, number: int) -> int:
         """
@@ -113,7 +114,7 @@ class SharedRace:
 
         :param number: of the agent
         """
-        return min(grid.worlds[number].gears for grid in self._turn.pool.examples)
+        return min(race.worlds[number].gears for race in self._turn.pool.examples)
 
     def is_over(self, ending: set[int]) -> bool:
         """
@@ -173,8 +174,8 @@ class SharedRace:
         else:
             engine.start_at(*start)
         self._tick, self._asked = 0, -1
-        if self.grid.crew is not None:
-            self.grid.crew.begin()
+        if self.loaded.crew is not None:
+            self.loaded.crew.begin()
 
     def join(self) -> None:
         """Let all agents begin in a race that is begun elsewhere."""
@@ -183,11 +184,11 @@ class SharedRace:
 
     def ask(self) -> None:
         """Ask the opponents that are agents what they do next, once before each timestep."""
-        if self.grid.crew is not None and self._asked != self._tick:
+        if self.loaded.crew is not None and self._asked != self._tick:
             engine = self.world(0).engine
             muted = engine.mute_noise(False)  # opponents see with noise, whoever looks on
             try:
-                self.grid.crew.act(self._tick)
+                self.loaded.crew.act(self._tick)
             finally:
                 engine.mute_noise(muted)
             self._asked = self._tick

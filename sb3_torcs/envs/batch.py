@@ -15,8 +15,7 @@ from sb3_torcs.actions import actions_of_races, controls_from_action
 from sb3_torcs.backends.base import Backend, Fleet
 from sb3_torcs.backends.lite.backend import LiteBackend
 from sb3_torcs.backends.lite.fleet import LiteFleet
-from sb3_torcs.backends.native import Fleet as NativeFleet
-from sb3_torcs.backends.native import NativeBackend
+from sb3_torcs.backends.native import NativeBackend, NativeFleet
 from sb3_torcs.backends.seats import SeatWorld
 from sb3_torcs.backends.several import present_world
 from sb3_torcs.car import CAR_RECORD, CarState, Controls, FloatArray, car_from_record
@@ -24,7 +23,7 @@ from sb3_torcs.envs.aids import AIDS
 from sb3_torcs.envs.compiled import COMPILED, RULES, aid_cars, read_actions, value_timesteps
 from sb3_torcs.envs.info import racing_info
 from sb3_torcs.envs.racing import RacingEnv
-from sb3_torcs.errors import CarLost, InvalidOption
+from sb3_torcs.errors import CarLost, InvalidAction, InvalidOption
 from sb3_torcs.rewards import Term
 from sb3_torcs.sensors import View
 
@@ -96,6 +95,8 @@ LAPS, LAST_LAP_TIME, SPEED_X = map(CarState._fields.index, ("laps", "last_lap_ti
 class Batch:
     """
     Racing environments that take their timesteps at once.
+
+    A "race" is the index of one of them here. Those whose cars share a race follow each other.
 
     This object holds the state of a race while :meth:`step` drives it. Call :meth:`leave` before
     the environment is used alone: it gives the state back. :meth:`enter` takes it over again.
@@ -235,7 +236,7 @@ class Batch:
             for env, row, seen in zip(self.envs, after, observations, strict=True):
                 self._view.add(car_from_record(row), env.backend, seen)
         for race, i, term, weight in self._in_python:
-            values[race, i] = self._ask(term, weight, before[race], after[race], controls[race])
+            values[race, i] = _ask(term, weight, before[race], after[race], controls[race])
         ended[failed] = True
         terms = values.tolist()
         return Outcome(
@@ -331,21 +332,20 @@ class Batch:
         shape = len(self.envs), len(low)
         rows = actions_of_races(asked, shape, ", as of model.predict(observations)")
         for race, row in enumerate(rows):
-            controls[race] = _row(controls_from_action(row, self._layout))
+            try:
+                controls[race] = _row(controls_from_action(row, self._layout))
+            except InvalidAction as error:
+                raise InvalidAction(f"environment {race}: {error}") from error
         return controls
 
-    def _ask(
-        self,
-        term: Term,
-        weight: float,
-        before: FloatArray,
-        after: FloatArray,
-        controls: FloatArray,
-    ) -> float:
-        """Return the weighted value of a term that is not compiled."""
-        was, car = car_from_record(before), car_from_record(after)
-        seconds = car.time - was.time
-        return weight * seconds * term(was, car, _controls(controls)) if seconds else 0.0
+
+def _ask(
+    term: Term, weight: float, before: FloatArray, after: FloatArray, controls: FloatArray
+) -> float:
+    """Return the weighted value of a term that is not compiled."""
+    was, car = car_from_record(before), car_from_record(after)
+    seconds = car.time - was.time
+    return weight * seconds * term(was, car, _controls(controls)) if seconds else 0.0
 
 
 def _clocks(rules: Any) -> tuple[int, int]:

@@ -17,7 +17,7 @@ from numba.extending import overload_attribute, register_jitable
 from sb3_torcs import actions, rewards
 from sb3_torcs.car import CarState, FloatArray
 from sb3_torcs.envs.aids import aided
-from sb3_torcs.envs.ends import STUCK_TICKS, end_of, stands
+from sb3_torcs.envs.ends import end_of, stands, waited
 from sb3_torcs.envs.slides import caught_steering, sideslip, slides
 from sb3_torcs.envs.unstick import freeing_controls, needs_freeing
 from sb3_torcs.rivals import needed_brake, needed_turn
@@ -63,7 +63,7 @@ _aids = (
     needed_brake, needed_turn, needs_freeing, freeing_controls, sideslip, slides, caught_steering,
     aided,
 )  # fmt: skip
-for _function in (end_of, stands, rewards.safe_speed, *_aids, *_readers):
+for _function in (end_of, stands, waited, rewards.safe_speed, *_aids, *_readers):
     register_jitable(_function)
 
 
@@ -161,7 +161,7 @@ def value_timesteps(
 
     :param before: (n,) cars
     :param after: (n,) cars
-    :param controls: (n,) that were held
+    :param controls: (n,) that were asked for, after the aids have changed them
     :param choices: (n, k) indices in :data:`COMPILED`, negative for none
     :param weights: (n, k) of the terms
     :param rules: (n,) of :data:`RULES`, whose clocks are changed
@@ -180,8 +180,7 @@ def value_timesteps(
                 terms[race, i] = weights[race, i] * seconds * value
         ended[race] = end_of(car, rule.laps, rule.runoff, rule.recovery) != 0
         if not ended[race]:
-            if stands(car):
-                rule.standing += rule.ticks
-                ended[race] = rule.standing > rule.patience
-            else:
-                rule.standing, rule.patience = 0, max(STUCK_TICKS, rule.recovery)
+            rule.standing, rule.patience = waited(
+                car, rule.standing, rule.patience, rule.ticks, rule.recovery
+            )
+            ended[race] = rule.standing > rule.patience

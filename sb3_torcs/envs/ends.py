@@ -14,6 +14,7 @@ __all__ = [
     "TRUNCATING",
     "end_of",
     "stands",
+    "waited",
 ]
 
 STUCK_SPEED = 5.0 / KMH  # [m/s] along the road; slower than walking counts as standing
@@ -58,3 +59,21 @@ def stands(car: CarState) -> bool:
     """
     along = math.cos(car.heading_error)
     return along < 0.0 or car.speed_x * along < STUCK_SPEED
+
+
+def waited(
+    car: CarState, standing: int, patience: int, ticks: int, recovery: int
+) -> tuple[int, int]:
+    """
+    Let the clocks of a car that may stand go on. Compiled code calls it, too.
+
+    :param car: at the end of a timestep
+    :param standing: for how long it has been standing [control ticks]
+    :param patience: for how long it may [control ticks]
+    :param ticks: of the timestep
+    :param recovery: how long a car may be without headway [control ticks]
+    :return: ``standing`` and ``patience`` now; who stands for longer than that is stuck
+    """
+    if stands(car):
+        return standing + ticks, patience
+    return 0, max(STUCK_TICKS, recovery)

@@ -26,6 +26,7 @@ __all__ = [
     "checked_threads",
     "checked_time_limit",
     "env_makers",
+    "refuse_flag",
 ]
 
 EnvMaker = Callable[[], gym.Env[Any, Any]]
@@ -108,16 +109,26 @@ def _shared(races: int, agents: int, env_id: str, env_kwargs: dict[str, Any]) ->
             f"agents is {agents}, and {env_id} has one car in each race; races are of Torcs-v0"
         )
     options = dict(env_kwargs)
-    if checked_flag("flagged", options.pop("flagged", False)):
-        raise InvalidOption(
-            "flagged is True, but a car that is flagged off leaves its race, and here it rejoins; "
-            "leave it out, or race by sb3_torcs.parallel_env"
-        )
+    refuse_flag(checked_flag("flagged", options.pop("flagged", False)))
     limits = _limits(options.pop("max_episode_steps", None), env_id, races)
     envs = [(env, limit) for limit in limits for env in make_race(agents, **options)]
     for env, _ in envs:  # RecordCallback reads it, as gym.make writes it
         env.spec = replace(gym.spec(env_id), kwargs=options, max_episode_steps=None)
     return [partial(_limited, env, limit) for env, limit in envs]
+
+
+def refuse_flag(flagged: bool) -> None:
+    """
+    Refuse a race whose agents are flagged off.
+
+    :param flagged: whether they are
+    :raises InvalidOption: if so
+    """
+    if flagged:
+        raise InvalidOption(
+            "flagged is True, but a car that is flagged off leaves its race, and here it rejoins; "
+            "leave it out, or race by sb3_torcs.parallel_env"
+        )
 
 
 def _limits(steps: Any, env_id: str, races: int) -> list[int]:

@@ -15,7 +15,7 @@ from pettingzoo import ParallelEnv
 
 from sb3_torcs.car import CarState, check_count
 from sb3_torcs.envs.making import NO_LIMIT, checked_time_limit
-from sb3_torcs.envs.starts import RESET_OPTIONS, read_start
+from sb3_torcs.envs.starts import RESET_OPTIONS
 from sb3_torcs.envs.torcs_race import RaceCarEnv, make_race
 from sb3_torcs.errors import EnvClosed, InvalidAction, InvalidOption
 
@@ -114,7 +114,7 @@ class TorcsParallelEnv(ParallelEnv[str, Observation, Action]):
             check_count("seed", seed, least=0)
         given = options if isinstance(options, Mapping) else {}
         options = {name: given[name] for name in RESET_OPTIONS if name in given}
-        read_start(options, next(iter(self._envs.values())).track.length)  # before anything changes
+        next(iter(self._envs.values())).check_start(options)  # before anything changes
         self._race.end()
         self.agents = []
         answers = {
@@ -144,6 +144,7 @@ class TorcsParallelEnv(ParallelEnv[str, Observation, Action]):
         self._steps += 1
         late = self._steps >= self._limit
         answers: tuple[dict[str, Any], ...] = ({}, {}, {}, {}, {})
+        over = []
         for name, env in racing.items():
             seen, reward, terminated, truncated, info = env.finish_step(partial(_car, env, failure))
             truncated = truncated or (late and not terminated)
@@ -151,8 +152,10 @@ class TorcsParallelEnv(ParallelEnv[str, Observation, Action]):
             for part, value in zip(answers, values, strict=True):
                 part[name] = value
             if terminated or truncated:
-                self.agents.remove(name)
-                env.seat.retire()
+                over.append(name)
+        for name in over:  # only now, since the others have still seen these cars
+            self.agents.remove(name)
+            racing[name].seat.retire()
         return answers
 
     def _check_open(self, what: str) -> None:

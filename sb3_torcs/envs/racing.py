@@ -31,7 +31,7 @@ from sb3_torcs.car import (
 )
 from sb3_torcs.envs.aids import NEED_RIVALS, Aids
 from sb3_torcs.envs.conditions import Conditions, Delay, Part
-from sb3_torcs.envs.ends import GRACE_TICKS, REASONS, STUCK_TICKS, TRUNCATING, end_of, stands
+from sb3_torcs.envs.ends import GRACE_TICKS, REASONS, STUCK_TICKS, TRUNCATING, end_of, waited
 from sb3_torcs.envs.info import racing_info
 from sb3_torcs.envs.starts import Starts, read_start
 from sb3_torcs.errors import CarLost, EnvClosed, InvalidOption, StartBlocked
@@ -265,9 +265,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         """
         if self._closed:
             raise EnvClosed("reset after close; make a new environment")
-        is_given = options is not None and not (isinstance(options, Mapping) and not options)
-        if is_given:
-            read_start(options, self.track.length)  # a wrong one leaves the episode as it is
+        is_given = self.check_start(options)  # a wrong one leaves the episode as it is
         super().reset(seed=seed)
         self.car = None  # if the reset fails, no step is possible
         if self._draw_track is not None:
@@ -295,6 +293,19 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
             self.render()
         seen = self.view.encode(self.car, self.backend)
         return seen, racing_info(self.car, 0.0, self.reward.nothing(), None)
+
+    def check_start(self, options: dict[str, Any] | None) -> bool:
+        """
+        Check the options of a reset, which are for the track of now.
+
+        :param options: as of ``reset``
+        :return: whether they say where to start
+        :raises InvalidOption: if a name or a value is wrong
+        """
+        if options is None or (isinstance(options, Mapping) and not options):
+            return False
+        read_start(options, self.track.length)
+        return True
 
     def step(
         self, action: npt.NDArray[np.float32]
@@ -368,7 +379,10 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
 
     @property
     def controls(self) -> Controls:
-        """The controls that were asked for in the last timestep."""
+        """What the driver asked for in the last timestep, after the aids have changed it.
+
+        With a delay, earlier controls were held meanwhile.
+        """
         return self._controls
 
     def finish_step(
@@ -456,11 +470,9 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         reason = end_of(car, laps, self.runoff, self.recovery_ticks)
         if reason:
             return REASONS[reason]
-        if not stands(car):
-            self.standing, self.patience = 0, max(STUCK_TICKS, self.recovery_ticks)
-            return self._end_of_race()
-        self.standing += self.action_repeat
-        return "stuck" if self.standing > self.patience else self._end_of_race()
-
-    def _end_of_race(self) -> str | None:
+        self.standing, self.patience = waited(
+            car, self.standing, self.patience, self.action_repeat, self.recovery_ticks
+        )
+        if self.standing > self.patience:
+            return "stuck"
         return "race" if self._race_is_over else None

@@ -12,7 +12,7 @@ import numpy as np
 
 from sb3_torcs.actions import ActionName, GearboxName, used_gearbox
 from sb3_torcs.backends.native import load_race
-from sb3_torcs.backends.seats import Grid, Seat, SeatWorld, SharedRace
+from sb3_torcs.backends.seats import LoadedRace, Seat, SeatWorld, SharedRace
 from sb3_torcs.backends.several import is_several, world_pool
 from sb3_torcs.car import (
     DEFAULT_CAR,
@@ -28,7 +28,7 @@ from sb3_torcs.torcs.drivers import crew_of
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.starting_list import guests_of, starting_list
 
-__all__ = ["RaceCarEnv", "make_grid", "make_race", "make_shared_race"]
+__all__ = ["RaceCarEnv", "load_shared_race", "make_race", "make_shared_race"]
 
 
 OF_ONE_AGENT = {
@@ -56,7 +56,7 @@ class RaceCarEnv(RacingEnv):
         return super()._end(car) or ("laps" if self.seat.finished else None)
 
 
-def make_grid(
+def load_shared_race(
     track: str | Path,
     car: str,
     *,
@@ -67,7 +67,7 @@ def make_grid(
     grid_place: int | None = None,
     gearbox: str = "automatic",
     flagged: bool = False,
-) -> Grid:
+) -> LoadedRace:
     """
     Load a race of several agents, for a :class:`~sb3_torcs.backends.seats.SharedRace`.
 
@@ -99,7 +99,7 @@ def make_grid(
     ]
     if crew is not None:
         crew.board(worlds[agents:])
-    return Grid(worlds[:agents], crew)
+    return LoadedRace(worlds[:agents], crew, flagged)
 
 
 def make_race(
@@ -192,7 +192,7 @@ def make_shared_race(
     :param grid_place: as there
     :param sensor_noise: as there
     :param action_repeat: of the agents; opponents that are agents have to have the same
-    :param shared: of all races, as of :func:`make_grid`
+    :param shared: of all races, as of :func:`load_shared_race`
     """
     listed = isinstance(opponents, (list, tuple))
     several = listed and any(isinstance(field, (list, tuple)) for field in opponents)
@@ -203,18 +203,24 @@ def make_shared_race(
         fields,
         grid_place if is_several(grid_place, "grid_place") else [grid_place],
     )
-    grids = world_pool(
+    races = world_pool(
         [
             partial(
-                make_grid, one, model, agents=agents, opponents=field, grid_place=place, **shared
+                load_shared_race,
+                one,
+                model,
+                agents=agents,
+                opponents=field,
+                grid_place=place,
+                **shared,
             )
             for one, model, field, place in choices
         ]
     )
-    for grid in grids.examples:
-        if grid.crew is not None and grid.crew.action_repeats != {action_repeat}:
+    for race in races.examples:
+        if race.crew is not None and race.crew.action_repeats != {action_repeat}:
             raise InvalidOption(
                 f"action_repeat is {action_repeat!r}, and agents among the opponents were trained "
-                f"with {', '.join(map(str, sorted(grid.crew.action_repeats)))}; give all the same"
+                f"with {', '.join(map(str, sorted(race.crew.action_repeats)))}; give all the same"
             )
-    return SharedRace(grids, sensor_noise)
+    return SharedRace(races, sensor_noise)

@@ -14,7 +14,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from sb3_torcs.actions import actions_of_races
-from sb3_torcs.backends.native import Fleet
+from sb3_torcs.backends.native import NativeFleet
 from sb3_torcs.backends.several import present_world, shared_worlds
 from sb3_torcs.car import CarState, check_count
 from sb3_torcs.envs.conditions import Part
@@ -84,14 +84,15 @@ class TorcsVectorEnv(SyncVectorEnv):
             )
         limit = checked_time_limit(max_episode_steps, "Torcs-v0")
         timesteps = math.inf if limit == NO_LIMIT else limit
-        self.envs: list[_Race]  # type: ignore[assignment]  # a list of Env, says Gymnasium
+        self.envs: list[_LimitedRace]  # type: ignore[assignment]  # a list of Env, says Gymnasium
         self._env_obs: list[Observation | None]  # type: ignore[assignment]  # of None, says Gymnasium
         super().__init__(
-            [lambda: _Race(timesteps, **options)] * int(num_envs), autoreset_mode=autoreset_mode
+            [lambda: _LimitedRace(timesteps, **options)] * int(num_envs),
+            autoreset_mode=autoreset_mode,
         )
         self.threads = min(most, self.num_envs)
         worlds: list[Any] = [present_world(env.backend) for env in self.envs]
-        self._fleet: Any = Fleet(worlds, self.threads)
+        self._fleet: Any = NativeFleet(worlds, self.threads)
 
     def step(self, actions: Iterable[npt.NDArray[np.float32]]) -> Answers:
         """
@@ -205,7 +206,7 @@ class TorcsVectorEnv(SyncVectorEnv):
         super().close_extras(**kwargs)
 
 
-class _Race(TorcsEnv):
+class _LimitedRace(TorcsEnv):
     """One of the races, which counts its timesteps as ``TimeLimit`` would."""
 
     def __init__(self, timesteps: float, **options: Any) -> None:

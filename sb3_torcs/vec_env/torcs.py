@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, MutableMapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from typing import Any, NoReturn, Self
+from typing import Any, NoReturn
 
 import gymnasium as gym
 import numpy as np
@@ -19,101 +19,15 @@ from sb3_torcs.backends.seats import Seat, SharedRace
 from sb3_torcs.backends.several import shared_worlds
 from sb3_torcs.car import check_count
 from sb3_torcs.envs.batch import Batch, Outcome
-from sb3_torcs.envs.info import RacingInfo
-from sb3_torcs.envs.making import MANY_RACES, EnvMaker, checked_threads, env_makers
+from sb3_torcs.envs.making import MANY_RACES, EnvMaker, checked_threads, env_makers, refuse_flag
 from sb3_torcs.envs.racing import RacingEnv
 from sb3_torcs.errors import EnvClosed, InvalidOption
 from sb3_torcs.signals import held_back
+from sb3_torcs.vec_env.info import TRUNCATED, RaceInfo
 
-__all__ = ["RaceInfo", "TorcsVecEnv", "glance"]
+__all__ = ["TorcsVecEnv"]
 
-TRUNCATED = "TimeLimit.truncated"
 ENDLESS = 1 << 62
-
-
-class RaceInfo(MutableMapping[str, Any]):
-    """
-    The ``info`` of a race whose episode goes on. It computes its values when one is first read.
-
-    :param timestep: the outcome of a timestep of all races
-    :param race: index of the race
-    """
-
-    __slots__ = ("_race", "_timestep", "_values")
-
-    def __init__(self, timestep: Outcome, race: int) -> None:
-        self._timestep, self._race = timestep, race
-        self._values: dict[str, Any] | None = None
-
-    def get(self, name: str, default: Any = None) -> Any:
-        """Look a value up; see :class:`dict`."""
-        if self._values is None:
-            if name == "lap_time":  # asked of each race in each timestep, to show progress
-                return self.glance()[1]
-            if name not in RacingInfo.__annotations__:
-                return False if name == TRUNCATED else default
-        return self._made().get(name, default)
-
-    def glance(self) -> tuple[float, float, dict[str, float]]:
-        """Look up what :func:`glance` returns, without computing the rest."""
-        if self._values is not None:
-            return _glance(self._values)
-        return self._timestep.glance(self._race)
-
-    def copy(self) -> dict[str, Any]:
-        """Make a dict of it."""
-        return self._made().copy()
-
-    def _made(self) -> dict[str, Any]:
-        if self._values is None:
-            self._values = self._timestep.info(self._race)
-            self._values[TRUNCATED] = False
-        return self._values
-
-    def __getitem__(self, name: str) -> Any:
-        return self._made()[name]
-
-    def __setitem__(self, name: str, value: Any) -> None:
-        self._made()[name] = value
-
-    def __delitem__(self, name: str) -> None:
-        del self._made()[name]
-
-    def __or__(self, other: Mapping[str, Any]) -> dict[str, Any]:
-        return self._made() | dict(other) if isinstance(other, Mapping) else NotImplemented
-
-    def __ror__(self, other: Mapping[str, Any]) -> dict[str, Any]:
-        return dict(other) | self._made() if isinstance(other, Mapping) else NotImplemented
-
-    def __ior__(self, other: Mapping[str, Any] | Iterable[tuple[str, Any]]) -> Self:
-        self._made().update(other)
-        return self
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._made())
-
-    def __len__(self) -> int:
-        return len(self._made())
-
-    def __repr__(self) -> str:
-        return repr(self._made())
-
-    def __reduce__(self) -> tuple[type, tuple[dict[str, Any]]]:
-        return dict, (self._made(),)
-
-
-def glance(info: MutableMapping[str, Any]) -> tuple[float, float, dict[str, float]]:
-    """
-    Look up what a timestep came to, at the least cost.
-
-    :param info: of the timestep
-    :return: speed [m/s], time of the lap that it completed, or 0 [s], and terms of the reward
-    """
-    return info.glance() if isinstance(info, RaceInfo) else _glance(info)
-
-
-def _glance(info: Mapping[str, Any]) -> tuple[float, float, dict[str, float]]:
-    return info["car"].speed_x, info.get("lap_time", 0.0), info.get("reward_terms", {})
 
 
 class TorcsVecEnv(DummyVecEnv):
@@ -178,16 +92,16 @@ class TorcsVecEnv(DummyVecEnv):
             makers = [partial(_monitored, make) for make in made]
         super().__init__(makers)
         try:
-            self._races = [_Race(env) for env in self._envs]
-            self._shared = _shared_races([race.racing for race in self._races])
-            self._batch = Batch([race.racing for race in self._races], most)
+            self._wrappers = [_Wrappers(env) for env in self._envs]
+            self._shared = _shared_races([wrappers.racing for wrappers in self._wrappers])
+            self._batch = Batch([wrappers.racing for wrappers in self._wrappers], most)
         except BaseException:
             self.close()
             raise
         self.threads = self._batch.threads
         self._elapsed = np.zeros(self.num_envs, np.int64)  # timesteps of the episodes
         self._limits = np.full(self.num_envs, ENDLESS)
-        self._watched = [i for i, race in enumerate(self._races) if race.is_watched]
+        self._watched = [i for i, wrappers in enumerate(self._wrappers) if wrappers.is_watched]
 
     @property
     def envs(self) -> list[gym.Env[Any, Any]]:
@@ -213,7 +127,10 @@ class TorcsVecEnv(DummyVecEnv):
         Begin an episode in each environment.
 
         :return: observations
+        :raises InvalidOption: if an option is wrong, and the episodes go on
         """
+        for wrappers, options in zip(self._wrappers, self._options, strict=True):
+            wrappers.racing.check_start(options)  # a wrong one leaves all races as they are
         for race in self._shared:
             race.end()
         return super().reset()
@@ -240,7 +157,7 @@ class TorcsVecEnv(DummyVecEnv):
             self._end_races(over)
             self._elapsed += ~over
             for i in np.flatnonzero(~over).tolist():
-                self._races[i].append(timestep.rewards[i])
+                self._wrappers[i].append(timestep.rewards[i])
             last: dict[int, Any] = {}
             for i in np.flatnonzero(over).tolist():
                 with self._kept(failures, i):
@@ -254,7 +171,7 @@ class TorcsVecEnv(DummyVecEnv):
             self._leave()
         for i in self._watched:
             if not over[i]:  # an environment whose episode ended has drawn itself
-                self._races[i].racing.render()
+                self._wrappers[i].racing.render()
         if failures:
             raise failures[0]
         return timestep.observations, rewards, dones, infos
@@ -266,7 +183,7 @@ class TorcsVecEnv(DummyVecEnv):
         timestep = batch.step(self.actions)
         for race, members in self._shared.items():
             first = min(members.values())
-            race.advance(self._races[first].racing.action_repeat)
+            race.advance(self._wrappers[first].racing.action_repeat)
         return timestep
 
     def _end_races(self, over: npt.NDArray[np.bool_]) -> None:
@@ -277,7 +194,7 @@ class TorcsVecEnv(DummyVecEnv):
                 race.end()
                 for i in members.values():
                     if not over[i]:
-                        self._races[i].racing.end_race()
+                        self._wrappers[i].racing.end_race()
                     over[i] = True
 
     @contextlib.contextmanager
@@ -286,12 +203,12 @@ class TorcsVecEnv(DummyVecEnv):
         try:
             yield
         except Exception as error:
-            error.add_note(f"in race {i} of {self.num_envs}")
+            error.add_note(f"in environment {i} of {self.num_envs}")
             failures.append(error)
 
     def _finish(self, i: int, timestep: Outcome) -> Any:
         """Take the last timestep of an episode through all wrappers; return what they return."""
-        self._races[i].leave(int(self._elapsed[i]))
+        self._wrappers[i].leave(int(self._elapsed[i]))
         return self._open_batch.finish(i, timestep, partial(self._envs[i].step, self.actions[i]))
 
     def _go_on(self, i: int, answer: Any) -> tuple[Any, float, bool, dict[str, Any]]:
@@ -313,16 +230,16 @@ class TorcsVecEnv(DummyVecEnv):
         self._driving = True
 
     def _enter_race(self, i: int) -> None:
-        self._elapsed[i], self._limits[i] = self._races[i].enter()
+        self._elapsed[i], self._limits[i] = self._wrappers[i].enter()
         self._open_batch.enter(i)
 
     def _leave(self) -> None:
         """Give the states of all races back to their environments."""
         self._driving = False
         if self._batch is not None:
-            for i, race in enumerate(self._races):
+            for i, wrappers in enumerate(self._wrappers):
                 self._batch.leave(i)
-                race.leave(int(self._elapsed[i]))
+                wrappers.leave(int(self._elapsed[i]))
 
     def __reduce__(self) -> NoReturn:
         raise InvalidOption(
@@ -340,7 +257,7 @@ class TorcsVecEnv(DummyVecEnv):
                 closing.callback(env.close)
 
 
-class _Race:
+class _Wrappers:
     """
     The wrappers of one environment, which count timesteps and sum rewards.
 
@@ -427,10 +344,11 @@ def _shared_races(envs: Sequence[RacingEnv]) -> dict[SharedRace, dict[int, int]]
         seat: Any = env.backend
         if isinstance(seat, Seat):
             members.setdefault(seat.race, {})[seat.number] = i
-    for race in members.values():
-        if max(race.values()) - min(race.values()) >= len(race):
+    for race, places in members.items():
+        refuse_flag(race.loaded.flagged)
+        if max(places.values()) - min(places.values()) >= len(places):
             raise InvalidOption(
-                f"environments {sorted(race.values())} are the agents of one race, with others "
+                f"environments {sorted(places.values())} are the agents of one race, with others "
                 "between them; list the agents of each race one after the other"
             )
     return members
