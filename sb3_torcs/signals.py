@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
 from types import FrameType
+from typing import Any
 
-__all__ = ["answered", "counted_interrupts", "handlers_kept", "held_back"]
+__all__ = ["answered", "counted_interrupts", "handlers_kept", "held_back", "ignored_interrupts"]
+
+SOON = 0.1  # [s] until a signal that was ignored comes again
 
 
 @contextlib.contextmanager
@@ -63,6 +67,40 @@ def counted_interrupts(passed: int, message: str) -> Iterator[list[int]]:
 
     with answered(note, signal.SIGINT, signal.SIGTERM):
         yield seen
+
+
+@contextlib.contextmanager
+def ignored_interrupts() -> Iterator[None]:
+    """
+    Let Ctrl-C come again where Python ignores it: in functions that C calls, as numba does.
+
+    What numba raises after it was ignored counts as the interrupt, too.
+
+    :raises KeyboardInterrupt: in place of such an error
+    """
+    again: list[threading.Timer] = []
+    before = sys.unraisablehook
+
+    def note(unraisable: Any) -> None:
+        if not issubclass(unraisable.exc_type, KeyboardInterrupt):
+            before(unraisable)
+            return
+        again.append(threading.Timer(SOON, os.kill, [os.getpid(), signal.SIGINT]))
+        # Whoever has a handler of its own counts signals, and knows of this one.
+        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+            again[-1].start()
+
+    sys.unraisablehook = note
+    try:
+        yield
+    except RuntimeError as error:
+        if again and type(error) is RuntimeError:
+            raise KeyboardInterrupt from error
+        raise
+    finally:
+        for timer in again:
+            timer.cancel()
+        sys.unraisablehook = before
 
 
 @contextlib.contextmanager

@@ -2,6 +2,7 @@
 
 import argparse
 import concurrent.futures
+import ctypes
 import errno
 import os
 import pickle
@@ -66,6 +67,22 @@ class RaisingCallback(BaseCallback):
     def _on_step(self):
         if self.num_timesteps == self.at:
             raise eval(self.error)
+        return True
+
+
+@ctypes.CFUNCTYPE(None)
+def called_by_c():
+    """Raise what Python ignores, since C cannot pass it on."""
+    signal.raise_signal(signal.SIGINT)
+
+
+class CompilingCallback(BaseCallback):
+    """Fails as numba does after a Ctrl-C while it compiled."""
+
+    def _on_step(self):
+        if self.num_timesteps == 45:
+            called_by_c()
+            raise RuntimeError("no compiled object yet")
         return True
 
 
@@ -291,6 +308,13 @@ def test_what_was_learned_until_an_error_is_kept(capsys, tmp_path, error, said):
     assert "45 of 60 timesteps" in err
     assert models.saved_timesteps(folder / "TorcsLite-v0.zip") == 45
     assert load_from_pkl(folder / REPLAY_BUFFER).size() == 44
+
+
+def test_an_interrupt_that_python_ignored_ends_a_training_as_any_other(capsys, tmp_path):
+    callback = f"{__name__}.CompilingCallback"
+    assert main([*words_of(tmp_path, callback=[callback]), "--eval-freq", "30"]) == 130
+    assert models.saved_timesteps(run_folder(tmp_path) / "TorcsLite-v0.zip") == 45
+    assert "go on with" in capsys.readouterr().out
 
 
 @pytest.mark.slow

@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+import ctypes
 import signal
+import time
 
 import pytest
 
-from sb3_torcs.signals import held_back
+from sb3_torcs.signals import held_back, ignored_interrupts
+
+
+@ctypes.CFUNCTYPE(None)
+def called_by_c():
+    """Raise what Python ignores, since C cannot pass it on."""
+    signal.raise_signal(signal.SIGINT)
 
 
 def test_a_signal_waits_until_the_work_is_done():
@@ -31,3 +39,28 @@ def test_an_ignored_signal_stays_ignored():
         assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     finally:
         signal.signal(signal.SIGHUP, before)
+
+
+def test_an_interrupt_that_python_ignores_comes_again():
+    @ignored_interrupts()
+    def work():
+        called_by_c()
+        time.sleep(20.0)
+
+    with pytest.raises(KeyboardInterrupt):
+        work()
+
+
+def test_an_error_that_follows_an_ignored_interrupt_is_the_interrupt():
+    @ignored_interrupts()
+    def work():
+        called_by_c()
+        raise RuntimeError("no compiled object yet")
+
+    with pytest.raises(KeyboardInterrupt):
+        work()
+
+
+def test_other_errors_are_none():
+    with pytest.raises(RuntimeError, match="else"), ignored_interrupts():
+        raise RuntimeError("something else")

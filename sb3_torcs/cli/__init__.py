@@ -33,7 +33,7 @@ from sb3_torcs.cli.common import CACHE_FIX, INTERRUPTED, READER_LEFT, drop_outpu
 from sb3_torcs.cli.parser import Parser
 from sb3_torcs.cli.plain import any_terminal, open_streams
 from sb3_torcs.errors import Sb3TorcsError
-from sb3_torcs.signals import answered
+from sb3_torcs.signals import answered, ignored_interrupts
 
 __all__ = ["main"]
 
@@ -84,7 +84,7 @@ def _run(args: argparse.Namespace) -> int:
     try:
         # Under nohup, SIGHUP is ignored and stays so.
         ends = [n for n in (SIGTERM, SIGHUP) if signal.getsignal(n) == signal.SIG_DFL]
-        with answered(_end, *ends):
+        with answered(_end, *ends), ignored_interrupts():
             status: int = args.run(args)
         sys.stdout.flush()
     except Sb3TorcsError as error:

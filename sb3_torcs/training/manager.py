@@ -335,6 +335,8 @@ class Manager(_EntryManager):
             with self._named_errors():
                 super().learn(model)
         except Exception as error:
+            if self.interrupts and type(error) is RuntimeError:
+                return  # numba's, after a Ctrl-C that Python has ignored while it compiled
             if model.num_timesteps == 0 and isinstance(error, InvalidOption):
                 self._leave_nothing()  # a callback has refused to begin
                 raise
