@@ -178,7 +178,9 @@ TERMS: dict[str, Term] = {
 OWN_TERMS: tuple[Term, ...] = tuple(TERMS.values())
 """Those of this package, which return numbers."""
 
-LARGEST = 1e9  # of a weight, so that no reward is infinite
+# So that no reward is infinite in single precision, in which SB3 sums them up.
+LARGEST = 1e9  # of a weight
+LARGEST_VALUE = 1e24  # of a term that was added
 SCALE = 0.1  # [1/m] a reward of 1 for ten metres along the road
 CRASH = -1.0  # when an episode ends off the road, backwards, stuck or damaged
 
@@ -298,6 +300,9 @@ def _checked_term(name: str, term: Term) -> Term:
 
 def _finite(name: str, term: Term, before: CarState, after: CarState, controls: Controls) -> float:
     value = term(before, after, controls)
-    if not is_number(value):
-        raise InvalidOption(f"reward term '{name}' returned {value!r}; expected a finite number")
+    if not (is_number(value) and abs(value) <= LARGEST_VALUE):
+        raise InvalidOption(
+            f"reward term '{name}' returned {value!r}; expected a finite number, of at most "
+            f"{LARGEST_VALUE:g}"
+        )
     return float(value)

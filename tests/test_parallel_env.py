@@ -136,8 +136,13 @@ def test_a_refused_reset_leaves_the_race_as_it_is(make):
     env = make(2)
     env.reset(seed=0)
     env.agents.remove("agent_0")
-    with pytest.raises(InvalidOption, match="speed is 1000"):
-        env.reset(options={"speed": 1000.0})
+    for options, message in (
+        ({"speed": 1000.0}, "speed is 1000"),
+        ({"spede": 20.0}, "unknown reset option 'spede'; allowed: distance"),
+        (3, "options of reset is 3; expected a dict"),
+    ):
+        with pytest.raises(InvalidOption, match=message):
+            env.reset(options=options)
     assert env.agents == ["agent_1"]
     env.step({"agent_1": GAS})
 

@@ -197,7 +197,7 @@ def test_a_weight_must_be_a_number(weight):
         Reward({"progress": weight})
 
 
-@pytest.mark.parametrize("value", [None, "1", np.ones(1), math.nan, math.inf])
+@pytest.mark.parametrize("value", [None, "1", np.ones(1), math.nan, math.inf, -1e30])
 def test_a_term_that_somebody_adds_returns_a_finite_number(monkeypatch, value):
     """So it is the same in one environment and in a batch of them, and the message names it."""
     monkeypatch.setitem(TERMS, "odd", lambda *_: value)

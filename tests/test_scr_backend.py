@@ -195,6 +195,7 @@ def test_a_lost_or_doubled_datagram_changes_nothing(backend):
         ({"sensor_noise": True}, InvalidOption, "-noisy"),
         ({"port": 3001}, InvalidOption, "add host='localhost'"),
         ({"host": 5}, InvalidOption, "host is 5; expected a name, e.g. 'localhost', or None"),
+        ({"host": ""}, InvalidOption, "host is ''; expected a name"),
         ({"host": "localhost", "port": 99999}, InvalidOption, "expected 1 to 65535"),
         ({"host": "localhost", "opponents": ["inferno"]}, InvalidOption, "serve --robots"),
         ({"backend": "native", "host": "localhost"}, InvalidOption, "add backend='scr'"),

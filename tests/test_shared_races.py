@@ -326,6 +326,11 @@ class TestMistakes:
         envs.set_options({"distance": "x"})
         with pytest.raises(InvalidOption, match="distance"):
             envs.reset()
+        envs.set_options([{}])
+        with pytest.raises(InvalidOption, match="a list of 1 for 3 environments; give one dict"):
+            envs.reset()
+        with pytest.raises(InvalidOption, match="seed is 'x'"):
+            envs.seed("x")
         envs.set_options()
         dones = np.zeros(3, np.bool_)
         while not dones.any():

@@ -55,6 +55,7 @@ def test_the_shipped_studies_can_be_run(path):
         ({"final_tracks": 3}, "expected a list of tracks, or of 'road', 'oval', 'dirt'"),
         ({"env": "Torc-v0"}, "no environment 'Torc-v0' is registered; did you mean 'Torcs-v0'?"),
         ({"algo": "dpg"}, "no hyperparameters are shipped for the algorithm 'dpg'"),
+        ({"algo": "a2c"}, "for the algorithm 'a2c'; shipped: crossq, ddpg"),
         ({"algo": "dqn"}, "for another one give a file: conf_file: FILE.yml"),
         ({"conf_file": "none.yml"}, "there is no hyperparameter file"),
         ({"entry": "as the pots"}, "did you mean 'as the post'?"),

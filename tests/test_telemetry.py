@@ -18,7 +18,7 @@ from sb3_torcs.agents.robots import race
 from sb3_torcs.agents.scripted import ScriptedDriver
 from sb3_torcs.car import Controls
 from sb3_torcs.cli import main
-from sb3_torcs.errors import DriveFileError, OutputNotWritable
+from sb3_torcs.errors import DriveFileError, InvalidOption, OutputNotWritable
 from sb3_torcs.evaluation.protocol import evaluate, race_environment
 from sb3_torcs.evaluation.ticks import log_drives
 from sb3_torcs.sensors import SENSORS
@@ -66,6 +66,13 @@ def log_without_gears():
     log = DriveLog()
     log.add(LABEL, car_state(), Controls(0.0, 0.0, 0.0))
     return log
+
+
+def test_a_log_refuses_other_labels_and_other_kinds_of_files(tmp_path):
+    with pytest.raises(InvalidOption, match="label is 'x'; give a DriveLabel"):
+        DriveLog().add("x", car_state(), Controls(0.0, 0.0, 0.0))
+    with pytest.raises(OutputNotWritable, match=r"should end in \.parquet"):
+        log_without_gears().write(tmp_path / "drive.csv")
 
 
 def test_a_gear_that_nobody_asked_for_is_missing(tmp_path):

@@ -106,7 +106,7 @@ class ScrBackend:
             "port": port,
             "gearbox": gearbox,
         }
-        if host is not None and not isinstance(host, str):
+        if host is not None and not (isinstance(host, str) and host):
             raise InvalidOption(f"host is {host!r}; expected a name, e.g. 'localhost', or None")
         self._own = host is None
         self._address = (HOST if host is None else host, SCR_PORT if port is None else port)

@@ -132,7 +132,7 @@ def _figures(agent: Agent) -> dict[str, Any]:
     median, late, longest = np.percentile(latencies, (50, 99, 100))
     return {
         "laps": len(agent.lap_times),
-        "lap_times": agent.lap_times,
+        "lap_times": [round(seconds, 3) for seconds in agent.lap_times],
         "distance": agent.distance,
         "ticks": len(latencies),
         "lost_ticks": agent.backend.lost_ticks,

@@ -218,9 +218,10 @@ def _check_options(settings: Sequence[tuple[str, Any]]) -> None:
             )
         if name in OPTIONS:
             one = value[0] if isinstance(value, list) and value else value
+            shown = name.upper() if one in ([], None, "") else one
             raise InvalidOption(
                 f"--env-kwargs has {name}={value}, for which there is an option; type "
-                f"--{name.replace('_', '-')} {one} instead"
+                f"--{name.replace('_', '-')} {shown} instead"
             )
 
 

@@ -28,10 +28,8 @@ __all__ = ["add_parser", "run"]
 
 ROBOT_HEADERS = ("robot", "index", "name", "car")
 
-DRIVING = {
-    "index": None, "track": "aalborg", "laps": 3, "rivals": None, "game": False, "telemetry": None,
-}  # fmt: skip
-"""Options of a drive, and what they are if they are not given."""
+DRIVING = ("index", "track", "laps", "rivals", "game", "telemetry")
+"""Options of a drive, in vain where no robot is named."""
 
 DESCRIPTION = """\
 List the installed robots. With NAME, let one of them drive: alone in a practice session, or in a
@@ -56,9 +54,8 @@ def add_parser(subparsers: Any) -> None:
     add("name", nargs="?", metavar="NAME", help="the robot, e.g. inferno")
     add("--index", type=natural, metavar="I",
         help=f"which of the robot's drivers; default: that of {DEFAULT_CAR}")  # fmt: skip
-    add("--track", default=DRIVING["track"], metavar="T", help="the track; default: aalborg")
-    add("--laps", type=positive, default=DRIVING["laps"], metavar="N",
-        help="laps to drive; default: 3")  # fmt: skip
+    add("--track", metavar="T", help="the track; default: aalborg")
+    add("--laps", type=positive, metavar="N", help="laps to drive; default: 3")
     add("--with", dest="rivals", metavar="NAME:I,…",
         help="robots to race against; they start behind")  # fmt: skip
     add("--game", action="store_true", help="run the race in the game's text mode")
@@ -94,6 +91,8 @@ def run(args: argparse.Namespace) -> int:
         telemetry = writable_file(args.telemetry, (".parquet", ".csv"))
     name = args.name if args.index is None else f"{args.name}:{args.index}"
     robots = [game.parse_robot(name), *parsed_robots(args.rivals, game)]
+    args.track = "aalborg" if args.track is None else args.track
+    args.laps = 3 if args.laps is None else args.laps
     file = find_track(args.track, game)
     track = args.track if file.source == "file" else file.name
     with quiet_output(args.json):
@@ -113,8 +112,8 @@ def _check_only_listed(args: argparse.Namespace) -> None:
     """Refuse options of a drive where no robot is named: robots are only listed."""
     from sb3_torcs.errors import InvalidOption
 
-    for name, usual in DRIVING.items():
-        if getattr(args, name) != usual:
+    for name in DRIVING:
+        if getattr(args, name) not in (None, False):
             option = f"--{'with' if name == 'rivals' else name}"
             raise InvalidOption(f"{option} is for a robot that drives; name one: robots inferno")
 

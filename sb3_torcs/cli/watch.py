@@ -150,7 +150,8 @@ def _shows(game: Game, names: Sequence[str], args: argparse.Namespace) -> list[S
         for name, robot in zip(names, robots, strict=True)
     ]
     trained = [r.env_kwargs["track"] for r in records if "track" in r.env_kwargs]
-    track = one_of("track", args.track or next(iter(trained), "aalborg"))
+    usual = next(iter(trained), "aalborg")
+    track = one_of("track", usual if args.track is None else args.track)
     opponents = parsed_robots(args.robots, game)
     own = {} if args.car is None else {"car": args.car}
     settings = [{**record.kept(("car", *DRIVEN_WITH)), **own} for record in records]

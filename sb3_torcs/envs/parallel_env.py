@@ -15,7 +15,6 @@ from pettingzoo import ParallelEnv
 
 from sb3_torcs.car import CarState, check_count
 from sb3_torcs.envs.making import NO_LIMIT, checked_time_limit
-from sb3_torcs.envs.starts import RESET_OPTIONS
 from sb3_torcs.envs.torcs_race import RaceCarEnv, make_race
 from sb3_torcs.errors import EnvClosed, InvalidAction, InvalidOption
 
@@ -103,7 +102,7 @@ class TorcsParallelEnv(ParallelEnv[str, Observation, Action]):
 
         :param seed: of the random numbers of this and the following races
         :param options: where the field starts, as of ``Torcs-v0``; the place is the first agent's.
-            Other names are ignored: PettingZoo's tests hand over one
+            The name ``options`` is ignored: PettingZoo's own tests hand it over
         :return: observations and infos
         :raises InvalidOption: if the seed or options have wrong values, and the race before goes
             on; or if the game lets no car start there, and there is no race then
@@ -112,8 +111,8 @@ class TorcsParallelEnv(ParallelEnv[str, Observation, Action]):
         self._check_open("reset")
         if seed is not None:
             check_count("seed", seed, least=0)
-        given = options if isinstance(options, Mapping) else {}
-        options = {name: given[name] for name in RESET_OPTIONS if name in given}
+        if isinstance(options, Mapping):
+            options = {name: value for name, value in options.items() if name != "options"}
         next(iter(self._envs.values())).check_start(options)  # before anything changes
         self._race.end()
         self.agents = []

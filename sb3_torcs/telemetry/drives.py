@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from sb3_torcs.car import CarState, Controls
-from sb3_torcs.errors import DriveFileError
+from sb3_torcs.errors import DriveFileError, InvalidOption, OutputNotWritable
 from sb3_torcs.files import readable, whole_file
 from sb3_torcs.sensors import SENSORS
 from sb3_torcs.telemetry.table import CONTROL_FIELDS, STATE_FIELDS
@@ -81,7 +81,12 @@ class DriveLog:
         :param label: whose it is
         :param car: at the end of the control tick or timestep
         :param controls: that it was driven with
+        :raises InvalidOption: if the label is none
         """
+        if not isinstance(label, DriveLabel):
+            raise InvalidOption(
+                f"label is {label!r}; give a DriveLabel, as sb3_torcs.telemetry has it"
+            )
         gear = np.nan if controls.gear is None else controls.gear
         asked = (controls.steering, controls.throttle, controls.brake, gear)
         state = car[: len(STATE_FIELDS)]
@@ -140,11 +145,13 @@ class DriveLog:
         """
         Write all rows to a Parquet file.
 
-        :param path: of the file, which appears when it is complete
-        :raises OutputNotWritable: if the file cannot be written
+        :param path: of the file, which ends in ``.parquet`` and appears when it is complete
+        :raises OutputNotWritable: if the file has another ending or cannot be written
         """
         from pyarrow import parquet
 
+        if Path(path).suffix.lower() != ".parquet":
+            raise OutputNotWritable(f"'{path}' should end in .parquet, of which kind the file is")
         table = self.table()
         floats = [field.name for field in table.schema if str(field.type) == "double"]
         others = [field.name for field in table.schema if field.name not in floats]

@@ -190,9 +190,8 @@ def _entry(
     if resume is not None and "policy" in entry:
         place = zoo.Place(resume, "as it was recorded")
     else:
-        place = zoo.Place(
-            zoo.config_file(options.algo, options.conf_file), options.entry or options.env
-        )
+        name = options.env if options.entry is None else options.entry
+        place = zoo.Place(zoo.config_file(options.algo, options.conf_file), name)
         entry = {**zoo.read_entry(*place), **entry}
     if options.track is not None:
         entry["env_kwargs"] = {**(entry.get("env_kwargs") or {}), "track": options.track}

@@ -132,11 +132,13 @@ def config_file(
         return path
     path = shipped_folder() / f"{algo.removeprefix(SBX)}.yml"
     if not path.is_file():
+        from rl_zoo3 import ALGOS
+
         known = sorted(file.stem for file in shipped_folder().glob("*.yml"))
         advice = f"shipped: {', '.join(known)}; for another one give a file: {option}"
         raise ZooConfigError(
             f"no hyperparameters are shipped for the algorithm '{algo}'"
-            f"{near_miss(algo, known, advice)}"
+            f"{near_miss(algo, () if algo in ALGOS else known, advice)}"
         )
     return path
 

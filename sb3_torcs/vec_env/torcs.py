@@ -129,11 +129,28 @@ class TorcsVecEnv(DummyVecEnv):
         :return: observations
         :raises InvalidOption: if an option is wrong, and the episodes go on
         """
+        if len(self._options) != self.num_envs:
+            raise InvalidOption(
+                f"set_options got a list of {len(self._options)} for {self.num_envs} environments; "
+                "give one dict, or one for each"
+            )
         for wrappers, options in zip(self._wrappers, self._options, strict=True):
             wrappers.racing.check_start(options)  # a wrong one leaves all races as they are
         for race in self._shared:
             race.end()
         return super().reset()
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """
+        Seed the next reset, each environment by another number.
+
+        :param seed: of the first one; ``None`` draws it
+        :return: the seeds
+        :raises InvalidOption: if it is no whole number from 0 up
+        """
+        if seed is not None:
+            check_count("seed", seed, least=0)
+        return super().seed(seed)
 
     def step_wait(self) -> VecEnvStepReturn:
         """
