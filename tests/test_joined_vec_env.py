@@ -120,8 +120,9 @@ def test_parts_have_equal_spaces(make):
         JoinedVecEnv(make((1, FAST), (1, {**FAST, "action": "pedal"})))
     with pytest.raises(InvalidOption, match="parts is empty"):
         JoinedVecEnv([])
-    with pytest.raises(InvalidOption, match="parts is one vector environment; expected a list"):
-        JoinedVecEnv(make((1, FAST))[0])
+    for parts in (make((1, FAST))[0], None):
+        with pytest.raises(InvalidOption, match=r"parts is .*; expected a list of vector env"):
+            JoinedVecEnv(parts)
 
 
 def test_parts_are_different_vector_environments(make):

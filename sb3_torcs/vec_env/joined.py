@@ -36,8 +36,8 @@ class JoinedVecEnv(VecEnv):
     """
 
     def __init__(self, parts: Iterable[VecEnv]) -> None:
-        if isinstance(parts, VecEnv):
-            raise InvalidOption("parts is one vector environment; expected a list of them")
+        if isinstance(parts, VecEnv) or not isinstance(parts, Iterable):
+            raise InvalidOption(f"parts is {parts!r}; expected a list of vector environments")
         parts = tuple(parts)
         if not parts:
             raise InvalidOption("parts is empty; expected at least one vector environment")
