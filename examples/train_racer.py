@@ -4,7 +4,8 @@ Each car of each race is an environment of TorcsVecEnv, so that stock PPO learns
 It learns one track, or several, to race on those that it never saw. With --driver it goes on from a
 model that drives alone already, and sees what that model sees and other cars; with --racer it goes
 on from one that races. With --ancestor it goes on from either, and races against itself, this
-ancestor and robots.
+ancestor and robots. Who learns with --weight-decay becomes careful, and goes on without it to pass
+the others with less damage.
 """
 
 import argparse
@@ -127,19 +128,20 @@ def against(ancestor: str) -> Races:
     )  # fmt: skip
 
 
-def reward_alone(settings: Settings) -> dict[str, float]:
+def reward_alone(settings: Settings, args: argparse.Namespace) -> dict[str, float]:
     """Return the weights of the reward's terms for a car that is alone."""
     return {
         "progress": 1.0, "off_line": settings.off_line[0], "leaving": -0.5, "damage": -0.02,
-        "crash": -1.0, "scale": 0.1,
+        "crash": -1.0, "sliding": -args.sliding, "scale": 0.1,
     }  # fmt: skip
 
 
-def reward_in_races(settings: Settings, races: Races) -> dict[str, float]:
+def reward_in_races(settings: Settings, races: Races, args: argparse.Namespace) -> dict[str, float]:
     """Return the weights of the reward's terms for a car among others."""
+    damage = {} if args.damage is None else {"damage": -args.damage}
     return {
         "progress": 1.0, "off_line": settings.off_line[1], "leaving": -0.3, "passing": 1.0,
-        "contact": -1.0, **races.reward, "scale": 0.1,
+        "contact": -1.0, **races.reward, **damage, "sliding": -args.sliding, "scale": 0.1,
     }  # fmt: skip
 
 
@@ -156,6 +158,26 @@ parser.add_argument(
     default=400_000,
     help="timesteps in which only the value function learns, if the driver's file has none",
 )
+parser.add_argument(
+    "--weight-decay",
+    type=float,
+    default=0.0,
+    metavar="W",
+    help="of the optimizer, such as 0.0003, by which racers become careful; default: none",
+)
+parser.add_argument(
+    "--damage",
+    type=float,
+    metavar="P",
+    help="what a point of damage costs in races; default: 0.3, and 0.1 with --ancestor",
+)
+parser.add_argument(
+    "--sliding",
+    type=float,
+    default=0.0,
+    metavar="P",
+    help="what each metre per second across the car costs, such as 0.5; default: nothing",
+)
 parser.add_argument("--races", type=int, default=16, help="held at once")
 parser.add_argument("--seed", type=int, default=0)
 parser.add_argument("--threads", type=int, help="default: one per core")
@@ -163,7 +185,12 @@ parser.add_argument("--folder", type=Path, default=Path("logs/racer"))
 
 
 def make_model(
-    env: VecEnv, seed: int, n_steps: int, gamma: float, settings: Settings, units: Sequence[int]
+    env: VecEnv,
+    args: argparse.Namespace,
+    n_steps: int,
+    gamma: float,
+    settings: Settings,
+    units: Sequence[int],
 ) -> PPO:
     """Make the learner of a stage."""
     return PPO(
@@ -178,8 +205,9 @@ def make_model(
             "net_arch": list(units),
             "activation_fn": nn.ReLU,
             "log_std_init": list(ALONE.log_std),
+            "optimizer_kwargs": {"eps": 1e-5, "weight_decay": args.weight_decay},  # SB3's own eps
         },
-        seed=seed,
+        seed=args.seed,
         device="cpu",
     )
 
@@ -203,7 +231,7 @@ def cars_alone(
     cars = TorcsVecEnv(
         number,
         threads=args.threads,
-        reward=reward_alone(settings),
+        reward=reward_alone(settings, args),
         start="random",
         max_episode_steps=settings.episode,
         grip=settings.grip,
@@ -232,7 +260,7 @@ def cars_in_races(
         args.races,
         agents=races.agents,
         threads=args.threads,
-        reward=reward_in_races(settings, races),
+        reward=reward_in_races(settings, races, args),
         opponents=races.fields,
         grid_place=races.places,
         runoff=8.0,
@@ -245,7 +273,7 @@ def cars_in_races(
 def learn_alone(args: argparse.Namespace, env_kwargs: dict, settings: Settings) -> dict:
     """Learn to drive where there is nobody, and return the policy's weights."""
     cars = mirrored(cars_alone(settings.cars_alone, args, env_kwargs, settings), settings)
-    model = make_model(cars, args.seed, 128, 0.985, settings, UNITS)
+    model = make_model(cars, args, 128, 0.985, settings, UNITS)
     timesteps = settings.timesteps_alone if args.alone is None else args.alone
     model.learn(timesteps, callback=callbacks(env_kwargs, args, "alone", ALONE))
     cars.close()
@@ -262,7 +290,7 @@ def with_values(
     """
     if "value_net.weight" in weights:
         return weights
-    model = make_model(cars, args.seed, 256, 0.99, settings, units)
+    model = make_model(cars, args, 256, 0.99, settings, units)
     model.policy.load_state_dict({**model.policy.state_dict(), **weights})
     learn_values(model, args.values)
     return model.policy.state_dict()
@@ -349,7 +377,7 @@ def main() -> None:
     # car costs little at once, and much in the end, so it looks further ahead.
     weights = with_values(weights, cars, args, settings, units)
     steps = SMALL_STEPS if known else BIG_STEPS
-    model = make_model(cars, args.seed, 256, 0.99, settings, units)
+    model = make_model(cars, args, 256, 0.99, settings, units)
     model.policy.load_state_dict(weights)
     # It has become sure of what to do, and has to try things again: who never brakes does not find
     # out that it ends a long contact.

@@ -89,6 +89,18 @@ def test_a_racer_is_trained_alone_and_against_robots(monkeypatch, capsys, tmp_pa
     assert racer.name == "model"
 
 
+def test_a_careful_racer_goes_on_without_the_decay(monkeypatch, tmp_path, game):
+    careful, racer = (str(tmp_path / name) for name in ("careful", "racer"))
+    costs = ["--robots=1", "--races=2", "--sliding=0.5"]
+    decay = ["--alone=1", "--weight-decay=0.0003"]
+    run(monkeypatch, "train_racer.py", *costs, *decay, "--folder", careful)
+    going_on = ["--racer", f"{careful}/model.zip", "--damage=0.6"]
+    run(monkeypatch, "train_racer.py", *costs, *going_on, "--folder", racer)
+    for folder, expected in ((careful, 0.0003), (racer, 0.0)):
+        policy = PPO.load(f"{folder}/model.zip", device="cpu").policy
+        assert policy.optimizer.param_groups[0]["weight_decay"] == expected
+
+
 @pytest.mark.parametrize("driver", ["ppo-roads", "ppo-any-road", "ppo-post"])
 def test_a_racer_goes_on_from_a_driver_that_never_saw_a_car(
     driver, monkeypatch, capsys, tmp_path, game
