@@ -14,6 +14,7 @@ from typing import Any
 __all__ = ["answered", "counted_interrupts", "handlers_kept", "held_back", "ignored_interrupts"]
 
 SOON = 0.1  # [s] until a signal that was ignored comes again
+STATUS = 128  # and the number of a signal: the exit status of what it ends
 
 
 @contextlib.contextmanager
@@ -72,33 +73,41 @@ def counted_interrupts(passed: int, message: str) -> Iterator[list[int]]:
 @contextlib.contextmanager
 def ignored_interrupts() -> Iterator[None]:
     """
-    Let Ctrl-C come again where Python ignores it: in functions that C calls, as numba does.
+    Let signals come again where Python ignores what their handlers raise: in functions that C
+    calls, as numba's compiler does.
 
-    What numba raises after it was ignored counts as the interrupt, too.
+    What numba raises after that counts as what was ignored.
 
-    :raises KeyboardInterrupt: in place of such an error
+    :raises KeyboardInterrupt: in place of such an error; or SystemExit, as the handler does
     """
-    again: list[threading.Timer] = []
+    ignored: list[BaseException] = []
+    timers: list[threading.Timer] = []
+    numbers: list[int] = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
+    handlers = {number: signal.getsignal(number) for number in numbers}
     before = sys.unraisablehook
 
     def note(unraisable: Any) -> None:
-        if not issubclass(unraisable.exc_type, KeyboardInterrupt):
+        error = unraisable.exc_value
+        if not isinstance(error, KeyboardInterrupt | SystemExit):
             before(unraisable)
             return
-        again.append(threading.Timer(SOON, os.kill, [os.getpid(), signal.SIGINT]))
-        # Whoever has a handler of its own counts signals, and knows of this one.
-        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-            again[-1].start()
+        ignored.append(error)
+        status = getattr(error, "code", STATUS + signal.SIGINT)  # KeyboardInterrupt has none
+        number = status - STATUS if isinstance(status, int) else None
+        # Whoever has set another handler counts signals, and knows of this one.
+        if number in handlers and signal.getsignal(number) is handlers[number]:
+            timers.append(threading.Timer(SOON, os.kill, [os.getpid(), number]))
+            timers[-1].start()
 
     sys.unraisablehook = note
     try:
         yield
     except RuntimeError as error:
-        if again and type(error) is RuntimeError:
-            raise KeyboardInterrupt from error
+        if ignored and type(error) is RuntimeError:
+            raise ignored[0] from error
         raise
     finally:
-        for timer in again:
+        for timer in timers:
             timer.cancel()
         sys.unraisablehook = before
 

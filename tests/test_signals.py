@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from sb3_torcs.signals import held_back, ignored_interrupts
+from sb3_torcs.signals import answered, held_back, ignored_interrupts
 
 
 @ctypes.CFUNCTYPE(None)
@@ -58,6 +58,27 @@ def test_an_error_that_follows_an_ignored_interrupt_is_the_interrupt():
         raise RuntimeError("no compiled object yet")
 
     with pytest.raises(KeyboardInterrupt):
+        work()
+
+
+def test_so_does_the_end_that_python_ignores():
+    """A handler that raises SystemExit, as the command's."""
+
+    def end(number, frame):
+        del frame
+        raise SystemExit(128 + number)
+
+    @ctypes.CFUNCTYPE(None)
+    def ended_in_c():
+        signal.raise_signal(signal.SIGTERM)
+
+    @answered(end, signal.SIGTERM)
+    @ignored_interrupts()
+    def work():
+        ended_in_c()
+        time.sleep(20.0)
+
+    with pytest.raises(SystemExit, match="143"):
         work()
 
 
