@@ -203,17 +203,10 @@ def make_shared_race(
         fields,
         grid_place if is_several(grid_place, "grid_place") else [grid_place],
     )
+    shared["agents"] = agents
     races = world_pool(
         [
-            partial(
-                load_shared_race,
-                one,
-                model,
-                agents=agents,
-                opponents=field,
-                grid_place=place,
-                **shared,
-            )
+            partial(load_shared_race, one, model, opponents=field, grid_place=place, **shared)
             for one, model, field, place in choices
         ]
     )
