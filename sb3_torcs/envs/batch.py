@@ -34,6 +34,9 @@ Counts = npt.NDArray[np.int64]
 Held = tuple[FloatArray, Counts]
 """Controls of all races, (n, 5), and for how many control ticks each of them is held, (n,)."""
 
+Parts = list[Held]
+"""A timestep, whose controls may change once: where those that were late arrive."""
+
 CONTROLS_RECORD = np.dtype([(name, "f8") for name in Controls._fields])
 CAR_NUMBERS = CAR_RECORD.itemsize // 8
 NO_TERM = -1
@@ -130,7 +133,7 @@ class Batch:
         self._cars = np.zeros((number, CAR_NUMBERS))
         self._rules = np.zeros(number, RULES)
         self._aids = np.zeros((number, len(AIDS)), np.bool_)
-        self._driven: list[list[list[Held]]] = [[] for _ in self.envs]
+        self._driven: list[list[Parts]] = [[] for _ in self.envs]  # timesteps since `enter`
         self._controls = np.zeros((number, len(Controls._fields)))
         self._rewards = [env.reward for env in self.envs]
         self._read_rewards()
@@ -283,7 +286,7 @@ class Batch:
         """End the threads."""
         self._fleet.close()
 
-    def _parts(self, controls: FloatArray) -> list[Held]:
+    def _parts(self, controls: FloatArray) -> Parts:
         """
         Split the timestep where controls arrive.
 
@@ -301,7 +304,7 @@ class Batch:
                 first[race], ticks[0, race] = _row(held), number
         return [(first, ticks[0]), (second, ticks[1])]
 
-    def _drive(self, parts: list[Held], after: FloatArray) -> list[int]:
+    def _drive(self, parts: Parts, after: FloatArray) -> list[int]:
         """
         Drive all races.
 
