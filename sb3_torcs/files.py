@@ -17,6 +17,7 @@ from sb3_torcs.errors import OutputNotWritable, Sb3TorcsError
 
 __all__ = [
     "IN_A_FOLDER",
+    "checked_ending",
     "import_advice",
     "listed",
     "path_and_arguments",
@@ -105,6 +106,21 @@ def writable_folder(folder: str | Path) -> Path:
     return path
 
 
+def checked_ending(file: str | Path, suffixes: tuple[str, ...]) -> Path:
+    """
+    Make sure that a file gets the ending of what it will hold.
+
+    :param file: that a result should go to
+    :param suffixes: allowed endings, e.g. ``(".png",)``
+    :return: its path
+    :raises OutputNotWritable: if it has another one
+    """
+    path = Path(os.path.expanduser(file))
+    if path.suffix.lower() not in suffixes:
+        raise OutputNotWritable(f"'{file}' should end in {' or '.join(suffixes)}")
+    return path
+
+
 def writable_file(file: str | Path, suffixes: tuple[str, ...]) -> Path:
     """
     Make sure that a file can be written.
@@ -114,9 +130,7 @@ def writable_file(file: str | Path, suffixes: tuple[str, ...]) -> Path:
     :return: its path
     :raises OutputNotWritable: if its folder cannot be written, or its kind is another
     """
-    path = Path(os.path.expanduser(file))
-    if path.suffix.lower() not in suffixes:
-        raise OutputNotWritable(f"'{file}' should end in {' or '.join(suffixes)}")
+    path = checked_ending(file, suffixes)
     if path.is_dir():
         raise OutputNotWritable(f"'{path}' is a folder; give a file in it")
     writable_folder(path.parent)

@@ -2,7 +2,6 @@
 
 import argparse
 import concurrent.futures
-import ctypes
 import errno
 import os
 import pickle
@@ -19,6 +18,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import yaml
+from processes import raise_in_c
 from rl_zoo3.exp_manager import ExperimentManager
 from stable_baselines3 import DDPG, PPO
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
@@ -70,18 +70,12 @@ class RaisingCallback(BaseCallback):
         return True
 
 
-@ctypes.CFUNCTYPE(None)
-def called_by_c():
-    """Raise what Python ignores, since C cannot pass it on."""
-    signal.raise_signal(signal.SIGINT)
-
-
 class CompilingCallback(BaseCallback):
     """Fails as numba does after a Ctrl-C while it compiled."""
 
     def _on_step(self):
         if self.num_timesteps == 45:
-            called_by_c()
+            raise_in_c(signal.SIGINT)
             raise RuntimeError("no compiled object yet")
         return True
 

@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-import ctypes
 import signal
 import time
 
 import pytest
+from processes import raise_in_c
 
 from sb3_torcs.signals import answered, held_back, ignored_interrupts
-
-
-@ctypes.CFUNCTYPE(None)
-def called_by_c():
-    """Raise what Python ignores, since C cannot pass it on."""
-    signal.raise_signal(signal.SIGINT)
 
 
 def test_a_signal_waits_until_the_work_is_done():
@@ -44,7 +38,7 @@ def test_an_ignored_signal_stays_ignored():
 def test_an_interrupt_that_python_ignores_comes_again():
     @ignored_interrupts()
     def work():
-        called_by_c()
+        raise_in_c(signal.SIGINT)
         time.sleep(20.0)
 
     with pytest.raises(KeyboardInterrupt):
@@ -54,7 +48,7 @@ def test_an_interrupt_that_python_ignores_comes_again():
 def test_an_error_that_follows_an_ignored_interrupt_is_the_interrupt():
     @ignored_interrupts()
     def work():
-        called_by_c()
+        raise_in_c(signal.SIGINT)
         raise RuntimeError("no compiled object yet")
 
     with pytest.raises(KeyboardInterrupt):
@@ -68,14 +62,10 @@ def test_so_does_the_end_that_python_ignores():
         del frame
         raise SystemExit(128 + number)
 
-    @ctypes.CFUNCTYPE(None)
-    def ended_in_c():
-        signal.raise_signal(signal.SIGTERM)
-
     @answered(end, signal.SIGTERM)
     @ignored_interrupts()
     def work():
-        ended_in_c()
+        raise_in_c(signal.SIGTERM)
         time.sleep(20.0)
 
     with pytest.raises(SystemExit, match="143"):

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from sb3_torcs.car import CarState, Controls
-from sb3_torcs.errors import DriveFileError, InvalidOption, OutputNotWritable
-from sb3_torcs.files import readable, whole_file
+from sb3_torcs.errors import DriveFileError, InvalidOption
+from sb3_torcs.files import checked_ending, readable, whole_file
 from sb3_torcs.sensors import SENSORS
 from sb3_torcs.telemetry.table import CONTROL_FIELDS, STATE_FIELDS
 
@@ -150,12 +150,11 @@ class DriveLog:
         """
         from pyarrow import parquet
 
-        if Path(path).suffix.lower() != ".parquet":
-            raise OutputNotWritable(f"'{path}' should end in .parquet, of which kind the file is")
+        file = checked_ending(path, (".parquet",))
         table = self.table()
         floats = [field.name for field in table.schema if str(field.type) == "double"]
         others = [field.name for field in table.schema if field.name not in floats]
-        with whole_file(Path(path)) as aside:
+        with whole_file(file) as aside:
             # Bytes of one weight stand together, which compresses better.
             parquet.write_table(
                 table, aside, compression="zstd", use_dictionary=others,
