@@ -478,7 +478,7 @@ def test_who_does_not_say_where_it_was_trained_drives_in_the_game(capsys, plain)
             f"driving Torcs-v0: '{name}' does not say where it was trained, and the game is "
             "installed; --env TorcsLite-v0 drives it without the game\n"
         )
-        assert (f"'{name}' has no record of its training" in said) == (name == plain)
+        assert (f"'{name}' has no record of its training; track, car," in said) == (name == plain)
 
 
 @pytest.mark.usefixtures("no_game")

@@ -42,7 +42,7 @@ def test_the_shipped_studies_can_be_run(path):
         ({"sedes": 3}, "unknown key 'sedes'; did you mean 'seeds'?"),
         ({"eval_interval": 0}, "eval_interval is 0; expected timesteps, e.g. 5000"),
         ({"name": "..."}, "name is '...'; expected a word"),
-        ({"final_tracks": ["aalbrg"]}, "final_tracks: no track 'aalbrg'; did you mean 'aalborg'?"),
+        ({"final_tracks": ["aalbrg"]}, "s.yml: final_tracks: no track 'aalbrg'; did you mean"),
         (
             {"env": "Torcs-v0", "final_tracks": ["forza", "random"]},
             "s.yml: final_tracks: track is 'random'; Torcs-v0 takes the name of an installed",

@@ -120,9 +120,9 @@ def warn_unless_known(driver: str, record: TrainingRecord) -> None:
 
     if not record.known and driver != SCRIPTED:
         print(
-            f"sb3-torcs: '{driver}' has no record of its training, or one of an earlier `learn` "
-            "(RecordCallback writes it in each); track, car, action repeat and range finders are "
-            "the defaults, unless you give them",
+            f"sb3-torcs: '{driver}' has no record of its training; track, car, action repeat and "
+            "range finders are the defaults, unless you give them. RecordCallback, passed to each "
+            "`learn`, writes the record",
             file=sys.stderr,
         )
 
