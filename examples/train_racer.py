@@ -4,8 +4,8 @@ Each car of each race is an environment of TorcsVecEnv, so that stock PPO learns
 It learns one track, or several, to race on those that it never saw. With --driver it goes on from a
 model that drives alone already, and sees what that model sees and other cars; with --racer it goes
 on from one that races. With --ancestor it goes on from either, and races against itself, this
-ancestor and robots. Who learns with --weight-decay becomes careful, and goes on without it to pass
-the others with less damage.
+ancestor and robots. With --weight-decay it becomes careful; with --racer it goes on from there
+without, which may teach it to pass and keep some of that care.
 """
 
 import argparse

@@ -302,7 +302,7 @@ def _finite(name: str, term: Term, before: CarState, after: CarState, controls: 
     value = term(before, after, controls)
     if not (is_number(value) and abs(value) <= LARGEST_VALUE):
         raise InvalidOption(
-            f"reward term '{name}' returned {value!r}; expected a finite number, of at most "
-            f"{LARGEST_VALUE:g}"
+            f"reward term '{name}' returned {value!r}; expected a finite number from "
+            f"{-LARGEST_VALUE:g} to {LARGEST_VALUE:g}"
         )
     return float(value)

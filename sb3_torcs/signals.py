@@ -14,7 +14,7 @@ from typing import Any
 __all__ = ["answered", "counted_interrupts", "handlers_kept", "held_back", "ignored_interrupts"]
 
 SOON = 0.1  # [s] until a signal that was ignored comes again
-STATUS = 128  # and the number of a signal: the exit status of what it ends
+EXIT_STATUS = 128  # of a process that a signal has ended, plus the number of the signal
 
 
 @contextlib.contextmanager
@@ -76,9 +76,9 @@ def ignored_interrupts() -> Iterator[None]:
     Let signals come again where Python ignores what their handlers raise: in functions that C
     calls, as numba's compiler does.
 
-    What numba raises after that counts as what was ignored.
+    Numba raises a ``RuntimeError`` where it has lost one. That error becomes the one that was lost.
 
-    :raises KeyboardInterrupt: in place of such an error; or SystemExit, as the handler does
+    :raises KeyboardInterrupt: in place of numba's error; or SystemExit, as the handler does
     """
     ignored: list[BaseException] = []
     timers: list[threading.Timer] = []
@@ -92,8 +92,8 @@ def ignored_interrupts() -> Iterator[None]:
             before(unraisable)
             return
         ignored.append(error)
-        status = getattr(error, "code", STATUS + signal.SIGINT)  # KeyboardInterrupt has none
-        number = status - STATUS if isinstance(status, int) else None
+        status = getattr(error, "code", EXIT_STATUS + signal.SIGINT)  # KeyboardInterrupt has none
+        number = status - EXIT_STATUS if isinstance(status, int) else None
         # Whoever has set another handler counts signals, and knows of this one.
         if number in handlers and signal.getsignal(number) is handlers[number]:
             timers.append(threading.Timer(SOON, os.kill, [os.getpid(), number]))

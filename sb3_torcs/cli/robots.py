@@ -29,7 +29,7 @@ __all__ = ["add_parser", "run"]
 ROBOT_HEADERS = ("robot", "index", "name", "car")
 
 DRIVING = ("index", "track", "laps", "rivals", "game", "telemetry")
-"""Options of a drive, in vain where no robot is named."""
+"""Options of a drive, which are refused where no robot is named."""
 
 DESCRIPTION = """\
 List the installed robots. With NAME, let one of them drive: alone in a practice session, or in a

@@ -99,7 +99,7 @@ class Batch:
     """
     Racing environments that take their timesteps at once.
 
-    A "race" is the index of one of them here. Those whose cars share a race follow each other.
+    ``race`` is the index of one of them, also where several share a race: they stand side by side.
 
     This object holds the state of a race while :meth:`step` drives it. Call :meth:`leave` before
     the environment is used alone: it gives the state back. :meth:`enter` takes it over again.

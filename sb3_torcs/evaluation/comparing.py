@@ -158,7 +158,9 @@ def _track(
     """Choose the track, and make sure that saved drives are of it."""
     stored = [drive for drives in saved.values() for drive in drives]
     names = list(dict.fromkeys(drive.track for drive in stored))
-    track = next(iter(names), None) or _trained_on(drivers) if given is None else given
+    track = given
+    if track is None:
+        track = next(iter(names), None) or _trained_on(drivers)
     if track == RANDOM_TRACK:
         raise InvalidOption(
             f"laps of one track are compared, and '{track}' is another one each time; give --track "

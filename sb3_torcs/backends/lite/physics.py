@@ -25,8 +25,7 @@ SUBSTEPS = 10  # physics steps per control tick, as in TORCS
 DT = CONTROL_TICK / SUBSTEPS  # [s]
 STEPS_PER_SECOND = 500.0  # time is counted in steps, so that it never drifts
 
-# Walls
-# Of a wall, in columns behind that of its friction.
+# Walls: the columns of a wall are counted from that of its friction.
 REBOUND = column.LEFT_WALL_REBOUND - column.LEFT_WALL_FRICTION
 DAMAGE_RATE = column.LEFT_WALL_DAMAGE - column.LEFT_WALL_FRICTION
 WALL_SPIN = 10.0  # how much a hit turns the car, simuv2's VELSCALE
