@@ -11,7 +11,14 @@ from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import Any
 
-__all__ = ["answered", "counted_interrupts", "handlers_kept", "held_back", "ignored_interrupts"]
+__all__ = [
+    "EXIT_STATUS",
+    "answered",
+    "counted_interrupts",
+    "handlers_kept",
+    "held_back",
+    "ignored_interrupts",
+]
 
 SOON = 0.1  # [s] until a signal that was ignored comes again
 EXIT_STATUS = 128  # of a process that a signal has ended, plus the number of the signal

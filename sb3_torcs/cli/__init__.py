@@ -33,7 +33,7 @@ from sb3_torcs.cli.common import CACHE_FIX, INTERRUPTED, READER_LEFT, drop_outpu
 from sb3_torcs.cli.parser import Parser
 from sb3_torcs.cli.plain import any_terminal, open_streams
 from sb3_torcs.errors import Sb3TorcsError
-from sb3_torcs.signals import answered, ignored_interrupts
+from sb3_torcs.signals import EXIT_STATUS, answered, ignored_interrupts
 
 __all__ = ["main"]
 
@@ -115,7 +115,7 @@ def _run(args: argparse.Namespace) -> int:
 def _end(number: int, frame: FrameType | None) -> None:
     """Let SIGTERM and SIGHUP end the process as an exception does, so that it cleans up."""
     del frame
-    raise SystemExit(128 + number)
+    raise SystemExit(EXIT_STATUS + number)
 
 
 def _parser() -> tuple[Parser, Iterable[str]]:

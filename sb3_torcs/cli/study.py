@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from sb3_torcs.cli.common import INTERRUPTED, positive, print_json, quiet_output
 from sb3_torcs.files import writable_folder
+from sb3_torcs.signals import EXIT_STATUS
 
 if TYPE_CHECKING:
     from sb3_torcs.studies.config import Study, Trial
@@ -96,7 +97,7 @@ def run(args: argparse.Namespace) -> int:
         print("go on with:" if left else "see them:")
         print(f"  {_command(args) if left else shlex.join(['sb3-torcs', 'report', str(folder)])}")
     if len(left) > len(failed):
-        return 128 + signals[0] if signals else INTERRUPTED
+        return EXIT_STATUS + signals[0] if signals else INTERRUPTED
     return int(bool(failed))
 
 

@@ -9,6 +9,7 @@ import sys
 from typing import Any
 
 from sb3_torcs.cli.common import positive, seed
+from sb3_torcs.signals import EXIT_STATUS
 from sb3_torcs.training.run import Run, TrainOptions, going_on, train_run
 
 __all__ = ["add_parser", "run"]
@@ -103,7 +104,7 @@ def run(args: argparse.Namespace) -> int:
         )
     result = train_run(options)
     print("\n".join(_closing_words(options, result)))
-    return 0 if result.signal is None else 128 + result.signal  # as shells have it
+    return 0 if result.signal is None else EXIT_STATUS + result.signal
 
 
 def _trained_before(args: argparse.Namespace) -> dict[str, str]:

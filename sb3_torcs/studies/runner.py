@@ -31,7 +31,7 @@ from sb3_torcs.errors import (
     TrackNotFound,
     TrainingDiverged,
 )
-from sb3_torcs.signals import answered, handlers_kept
+from sb3_torcs.signals import EXIT_STATUS, answered, handlers_kept
 from sb3_torcs.studies.config import Study, Trial
 from sb3_torcs.studies.storage import Files, StudyFolder
 
@@ -272,7 +272,7 @@ def _end_by_force(scratch: Path, session: Path) -> None:
     _remove_folder(scratch)
     session.unlink(missing_ok=True)
     sys.stderr.write("sb3-torcs: ended; the same command goes on with the study\n")
-    os._exit(128 + signal.SIGTERM)
+    os._exit(EXIT_STATUS + signal.SIGTERM)
 
 
 def _remove_scratch(session: Path) -> None:
