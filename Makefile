@@ -52,7 +52,7 @@ browser: ## get Chromium, in which tests open the pages, if it is not here
 	  $(BROWSER) || { $(SUDO) apt-get update && $(BROWSER); }; }
 
 test: native game browser check-codestyle lint type ## check format, lint and types, and run every test
-	$(BIN)/python -m pytest -n 2 --durations=10
+	$(BIN)/python -m pytest -n 2 --dist worksteal --durations=10
 
 pytest: native game browser ## run the tests that do not train
 	$(BIN)/python -m pytest -n 2 -m 'not slow'

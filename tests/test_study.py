@@ -38,6 +38,12 @@ TINY = {
 }  # fmt: skip
 
 
+@pytest.fixture(autouse=True)
+def impatient_workers(monkeypatch):
+    """Ray's workers give way to all others, so that beside other tests they would hardly run."""
+    monkeypatch.setenv("RAY_worker_niceness", "0")
+
+
 def study_file(folder, **changes):
     said = {
         "name": "tiny", "env": "TorcsLite-v0", "seeds": 2, "n_timesteps": 1920,
