@@ -30,12 +30,12 @@ __all__ = [
     "GearboxName",
     "action_layout",
     "action_rows",
-    "actions_of_races",
     "automatic_gear",
     "checked_gearbox",
     "controls_from_action",
     "launch_clutch",
     "layout_of_width",
+    "listed_actions",
     "used_gearbox",
 ]
 
@@ -249,12 +249,12 @@ def action_rows(actions: Any, shape: tuple[int, ...]) -> npt.NDArray[np.floating
     return rows
 
 
-def actions_of_races(actions: Any, shape: tuple[int, ...], advice: str) -> list[Any]:
+def listed_actions(actions: Any, shape: tuple[int, ...], advice: str) -> list[Any]:
     """
-    Make sure that there is an action for each of several races, which read their own.
+    Make sure that there is an action for each of several environments, which read their own.
 
-    :param actions: one per race, each as of :func:`controls_from_action`
-    :param shape: (races, numbers of an action)
+    :param actions: one per environment, each as of :func:`controls_from_action`
+    :param shape: (environments, numbers of an action)
     :param advice: where to take them from, for the error
     :return: them
     :raises InvalidAction: if there are more or fewer, or numbers instead of actions
@@ -263,8 +263,8 @@ def actions_of_races(actions: Any, shape: tuple[int, ...], advice: str) -> list[
     bare = all(isinstance(row, Real) for row in rows)
     if bare or len(rows) != shape[0]:
         raise InvalidAction(
-            f"{len(rows)} {'numbers' if bare else 'actions'} for {shape[0]} races; expected shape "
-            f"{shape}{advice}"
+            f"{len(rows)} {'numbers' if bare else 'actions'} for {shape[0]} environments; expected "
+            f"shape {shape}{advice}"
         )
     return rows
 

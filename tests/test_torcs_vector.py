@@ -205,10 +205,10 @@ def test_a_wrong_action_is_told_and_leaves_the_races_usable(make):
     envs = make(num_envs=2, threads=2)
     envs.reset(seed=0)
     times = [env.backend.engine.read(0).time for env in envs.envs]
-    with pytest.raises(InvalidAction, match="throttle is nan"):
+    with pytest.raises(InvalidAction, match="environment 1: throttle is nan"):
         envs.step(np.array([GAS, [0.0, np.nan, 0.0]], np.float32))
     assert [env.backend.engine.read(0).time for env in envs.envs] == times  # nobody has driven
-    with pytest.raises(InvalidAction, match="3 actions for 2 races"):
+    with pytest.raises(InvalidAction, match="3 actions for 2 environments"):
         envs.step(np.stack([GAS, GAS, GAS]))
     first = envs.reset(seed=5)[0]
     np.testing.assert_array_equal(first, envs.reset(seed=5)[0])

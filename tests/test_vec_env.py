@@ -519,8 +519,8 @@ def test_a_game_of_its_own_is_refused():
     ("asked", "message"),
     [
         (np.array([GAS, [0.0, np.nan, 0.0]], np.float32), "throttle is nan"),
-        (np.stack([GAS] * 3), "3 actions for 2 races; expected shape"),
-        (None, "1 actions for 2 races; expected shape"),
+        (np.stack([GAS] * 3), "3 actions for 2 environments; expected shape"),
+        (None, "1 actions for 2 environments; expected shape"),
         (np.zeros((2, 2), np.float32), "action has shape"),
         ([GAS, "full throttle"], "action has shape"),
     ],

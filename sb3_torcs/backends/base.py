@@ -85,46 +85,50 @@ class Backend(Protocol):
 
 
 class Fleet(Protocol):
-    """Worlds of one kind that are driven at once, one per race, in the process that made them."""
+    """
+    Worlds of one kind that are driven at once, one per environment, in the process that made them.
 
-    def put(self, race: int, world: Any) -> None:
+    ``index`` is that of an environment.
+    """
+
+    def put(self, index: int, world: Any) -> None:
         """
-        Let a race go on in another world, or in the same.
+        Let an environment go on in another world, or in the same.
 
-        :param race: which
+        :param index: which
         :param world: of the same kind
         """
 
     def step(
         self,
-        races: npt.NDArray[np.int64],
+        indices: npt.NDArray[np.int64],
         controls: FloatArray,
         ticks: npt.NDArray[np.int64],
         cars: FloatArray,
     ) -> list[int]:
         """
-        Hold controls in some of the races.
+        Hold controls in some of the worlds.
 
-        :param races: (n,) which
+        :param indices: (n,) which
         :param controls: (n, 5) as of :class:`~sb3_torcs.car.Controls`, finite and within their
             ranges; a gear of nan leaves it to the gearbox
         :param ticks: (n,) control ticks of 0.02 s
         :param cars: (n, 111) filled, each row a :data:`~sb3_torcs.car.CAR_RECORD`
-        :return: the rows that are not filled, of races that failed
+        :return: the rows that are not filled, of those that failed
         """
 
-    def failure(self, race: int) -> Exception:
+    def failure(self, index: int) -> Exception:
         """
-        Return what stopped a race.
+        Return what stopped a world.
 
-        :param race: one that failed in the latest step
+        :param index: of one that failed in the latest step
         """
 
-    def arrive(self, race: int, steps: Iterable[tuple[Controls, int]], car: CarState) -> None:
+    def arrive(self, index: int, steps: Iterable[tuple[Controls, int]], car: CarState) -> None:
         """
         Tell a world which steps it has been driven, before it is used without the fleet.
 
-        :param race: whose world
+        :param index: which
         :param steps: controls and ticks since it was told
         :param car: at their end
         """

@@ -347,60 +347,60 @@ class NativeFleet:
         self._seats = np.array([world.seat for world in worlds])
         self._fleet = _extension().Fleet(engines, threads)
 
-    def put(self, race: int, world: NativeBackend | SeatWorld) -> None:
-        """Let a race go on in another world; see :class:`~sb3_torcs.backends.base.Fleet`."""
-        if self._worlds[race] is world:
+    def put(self, index: int, world: NativeBackend | SeatWorld) -> None:
+        """Let one go on in another world; see :class:`~sb3_torcs.backends.base.Fleet`."""
+        if self._worlds[index] is world:
             return
-        self._worlds[race], self._seats[race] = world, world.seat
-        self._fleet.put(int(self._engines[race]), world.engine)
+        self._worlds[index], self._seats[index] = world, world.seat
+        self._fleet.put(int(self._engines[index]), world.engine)
 
-    def begin(self, race: int, controls: Controls, ticks: int) -> None:
+    def begin(self, index: int, controls: Controls, ticks: int) -> None:
         """
         Begin a step of one world and return at once. Call :meth:`wait` before using that world.
 
-        :param race: which
+        :param index: which
         :param controls: as of ``step``
         :param ticks: as of ``step``
         """
-        self._begun[race] = controls, ticks
+        self._begun[index] = controls, ticks
         steering, throttle, brake, gear, clutch = controls
-        self._fleet.begin(int(self._engines[race]), steering, throttle, brake, gear, ticks, clutch)
+        self._fleet.begin(int(self._engines[index]), steering, throttle, brake, gear, ticks, clutch)
 
-    def wait(self, race: int) -> CarState:
+    def wait(self, index: int) -> CarState:
         """
         Drive until the step of one world is done.
 
-        :param race: which
+        :param index: which
         :return: as of ``step``
         """
-        state: CarState = self._fleet.wait(int(self._engines[race]))
-        self._worlds[race].arrive(*self._begun[race], state)
+        state: CarState = self._fleet.wait(int(self._engines[index]))
+        self._worlds[index].arrive(*self._begun[index], state)
         return state
 
     def step(
         self,
-        races: npt.NDArray[np.int64],
+        indices: npt.NDArray[np.int64],
         controls: FloatArray,
         ticks: npt.NDArray[np.int64],
         cars: FloatArray,
     ) -> list[int]:
         """Drive some of them; see :class:`~sb3_torcs.backends.base.Fleet`."""
-        engines, seats = self._engines[races], self._seats[races]
+        engines, seats = self._engines[indices], self._seats[indices]
         failed: list[int] = self._fleet.step(engines, seats, controls, ticks, cars)
         return failed
 
-    def failure(self, race: int) -> Exception:
-        """Return what stopped a race; see :class:`~sb3_torcs.backends.base.Fleet`."""
+    def failure(self, index: int) -> Exception:
+        """Return what stopped a world; see :class:`~sb3_torcs.backends.base.Fleet`."""
         try:
-            self._fleet.wait(int(self._engines[race]))
+            self._fleet.wait(int(self._engines[index]))
         except Exception as error:
             return error
-        raise AssertionError("the race has not failed")
+        raise AssertionError("the world has not failed")
 
-    def arrive(self, race: int, steps: Iterable[tuple[Controls, int]], car: CarState) -> None:
+    def arrive(self, index: int, steps: Iterable[tuple[Controls, int]], car: CarState) -> None:
         """Tell a world what it has been driven; see :class:`~sb3_torcs.backends.base.Fleet`."""
         for controls, ticks in steps:
-            self._worlds[race].arrive(controls, ticks, car)
+            self._worlds[index].arrive(controls, ticks, car)
 
     def finish(self) -> None:
         """Drive until all steps are done."""

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from sb3_torcs.actions import actions_of_races, controls_from_action
+from sb3_torcs.actions import controls_from_action, listed_actions
 from sb3_torcs.backends.base import Backend, Fleet
 from sb3_torcs.backends.lite.backend import LiteBackend
 from sb3_torcs.backends.lite.fleet import LiteFleet
@@ -32,7 +32,7 @@ __all__ = ["Batch", "Outcome", "fleet_of"]
 Counts = npt.NDArray[np.int64]
 
 Held = tuple[FloatArray, Counts]
-"""Controls of all races, (n, 5), and for how many control ticks each of them is held, (n,)."""
+"""Controls of all, (n, 5), and for how many control ticks each of them is held, (n,)."""
 
 Parts = list[Held]
 """A timestep, whose controls may change once: where those that were late arrive."""
@@ -43,7 +43,7 @@ NO_TERM = -1
 
 
 class Outcome(NamedTuple):
-    """The outcome of a timestep of all races."""
+    """The outcome of a timestep of all environments."""
 
     before: FloatArray  # (n, 111) cars
     after: FloatArray  # (n, 111) cars
@@ -52,44 +52,44 @@ class Outcome(NamedTuple):
     terms: list[list[float]]  # of the rewards, in the order of `names`
     names: list[tuple[str, ...]]  # of the terms
     rules: npt.NDArray[np.void]  # (n,) of RULES, before
-    waiting: list[tuple[Controls, ...]]  # controls that had not arrived before, of each race
-    ended: npt.NDArray[np.bool_]  # (n,) also if the race has failed; time limits are not known here
-    failures: dict[int, Exception]  # the errors of races, by index
+    waiting: list[tuple[Controls, ...]]  # controls that had not arrived before, of each
+    ended: npt.NDArray[np.bool_]  # (n,) also by a failure; time limits are not known here
+    failures: dict[int, Exception]  # what stopped cars, by index
 
-    def info(self, race: int) -> dict[str, Any]:
+    def info(self, index: int) -> dict[str, Any]:
         """
-        Make the ``info`` of a race whose episode goes on.
+        Make the ``info`` of an environment whose episode goes on.
 
-        :param race: index of the race
+        :param index: of the environment
         """
-        _, lap_time, terms = self.glance(race)
-        return racing_info(car_from_record(self.after[race]), lap_time, terms)
+        _, lap_time, terms = self.glance(index)
+        return racing_info(car_from_record(self.after[index]), lap_time, terms)
 
-    def glance(self, race: int) -> tuple[float, float, dict[str, float]]:
+    def glance(self, index: int) -> tuple[float, float, dict[str, float]]:
         """
-        Read a few values of a race whose episode goes on.
+        Read a few values of an environment whose episode goes on.
 
-        :param race: index of the race
+        :param index: of the environment
         :return: speed [m/s], time of the lap that the timestep completed, or 0 [s], and terms of
             the reward
         """
-        number = self.after.item  # no view of the row: this is asked of each race
-        has_lapped = number(race, LAPS) > self.before.item(race, LAPS)
-        # A race with fewer terms than another has zeros after its own.
-        terms = dict(zip(self.names[race], self.terms[race], strict=False))
+        number = self.after.item  # no view of the row: this is asked of each
+        has_lapped = number(index, LAPS) > self.before.item(index, LAPS)
+        # Who has fewer terms than another has zeros after its own.
+        terms = dict(zip(self.names[index], self.terms[index], strict=False))
         terms["crash"] = 0.0
-        return number(race, SPEED_X), number(race, LAST_LAP_TIME) if has_lapped else 0.0, terms
+        return number(index, SPEED_X), number(index, LAST_LAP_TIME) if has_lapped else 0.0, terms
 
-    def car(self, race: int) -> CarState:
+    def car(self, index: int) -> CarState:
         """
-        Return the car of a race, as the backend's ``step`` does.
+        Return the car of an environment, as the backend's ``step`` does.
 
-        :param race: index of the race
-        :raises Exception: that stopped the race
+        :param index: of the environment
+        :raises Exception: that stopped the car
         """
-        if race in self.failures:
-            raise self.failures[race]
-        return car_from_record(self.after[race])
+        if index in self.failures:
+            raise self.failures[index]
+        return car_from_record(self.after[index])
 
 
 LAPS, LAST_LAP_TIME, SPEED_X = map(CarState._fields.index, ("laps", "last_lap_time", "speed_x"))
@@ -99,10 +99,11 @@ class Batch:
     """
     Racing environments that take their timesteps at once.
 
-    ``race`` is the index of one of them, also where several share a race: they stand side by side.
+    Those that share a race stand side by side.
 
-    This object holds the state of a race while :meth:`step` drives it. Call :meth:`leave` before
-    the environment is used alone: it gives the state back. :meth:`enter` takes it over again.
+    This object holds the state of an environment while :meth:`step` drives it. Call :meth:`leave`
+    before the environment is used alone: it gives the state back. :meth:`enter` takes it over
+    again.
 
     :param envs: of one kind and with the same layout of actions
     :param threads: that drive, at least 1; those beyond one per race are left out
@@ -129,7 +130,7 @@ class Batch:
         self._layout, self._view = self.envs[0].layout, View(*views)
         self._bounds = np.array(self._layout.low), np.array(self._layout.high)
         self._fleet = fleet_of([present_world(env.backend) for env in self.envs], self.threads)
-        self._races = np.arange(number)
+        self._indices = np.arange(number)
         self._cars = np.zeros((number, CAR_NUMBERS))
         self._rules = np.zeros(number, RULES)
         self._aids = np.zeros((number, len(AIDS)), np.bool_)
@@ -144,30 +145,30 @@ class Batch:
         self._choices = np.full((number, most), NO_TERM)
         self._weights = np.zeros((number, most))
         self._in_python: list[tuple[int, int, Term, float]] = []
-        for race, reward in enumerate(self._rewards):
-            for i, (_, term, weight) in enumerate(reward.terms):
-                self._weights[race, i] = weight
+        for index, reward in enumerate(self._rewards):
+            for column, (_, term, weight) in enumerate(reward.terms):
+                self._weights[index, column] = weight
                 if term in COMPILED:
-                    self._choices[race, i] = COMPILED.index(term)
+                    self._choices[index, column] = COMPILED.index(term)
                 else:
-                    self._in_python.append((race, i, term, weight))
+                    self._in_python.append((index, column, term, weight))
         self._names = [tuple(name for name, _, _ in reward.terms) for reward in self._rewards]
 
     def renew(self) -> None:
-        """Take an array of its own before races are taken over: earlier outcomes look at this."""
+        """Take an array of its own before states are taken over: earlier outcomes look at this."""
         self._cars = self._cars.copy()
 
-    def enter(self, race: int) -> None:
+    def enter(self, index: int) -> None:
         """
-        Take the state of a race over from its environment, which has been reset.
+        Take the state of an environment over, which has been reset.
 
-        :param race: index of the race
+        :param index: of the environment
         """
-        env = self.envs[race]
+        env = self.envs[index]
         assert env.car is not None, "step raises before the first reset"
-        self._fleet.put(race, present_world(env.backend))
-        self._cars[race] = np.hstack(env.car)
-        self._rules[race] = (
+        self._fleet.put(index, present_world(env.backend))
+        self._cars[index] = np.hstack(env.car)
+        self._rules[index] = (
             math.inf if env.laps is None else env.laps,
             env.runoff,
             env.recovery_ticks,
@@ -175,39 +176,39 @@ class Batch:
             env.patience,
             env.standing,
         )
-        self._aids[race] = astuple(env.aids)
-        self._driven[race] = []
-        if env.reward is not self._rewards[race]:
-            self._rewards[race] = env.reward
+        self._aids[index] = astuple(env.aids)
+        self._driven[index] = []
+        if env.reward is not self._rewards[index]:
+            self._rewards[index] = env.reward
             self._read_rewards()
 
-    def leave(self, race: int) -> None:
+    def leave(self, index: int) -> None:
         """
-        Give the state of a race back to its environment.
+        Give the state of an environment back to it.
 
-        :param race: index of the race
+        :param index: of the environment
         """
-        if not self._driven[race]:
+        if not self._driven[index]:
             return
-        env, car = self.envs[race], car_from_record(self._cars[race])
+        env, car = self.envs[index], car_from_record(self._cars[index])
         steps = (
-            (_controls(controls[race]), int(ticks[race]))
-            for parts in self._driven[race]
+            (_controls(controls[index]), int(ticks[index]))
+            for parts in self._driven[index]
             for controls, ticks in parts
-            if ticks[race]
+            if ticks[index]
         )
-        self._fleet.arrive(race, steps, car)
-        env.arrive(car, _controls(self._controls[race]), *_clocks(self._rules[race]))
-        self._driven[race] = []
+        self._fleet.arrive(index, steps, car)
+        env.arrive(car, _controls(self._controls[index]), *_clocks(self._rules[index]))
+        self._driven[index] = []
 
     def step(self, asked: npt.NDArray[np.floating]) -> Outcome:
         """
-        Hold an action in each race.
+        Hold an action in each environment.
 
         :param asked: (n, numbers of an action)
-        :return: the outcome; a race that has ended or failed has to be finished
-        :raises InvalidAction: if there is not one action per race, or one is invalid; then no race
-            has been driven
+        :return: the outcome; an environment that has ended or failed has to be finished
+        :raises InvalidAction: if there is not one action per environment, or one is invalid; then
+            no car has been driven
         """
         controls = self._read(asked)
         if self._aids.any():
@@ -238,8 +239,8 @@ class Batch:
         if self._view.has_more:
             for env, row, seen in zip(self.envs, after, observations, strict=True):
                 self._view.add(car_from_record(row), env.backend, seen)
-        for race, i, term, weight in self._in_python:
-            values[race, i] = _ask(term, weight, before[race], after[race], controls[race])
+        for index, column, term, weight in self._in_python:
+            values[index, column] = _ask(term, weight, before[index], after[index], controls[index])
         ended[failed] = True
         terms = values.tolist()
         return Outcome(
@@ -252,35 +253,35 @@ class Batch:
             rules,
             waiting,
             ended,
-            {race: self._fleet.failure(race) for race in failed},
+            {index: self._fleet.failure(index) for index in failed},
         )
 
-    def finish(self, race: int, timestep: Outcome, act: Callable[[], Any]) -> Any:
+    def finish(self, index: int, timestep: Outcome, act: Callable[[], Any]) -> Any:
         """
         Let an environment take the timestep itself, with all its wrappers, without driving again.
 
-        :param race: index of the race
+        :param index: of the environment
         :param timestep: the outcome of the latest ``step``
         :param act: steps the outermost wrapper
         :return: what ``act`` returns
-        :raises Exception: the error that stopped the race; its state is that before the timestep
+        :raises Exception: the error that stopped the car; its state is that before the timestep
         """
-        env = self.envs[race]
-        failure = timestep.failures.get(race)
+        env = self.envs[index]
+        failure = timestep.failures.get(index)
         if failure is not None and not isinstance(failure, CarLost):
-            self._driven[race].pop()
-            env.delay.waiting = timestep.waiting[race]
-            self._rules[race] = timestep.rules[race]
+            self._driven[index].pop()
+            env.delay.waiting = timestep.waiting[index]
+            self._rules[index] = timestep.rules[index]
             raise failure
-        before = car_from_record(timestep.before[race])
-        env.arrive(before, env.controls, *_clocks(timestep.rules[race]))
-        env.delay.waiting = timestep.waiting[race]
-        env.driven = partial(timestep.car, race)
+        before = car_from_record(timestep.before[index])
+        env.arrive(before, env.controls, *_clocks(timestep.rules[index]))
+        env.delay.waiting = timestep.waiting[index]
+        env.driven = partial(timestep.car, index)
         try:
             return act()
         finally:
             env.driven = None
-            self._driven[race] = []
+            self._driven[index] = []
 
     def close(self) -> None:
         """End the threads."""
@@ -297,31 +298,31 @@ class Batch:
             return [(controls, self._rules["ticks"].copy())]
         first, second = np.zeros((2, *controls.shape))
         ticks = np.zeros((2, len(self.envs)), np.int64)
-        for race, env in enumerate(self.envs):
-            *begun, (held, ticks[1, race]) = env.delay.hold(_controls(controls[race]))
-            second[race] = _row(held)
+        for index, env in enumerate(self.envs):
+            *begun, (held, ticks[1, index]) = env.delay.hold(_controls(controls[index]))
+            second[index] = _row(held)
             for held, number in begun:
-                first[race], ticks[0, race] = _row(held), number
+                first[index], ticks[0, index] = _row(held), number
         return [(first, ticks[0]), (second, ticks[1])]
 
     def _drive(self, parts: Parts, after: FloatArray) -> list[int]:
         """
-        Drive all races.
+        Drive all cars.
 
         :param parts: of the timestep
         :param after: (n, 111) filled
-        :return: the races that failed, whose rows are not
+        :return: who failed, whose rows are not
         """
         if len(parts) == 1:
-            return self._fleet.step(self._races, *parts[0], after)
+            return self._fleet.step(self._indices, *parts[0], after)
         going, failed = np.ones(len(self.envs), np.bool_), []
         for controls, ticks in parts:
-            races = np.flatnonzero(going & (ticks > 0))
-            cars = np.empty((len(races), CAR_NUMBERS))
-            lost = self._fleet.step(races, controls[races], ticks[races], cars)
-            after[races] = cars
-            failed += races[lost].tolist()
-            going[races[lost]] = False
+            indices = np.flatnonzero(going & (ticks > 0))
+            cars = np.empty((len(indices), CAR_NUMBERS))
+            lost = self._fleet.step(indices, controls[indices], ticks[indices], cars)
+            after[indices] = cars
+            failed += indices[lost].tolist()
+            going[indices[lost]] = False
         return failed
 
     def _read(self, asked: npt.NDArray[np.floating]) -> FloatArray:
@@ -333,12 +334,12 @@ class Batch:
             if fits and read_actions(np.ascontiguousarray(asked), low, high, controls):
                 return controls
         shape = len(self.envs), len(low)
-        rows = actions_of_races(asked, shape, ", as of model.predict(observations)")
-        for race, row in enumerate(rows):
+        rows = listed_actions(asked, shape, ", as of model.predict(observations)")
+        for index, row in enumerate(rows):
             try:
-                controls[race] = _row(controls_from_action(row, self._layout))
+                controls[index] = _row(controls_from_action(row, self._layout))
             except InvalidAction as error:
-                raise InvalidAction(f"environment {race}: {error}") from error
+                raise InvalidAction(f"environment {index}: {error}") from error
         return controls
 
 

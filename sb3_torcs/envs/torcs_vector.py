@@ -13,7 +13,7 @@ import numpy.typing as npt
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from sb3_torcs.actions import actions_of_races
+from sb3_torcs.actions import listed_actions
 from sb3_torcs.backends.native import NativeFleet
 from sb3_torcs.backends.several import present_world, shared_worlds
 from sb3_torcs.car import CarState, check_count
@@ -26,7 +26,7 @@ from sb3_torcs.envs.making import (
 )
 from sb3_torcs.envs.racing import Observation
 from sb3_torcs.envs.torcs import TorcsEnv
-from sb3_torcs.errors import CarLost, EnvClosed, InvalidOption
+from sb3_torcs.errors import CarLost, EnvClosed, InvalidAction, InvalidOption
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.starting_list import guests_of
 
@@ -105,12 +105,15 @@ class TorcsVectorEnv(SyncVectorEnv):
         if self.closed:
             raise EnvClosed("step after close; make new environments with gym.make_vec")
         shape = self.action_space.shape or ()
-        rows = actions_of_races(actions, shape, ": take them from envs.action_space.sample()")
+        rows = listed_actions(actions, shape, ": take them from envs.action_space.sample()")
         anew = self._begin_anew()
         going = [index for index in range(self.num_envs) if not anew[index]]
         # All before any sets out: a wrong one leaves all races where they are.
         for index in going:
-            self.envs[index].read_action(rows[index])
+            try:
+                self.envs[index].read_action(rows[index])
+            except InvalidAction as error:
+                raise InvalidAction(f"environment {index}: {error}") from error
         parts = {index: self.envs[index].held_parts() for index in going}
         try:
             for index, (held, *_) in parts.items():

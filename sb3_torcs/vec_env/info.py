@@ -8,30 +8,30 @@ from typing import Any, Self
 from sb3_torcs.envs.batch import Outcome
 from sb3_torcs.envs.info import RacingInfo
 
-__all__ = ["TRUNCATED", "RaceInfo", "glance"]
+__all__ = ["TRUNCATED", "LazyInfo", "glance"]
 
 TRUNCATED = "TimeLimit.truncated"
 """Of SB3: whether a time limit ended the episode."""
 
 
-class RaceInfo(MutableMapping[str, Any]):
+class LazyInfo(MutableMapping[str, Any]):
     """
-    The ``info`` of a race whose episode goes on. It computes its values when one is first read.
+    The ``info`` of an episode that goes on. It computes its values when one is first read.
 
-    :param timestep: the outcome of a timestep of all races
-    :param race: index of the race
+    :param timestep: the outcome of a timestep of all environments
+    :param index: of the environment
     """
 
-    __slots__ = ("_race", "_timestep", "_values")
+    __slots__ = ("_index", "_timestep", "_values")
 
-    def __init__(self, timestep: Outcome, race: int) -> None:
-        self._timestep, self._race = timestep, race
+    def __init__(self, timestep: Outcome, index: int) -> None:
+        self._timestep, self._index = timestep, index
         self._values: dict[str, Any] | None = None
 
     def get(self, name: str, default: Any = None) -> Any:
         """Look a value up; see :class:`dict`."""
         if self._values is None:
-            if name == "lap_time":  # asked of each race in each timestep, to show progress
+            if name == "lap_time":  # asked of each in each timestep, to show progress
                 return self.glance()[1]
             if name not in RacingInfo.__annotations__:
                 return False if name == TRUNCATED else default
@@ -41,7 +41,7 @@ class RaceInfo(MutableMapping[str, Any]):
         """Look up what :func:`glance` returns, without computing the rest."""
         if self._values is not None:
             return _glance(self._values)
-        return self._timestep.glance(self._race)
+        return self._timestep.glance(self._index)
 
     def copy(self) -> dict[str, Any]:
         """Make a dict of it."""
@@ -49,7 +49,7 @@ class RaceInfo(MutableMapping[str, Any]):
 
     def _made(self) -> dict[str, Any]:
         if self._values is None:
-            self._values = self._timestep.info(self._race)
+            self._values = self._timestep.info(self._index)
             self._values[TRUNCATED] = False
         return self._values
 
@@ -92,7 +92,7 @@ def glance(info: MutableMapping[str, Any]) -> tuple[float, float, dict[str, floa
     :param info: of the timestep
     :return: speed [m/s], time of the lap that it completed, or 0 [s], and terms of the reward
     """
-    return info.glance() if isinstance(info, RaceInfo) else _glance(info)
+    return info.glance() if isinstance(info, LazyInfo) else _glance(info)
 
 
 def _glance(info: Mapping[str, Any]) -> tuple[float, float, dict[str, float]]:

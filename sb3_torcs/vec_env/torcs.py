@@ -23,7 +23,7 @@ from sb3_torcs.envs.making import MANY_RACES, EnvMaker, checked_threads, env_mak
 from sb3_torcs.envs.racing import RacingEnv
 from sb3_torcs.errors import EnvClosed, InvalidOption
 from sb3_torcs.signals import held_back
-from sb3_torcs.vec_env.info import TRUNCATED, RaceInfo
+from sb3_torcs.vec_env.info import TRUNCATED, LazyInfo
 
 __all__ = ["TorcsVecEnv"]
 
@@ -166,7 +166,7 @@ class TorcsVecEnv(DummyVecEnv):
         timestep = self._drive(batch)
         rewards = np.array(timestep.rewards, np.float32)
         dones = np.zeros(self.num_envs, np.bool_)
-        infos: list[Any] = [RaceInfo(timestep, i) for i in range(self.num_envs)]
+        infos: list[Any] = [LazyInfo(timestep, i) for i in range(self.num_envs)]
         over = timestep.ended | (self._elapsed + 1 >= self._limits)
         failures: list[Exception] = []
         # Ctrl-C waits meanwhile: a race between two episodes could not be driven on.

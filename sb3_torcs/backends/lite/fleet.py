@@ -31,7 +31,7 @@ RACE = OPPONENTS + 36
 @njit(cache=True, nogil=True)
 def _drive(
     rows: Rows,
-    races: Rows,
+    indices: Rows,
     states: FloatArray,
     table: FloatArray,
     shapes: FloatArray,
@@ -47,25 +47,25 @@ def _drive(
     """
     Drive worlds that are on one track.
 
-    :param rows: of the worlds, in the arrays that have a row for each race of a step
-    :param races: (n,) which race each row is of
-    :param states: (races, STATE_SIZE) of the physics, changed
+    :param rows: of the worlds, in the arrays that have a row for each world of a step
+    :param indices: (n,) which world each row is of
+    :param states: (worlds, STATE_SIZE) of the physics, changed
     :param table: ``Track.table``
     :param shapes: of the road's edges, as :class:`~sb3_torcs.backends.lite.rays.Edges` has them
     :param first: of the edges
     :param reach: of the edges
-    :param angles: (races, 19) of the range finders [rad]
-    :param gearboxes: (races,) ``AUTOMATIC`` or ``BY_ROAD_SPEED``
+    :param angles: (worlds, 19) of the range finders [rad]
+    :param gearboxes: (worlds,) ``AUTOMATIC`` or ``BY_ROAD_SPEED``
     :param controls: (n, 5)
     :param ticks: (n,) control ticks
     :param cars: (n, 111) filled
     :param lost: (n,) filled: whether the physics has given NaN
     """
     for row in rows:
-        race = races[row]
-        state, car = states[race], cars[row]
+        index = indices[row]
+        state, car = states[index], cars[row]
         steering, throttle, brake, gear, clutch = controls[row]
-        wanted = gearboxes[race] if math.isnan(gear) else int(gear)
+        wanted = gearboxes[index] if math.isnan(gear) else int(gear)
         asked = (steering, throttle, brake, wanted, clutch)
         physics.advance(state, table, asked, ticks[row])
         lost[row] = not math.isfinite(state[physics.X] + state[physics.VX])
@@ -75,7 +75,7 @@ def _drive(
             shapes,
             first,
             reach,
-            angles[race],
+            angles[index],
             car[: physics.SCALARS],
             car[WHEELS:BEAMS],
             car[BEAMS:OPPONENTS],
@@ -105,32 +105,32 @@ class LiteFleet:
         self._others = ThreadPoolExecutor(max(threads - 1, 1))  # threads begin at need
         self._owner = os.getpid()
 
-    def put(self, race: int, world: LiteBackend) -> None:
-        """Let a race go on in another world; see :class:`~sb3_torcs.backends.base.Fleet`."""
-        before, row = self._worlds[race], self._rows[race]
+    def put(self, index: int, world: LiteBackend) -> None:
+        """Let one go on in another world; see :class:`~sb3_torcs.backends.base.Fleet`."""
+        before, row = self._worlds[index], self._rows[index]
         if before is not world:
-            if before.keeps_state_in(row):  # not in that of another race, which took it over
+            if before.keeps_state_in(row):  # not in that of another index, which took it over
                 before.keep_state_in(np.empty_like(row))
-            self._worlds[race] = world
+            self._worlds[index] = world
         if not world.keeps_state_in(row):
             world.keep_state_in(row)
 
-    def step(self, races: Rows, controls: FloatArray, ticks: Rows, cars: FloatArray) -> list[int]:
+    def step(self, indices: Rows, controls: FloatArray, ticks: Rows, cars: FloatArray) -> list[int]:
         """Drive some of them; see :class:`~sb3_torcs.backends.base.Fleet`."""
         if os.getpid() != self._owner:
             raise EngineForked(
                 "these threads belong to the parent process; make the environment after the fork"
             )
-        lost = np.zeros(len(races), np.bool_)
+        lost = np.zeros(len(indices), np.bool_)
 
         def drive(rows: Rows, road: Road) -> None:
             table, edges = road
             _drive(
-                rows, races, self._states, table, *edges, self._angles, self._gearboxes, controls,
+                rows, indices, self._states, table, *edges, self._angles, self._gearboxes, controls,
                 ticks, cars, lost,
             )  # fmt: skip
 
-        jobs = iter(list(self._jobs(races)))
+        jobs = iter(list(self._jobs(indices)))
 
         def work() -> None:
             for rows, road in jobs:  # an iterator that all threads share
@@ -145,23 +145,23 @@ class LiteFleet:
             other.result()
         return np.flatnonzero(lost).tolist()
 
-    def _jobs(self, races: Rows) -> Iterator[tuple[Rows, Road]]:
+    def _jobs(self, indices: Rows) -> Iterator[tuple[Rows, Road]]:
         """Return the rows of each track, split so that all threads have work."""
         tracks: dict[int, list[int]] = {}
-        for row, race in enumerate(races.tolist()):
-            world = self._worlds[race]
-            self._gearboxes[race] = world.gearbox
+        for row, index in enumerate(indices.tolist()):
+            world = self._worlds[index]
+            self._gearboxes[index] = world.gearbox
             tracks.setdefault(id(world.road[0]), []).append(row)
         for rows in tracks.values():
-            road = self._worlds[races[rows[0]]].road
-            parts = math.ceil(self._threads * len(rows) / len(races))
+            road = self._worlds[indices[rows[0]]].road
+            parts = math.ceil(self._threads * len(rows) / len(indices))
             yield from ((part, road) for part in np.array_split(rows, parts) if len(part))
 
-    def failure(self, race: int) -> Exception:
-        """Return what stopped a race; see :class:`~sb3_torcs.backends.base.Fleet`."""
-        return self._worlds[race].lost()
+    def failure(self, index: int) -> Exception:
+        """Return what stopped a world; see :class:`~sb3_torcs.backends.base.Fleet`."""
+        return self._worlds[index].lost()
 
-    def arrive(self, race: int, steps: Iterable[tuple[Controls, int]], car: CarState) -> None:
+    def arrive(self, index: int, steps: Iterable[tuple[Controls, int]], car: CarState) -> None:
         """Do nothing: the worlds share the cars. See :class:`~sb3_torcs.backends.base.Fleet`."""
 
     def close(self) -> None:
