@@ -129,6 +129,13 @@ def test_listing_tracks_does_not_load_torch():
     assert "torch" not in loaded_by("tracks")
 
 
+def test_driving_does_not_load_the_compiler_of_torch():
+    """Its optimizers do, and it takes as long as torch itself."""
+    loaded = loaded_by("evaluate", "ddpg-fallback", "--env-kwargs", "max_episode_steps=1")
+    assert "torch" in loaded
+    assert "torch._dynamo" not in loaded
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [

@@ -1,4 +1,4 @@
-"""Optimizers for networks whose parameters are one vector."""
+"""Optimizers for networks whose parameters are one vector, and for those that learn nothing."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch as th
 
 from sb3_torcs.policies import kernels
 
-__all__ = ["LeanAdam", "adam_factors", "adam_state", "is_usual", "with_lr_scale"]
+__all__ = ["IdleOptimizer", "LeanAdam", "adam_factors", "adam_state", "is_usual", "with_lr_scale"]
 
 
 class _LrScale:
@@ -79,6 +79,28 @@ class LeanAdam(_LrScale, th.optim.Adam):
         )
         step += 1
         return mean, square, *adam_factors(group, step.item(), mean.dtype.type)
+
+
+class IdleOptimizer(th.optim.Optimizer):
+    """
+    What a policy that only drives has for an optimizer.
+
+    The first of PyTorch's own in a process imports PyTorch's compiler, which takes seconds.
+
+    :param params: as of every optimizer
+    :param options: of any optimizer
+    """
+
+    def __init__(self, params: Any, **options: Any) -> None:
+        super().__init__(params, options)
+
+    def add_param_group(self, param_group: dict[str, Any]) -> None:
+        """
+        Take parameters, as PyTorch does after it has imported its compiler.
+
+        :param param_group: with its options
+        """
+        self.param_groups.append(param_group)
 
 
 def adam_state(optimizer: th.optim.Optimizer, param: th.Tensor) -> dict[str, th.Tensor]:

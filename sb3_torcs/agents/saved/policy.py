@@ -182,9 +182,11 @@ def build_policy(said: Mapping[str, Any], seen: Spaces) -> Any:
 
     :param said: by :func:`plain_policy` or :func:`readable_policy`
     :param seen: the observation space and the action space
-    :return: the policy, without its weights
+    :return: the policy, without its weights; it cannot learn
     :raises ModelNotTrusted: if that takes more than plain data and known classes
     """
+    from sb3_torcs.policies.optimizers import IdleOptimizer
+
     if "unreadable" in said:
         raise ModelNotTrusted(str(said["unreadable"]))
     path, kwargs = str(said.get("class")), dict(said.get("kwargs") or {})
@@ -196,6 +198,8 @@ def build_policy(said: Mapping[str, Any], seen: Spaces) -> Any:
         raise ModelNotTrusted(f"its network would have more than {MAX_NUMBERS} numbers")
     given = {"observation_space": seen[0], "action_space": seen[1], "lr_schedule": lambda _: 0.0}
     taken = inspect.signature(policy_class).parameters
+    if "optimizer_class" in taken or "kwargs" in taken:
+        kwargs["optimizer_class"] = IdleOptimizer
     return policy_class(**{key: given[key] for key in given if key in taken}, **kwargs)
 
 
