@@ -17,6 +17,7 @@ from sb3_torcs.errors import OutputNotWritable, Sb3TorcsError
 
 __all__ = [
     "IN_A_FOLDER",
+    "PICTURES",
     "checked_ending",
     "import_advice",
     "listed",
@@ -28,6 +29,9 @@ __all__ = [
     "writable_file",
     "writable_folder",
 ]
+
+PICTURES = (".png", ".svg", ".pdf")
+"""Endings of pictures that matplotlib draws."""
 
 IN_A_FOLDER = "choose a file in an existing folder that you may write to"
 """Advice where a file cannot be written."""

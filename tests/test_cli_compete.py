@@ -73,6 +73,19 @@ def test_a_name_that_the_game_cannot_draw_is_refused(name, instead, capsys):
     assert out == ""
 
 
+@pytest.mark.parametrize("words", [
+    ["compete", "ppo-cars"], ["compete", "ppo-racer"], ["watch", "ppo-cars"],
+    ["watch", "scripted", "--beside", "ppo-racer", "--video", "both.mp4"],
+])  # fmt: skip
+def test_an_agent_of_whose_sensors_the_server_tells_too_little_is_told_what_else_races_it(
+    words, game, capsys, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    assert main(words) == 2
+    err = capsys.readouterr().err
+    assert re.search(r"'(ppo-\w+)' drives with '\w+'.* tells too little; `sb3-torcs race \1 ", err)
+
+
 def test_a_server_that_is_not_there_is_told(monkeypatch, capsys):
     monkeypatch.setattr("sb3_torcs.backends.scr.PATIENCE_WITH_OTHERS", 0.2)
     (bound,) = open_ports(1)

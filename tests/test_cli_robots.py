@@ -78,7 +78,7 @@ class TestByTheGame:
         _, out, _ = run(capsys, "sparkle", "--index", "0", "--track", "g-track-1", "--laps", "1",
                         "--game")  # fmt: skip
         lines = out.splitlines()
-        assert lines[0] == "sparkle 0, baja-bug, g-track-1"
+        assert lines[0] == "sparkle:0, baja-bug, g-track-1"
         assert lines[1].split() == ["lap", "time", "s", "damage"]
         assert lines[3].split()[0] == "1"
         assert lines[4].startswith("best lap: ")
@@ -104,7 +104,7 @@ class TestByTheEngine:
         assert (status, engine["robots"], engine["track"]) == (0, [("racer", 3)], "road/loop")
         assert (engine["laps"], engine["session"], engine["telemetry"]) == (2, "practice", file)
         assert out.splitlines() == [
-            "racer 3, small, loop",
+            "racer:3, small, loop",
             "lap  time s  damage",
             "---  ------  ------",
             "  1  50.500       0",
@@ -138,10 +138,10 @@ class TestByTheEngine:
         assert engine["session"] == "race"
         assert engine["robots"] == [("racer", 3), ("racer", 10)]
         assert out.splitlines()[3].split() == [
-            "1", "racer", "10", "big", "2", "90.000", "44.000", "0", "no"
+            "1", "racer:10", "big", "2", "90.000", "44.000", "0", "no"
         ]  # fmt: skip
         assert out.splitlines()[4].split() == [
-            "2", "racer", "3", "small", "0", "0.000", "-", "10001", "yes"
+            "2", "racer:3", "small", "0", "0.000", "-", "10001", "yes"
         ]  # fmt: skip
 
     def test_without_a_whole_lap_there_is_no_table(self, engine, capsys):

@@ -81,7 +81,7 @@ def test_two_drivers_side_by_side(tmp_path, capsys):
     assert main([*words, "--telemetry", str(drives)]) == 0
     out = capsys.readouterr().out
     assert "scripted, car1-trb1, a-speedway" in out
-    assert "inferno 3, car1-trb1, a-speedway" in out
+    assert "inferno:3, car1-trb1, a-speedway" in out
     laps = [float(lap) for lap in re.findall(r"best lap: ([\d.]+) s", out)]
     saved = [round(drive.laps[0].time, 3) for drive in saved_drives(drives)]
     assert saved == pytest.approx(laps, abs=0.001)  # [s] SCR packets carry six digits

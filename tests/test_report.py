@@ -1,7 +1,9 @@
 """The report says what the table of results says: every seed, failures too, and always the same."""
 
 import csv
+import json
 import math
+import re
 
 import numpy as np
 import pytest
@@ -67,7 +69,7 @@ def test_every_seed_is_in_the_report_failures_too(study, tmp_path):
     report = write_report(study, tmp_path / "out")
     (summary,) = lines_of(report, "| base |")
     assert "| 2 of 3 | 83.500 | 83.500 |" in summary
-    assert summary.endswith("| 200 | 20 | 2 |")
+    assert summary.endswith("| 200 | 20 | 1.7 |")
     one, _, failed = [line for line in lines_of(report, "| base, ") if "of 300" in line]
     assert "| base, 0 | yes | 97.000, 84.000, 83.500 | 7000 | laps | 300 of 300 | 1 of 3 |" in one
     assert "| base, 2 | no | - | 900 | off_track | 100 of 300 | 0 of 3 | never | - | - |" in failed
@@ -93,6 +95,8 @@ def test_a_study_that_still_runs_can_be_reported(tmp_path):
     rows = [row(0), row(0, timesteps=200), row(0, timesteps=300), row(1, laps=(), kept=1)]
     report = write_report(written(tmp_path / "study", rows), tmp_path / "out")
     assert lines_of(report, "| base, 0 | not measured |")
+    assert lines_of(report, "| base | not measured yet |")
+    assert not lines_of(report, "## The ladder")
     assert [len(trial.train) for trial in read_results(tmp_path / "study")] == [3, 1]
 
 
@@ -104,6 +108,19 @@ def test_rows_of_several_machines_may_be_mixed(study, tmp_path):
     write_report(study, tmp_path / "mixed")
     for name in ("report.md", "learning-base.png"):
         assert (tmp_path / "mixed" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+
+
+def test_every_variant_has_a_colour_and_a_dash_of_its_own(tmp_path):
+    rows = [row(0, variant=f"variant {number}") for number in range(9)]
+    write_report(written(tmp_path / "study", rows), tmp_path / "out")
+    page = (tmp_path / "out" / "report.html").read_text()
+    data = json.loads(re.search(r'id="data">(.*?)</script>', page)[1])
+    looks = [
+        (curve["colour"], curve["dash"])
+        for curve in data["panels"][0]["curves"] if curve.get("bold")
+    ]  # fmt: skip
+    assert len(set(looks)) == 9
+    assert page.count('<span class="chip dash"') == 2
 
 
 def test_few_seeds_have_no_interval(tmp_path):
@@ -241,7 +258,7 @@ def test_a_study_in_which_nobody_laps_is_reported_too(tmp_path):
     rows = [row(seed, laps=(), kept=1, timesteps=n) for seed in (0, 1) for n in (100, 200)]
     report = write_report(written(tmp_path / "study", rows), tmp_path / "out")
     assert lines_of(report, "| base |") == [
-        "| base | 0 of 0, 2 not measured | - | - | - | - | - | - |"
+        "| base | not measured yet | - | - | - | - | - | - |"
     ]
 
 

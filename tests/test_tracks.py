@@ -175,6 +175,10 @@ class TestLoading:
         with pytest.raises(TrackNotFound, match=r"did you mean '(road/)?aalborg'\? `sb3-torcs tr"):
             load_track(name)
 
+    def test_the_name_of_a_kind_is_told(self):
+        with pytest.raises(TrackNotFound, match=r"'road' is a kind of .*; name one of the \d+, e"):
+            load_track("road")
+
     def test_an_unknown_name_is_told_where_to_look(self):
         with pytest.raises(TrackNotFound) as caught:
             load_track("zz")

@@ -11,10 +11,31 @@ import gymnasium as gym
 from sb3_torcs.agents.models import driver_name, driver_record, load_driver
 from sb3_torcs.agents.rollout import drive
 from sb3_torcs.agents.wrapping import wrapped
+from sb3_torcs.envs.aids import NEED_RIVALS
+from sb3_torcs.errors import ModelMismatch
+from sb3_torcs.sensors import NEEDS_CAR, NEEDS_RACE
 from sb3_torcs.telemetry import DriveLabel, DriveLog
 from sb3_torcs.tracks.catalogue import lasting_name
 
-__all__ = ["Agent"]
+__all__ = ["Agent", "check_told"]
+
+
+def check_told(driver: str, options: Mapping[str, Any], advice: str) -> None:
+    """
+    Refuse an agent that needs more than the SCR protocol tells.
+
+    :param driver: its name
+    :param options: of ``Torcs-v0``, with which it drives
+    :param advice: what to do instead
+    :raises ModelMismatch: if it sees other cars or its car's file, or has aids that do
+    """
+    untold = sorted((NEEDS_RACE | NEEDS_CAR).intersection(options.get("sensors", ())))
+    untold += [aid for aid in NEED_RIVALS if options.get(aid)]
+    if untold:
+        raise ModelMismatch(
+            f"'{driver}' drives with {', '.join(map(repr, untold))}, for which the game's "
+            f"server tells too little; {advice}"
+        )
 
 
 class Agent:

@@ -174,7 +174,9 @@ def setting(text: str) -> tuple[str, Any]:
 
     name, equals, value = text.partition("=")
     if not (name.isidentifier() and equals):
-        raise argparse.ArgumentTypeError(f"{text!r}: expected NAME=VALUE, e.g. delay=2")
+        raise argparse.ArgumentTypeError(
+            f"{text!r}: expected NAME=VALUE, e.g. delay=2; name anything else before this option"
+        )
     try:
         return name, read_yaml(value)
     except YAMLError:

@@ -72,12 +72,13 @@ def run(args: argparse.Namespace) -> int:
 
     from sb3_torcs.agents.ghosts import is_ghost
     from sb3_torcs.agents.models import driver_name, one_of
-    from sb3_torcs.agents.remote import Agent
+    from sb3_torcs.agents.remote import Agent, check_told
     from sb3_torcs.agents.saved.record import DRIVEN_WITH
     from sb3_torcs.sensors import NEEDS_ROAD
 
     record = told_record(args.model)
     settings = record.kept(("track", "car", *DRIVEN_WITH))
+    check_told(args.model, settings, f"`sb3-torcs race {args.model} inferno` races it elsewhere")
     given = {"track": args.track, "car": args.car, "host": args.host, "port": args.port}
     settings |= {name: value for name, value in given.items() if value is not None}
     sees_road = NEEDS_ROAD.intersection(settings.get("sensors", ()))

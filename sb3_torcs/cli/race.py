@@ -21,6 +21,7 @@ from sb3_torcs.cli.common import (
     table,
     warn_unless_known,
 )
+from sb3_torcs.files import PICTURES
 from sb3_torcs.signals import held_back
 from sb3_torcs.torcs.starting_list import GRIDS
 
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 __all__ = ["add_parser", "run"]
 
 FILES = {
-    "video": (".mp4",), "picture": (".png", ".svg", ".pdf"), "telemetry": (".parquet",),
+    "video": (".mp4",), "picture": PICTURES, "telemetry": (".parquet",),
     "report": (".html",),
 }  # fmt: skip
 """Endings of what can be written: a video of the first race, the others of the last one."""

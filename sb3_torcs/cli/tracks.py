@@ -6,7 +6,7 @@ import argparse
 from typing import Any
 
 from sb3_torcs.cli.common import print_json, table
-from sb3_torcs.files import writable_file
+from sb3_torcs.files import PICTURES, writable_file
 
 __all__ = ["add_parser", "run"]
 
@@ -26,7 +26,9 @@ def add_parser(subparsers: Any) -> None:
         "names", nargs="*", metavar="NAME", help="a track or the path of its file; default: all"
     )
     parser.add_argument("--json", action="store_true", help="print a JSON list and nothing else")
-    parser.add_argument("--plot", metavar="FILE.png", help="draw the named track into this file")
+    parser.add_argument(
+        "--plot", metavar="FILE", help="draw the named track into this file (.png, .svg, .pdf)"
+    )
     parser.add_argument(
         "--racing-line",
         action="store_true",
@@ -54,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
                 f"--plot draws one track, but {len(tracks)} are named; "
                 "type e.g.: sb3-torcs tracks aalborg --plot aalborg.png"
             )
-        plot = writable_file(args.plot, (".png",))
+        plot = writable_file(args.plot, PICTURES)
     summaries = [track.summary() for track in tracks] if tracks else available_tracks()
     if args.json:
         print_json([summary._asdict() for summary in summaries])
@@ -68,7 +70,8 @@ def run(args: argparse.Namespace) -> int:
         from sb3_torcs.tracks.plot import plot_track
         from sb3_torcs.tracks.racing_line import driven
 
-        plot_track(tracks[0], plot, *(driven(tracks[0]) if args.racing_line else ()))
+        line, speed = driven(tracks[0]) if args.racing_line else (None, None)
+        plot_track(tracks[0], plot, line, speed, label="speed that the road allows [km/h]")
         if not args.json:
             print(f"drawn: {plot}")
     return 0

@@ -129,6 +129,7 @@ def _shows(game: Game, names: Sequence[str], args: argparse.Namespace) -> list[S
     """
     from sb3_torcs.agents.ghosts import check_laps, is_ghost, read_ghost
     from sb3_torcs.agents.models import one_of
+    from sb3_torcs.agents.remote import check_told
     from sb3_torcs.agents.saved.record import DRIVEN_WITH, TrainingRecord
     from sb3_torcs.errors import InvalidOption
     from sb3_torcs.evaluation.watching import Show
@@ -149,6 +150,11 @@ def _shows(game: Game, names: Sequence[str], args: argparse.Namespace) -> list[S
         told_record(name, game) if robot is None else TrainingRecord()
         for name, robot in zip(names, robots, strict=True)
     ]
+    for name, record in zip(names, records, strict=True):
+        elsewhere = (
+            f"`sb3-torcs race {name} inferno --video FILE.mp4` races and records it elsewhere"
+        )
+        check_told(name, record.kept(DRIVEN_WITH), elsewhere)
     trained = [r.env_kwargs["track"] for r in records if "track" in r.env_kwargs]
     usual = next(iter(trained), "aalborg")
     track = one_of("track", usual if args.track is None else args.track)

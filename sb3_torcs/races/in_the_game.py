@@ -9,15 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sb3_torcs.agents.remote import Agent
+from sb3_torcs.agents.remote import Agent, check_told
 from sb3_torcs.agents.saved.record import DRIVEN_WITH
-from sb3_torcs.envs.aids import NEED_RIVALS
-from sb3_torcs.errors import GameFailed, InvalidOption, ModelMismatch, ServerLost
+from sb3_torcs.errors import GameFailed, InvalidOption, ServerLost
 from sb3_torcs.races import text_mode
 from sb3_torcs.races.entrants import Entrant
 from sb3_torcs.races.protocol import Race, Standing
 from sb3_torcs.scr.server import open_ports, start_server
-from sb3_torcs.sensors import NEEDS_CAR, NEEDS_RACE
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.race_results import RobotResult
 from sb3_torcs.torcs.race_setup import SCR_DRIVERS, SCR_SERVER, RaceSetup, session_for
@@ -128,13 +126,7 @@ def _client(entrant: Entrant, race: RaceSetup, port: int, trust: bool) -> Agent:
     pilot = entrant.agent
     assert pilot is not None, "robots are the game's"
     options = pilot.kept(DRIVEN_WITH)
-    untold = sorted((NEEDS_RACE | NEEDS_CAR).intersection(options.get("sensors", ())))
-    untold += [aid for aid in NEED_RIVALS if options.get(aid)]
-    if untold:
-        raise ModelMismatch(
-            f"'{entrant.name}' drives with {', '.join(map(repr, untold))}, for which the game's "
-            "server tells too little; leave out --game"
-        )
+    check_told(entrant.name, options, "leave out --game")
     settings: dict[str, Any] = {
         **options,
         "track": race.track, "car": pilot.car, "host": "127.0.0.1", "port": port,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
@@ -62,10 +63,12 @@ class Standing:
     distance: float | None = field(repr=False, default=0.0)  # [m] which the game does not tell
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the fields as the command prints them."""
+        """Return the fields as the command prints them: times in whole milliseconds."""
         fields = asdict(self)
         del fields["distance"]
-        return fields
+        best = self.best_lap
+        times = {"time": round(self.time, 3), "best_lap": None if best is None else round(best, 3)}
+        return fields | times
 
 
 @dataclass(frozen=True)
@@ -78,6 +81,7 @@ class Race:
     drivers: list[str]  # by grid slot
     distances: FloatArray  # (moments, cars) [m] from the start line on
     places: Any  # (moments, cars)
+    goal: float = math.inf  # [m] from the start line on, where the race ends
 
 
 class Watcher(Protocol):
@@ -149,10 +153,15 @@ def run_races(
     checked_choice("grid", grid, GRIDS)
     check_count("races", races)
     size = len(entrants) if field_size is None else field_size
-    if not 1 <= size <= min(len(entrants), GRID_SLOTS):
+    if not 1 <= size <= len(entrants):
         raise InvalidOption(
-            f"{len(entrants)} drivers, {size} in a race; expected no more than there are, and 1 to "
-            f"{GRID_SLOTS}, which is what a grid has room for"
+            f"field is {size}; expected a whole number from 1 to {len(entrants)}, as many drivers "
+            "as there are"
+        )
+    if size > GRID_SLOTS:
+        raise InvalidOption(
+            f"{size} drivers in a race; a grid has room for {GRID_SLOTS}: name fewer, or draw some "
+            f"for each race with --field {GRID_SLOTS} (from Python: field_size={GRID_SLOTS})"
         )
 
     def held() -> Iterator[Race]:  # what is checked above is refused before the first race
@@ -248,7 +257,8 @@ def run_race(
     finally:
         engine.close()
     trace = np.array(moments)
-    return Race(seed, standings, failures, names, trace[..., 0] - starts, trace[..., 1].astype(int))
+    distances, places = trace[..., 0] - starts, trace[..., 1].astype(int)
+    return Race(seed, standings, failures, names, distances, places, laps * road.length)
 
 
 def behind_the_line(engine: Engine, road: Track, cars: int) -> FloatArray:

@@ -32,12 +32,14 @@ def iqm(scores: Array) -> Array:
     """
     Average the middle half of the seeds: rliable's ``aggregate_iqm`` for all points at once.
 
+    It is called thousands of times, and SciPy's ``trim_mean`` would take a millisecond each.
+
     :param scores: (seeds, 1, points)
     :return: (points,)
     """
-    from scipy.stats import trim_mean
-
-    return np.asarray(trim_mean(scores, proportiontocut=0.25, axis=0)[0])
+    cut = len(scores) // 4
+    middle = np.sort(scores[:, 0], axis=0)[cut : len(scores) - cut]
+    return np.asarray(middle.mean(axis=0))
 
 
 def share(scores: Array) -> Array:

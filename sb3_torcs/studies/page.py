@@ -14,7 +14,7 @@ import numpy as np
 from sb3_torcs.studies.config import trial_name
 from sb3_torcs.studies.curves import COMPLETES, PANELS, Learning
 from sb3_torcs.studies.estimates import Array, Estimate
-from sb3_torcs.telemetry.document import Cell, chip, colour_of, document, paragraph, table
+from sb3_torcs.telemetry.document import Cell, chip, colour_of, dash_of, document, paragraph, table
 
 __all__ = ["Section", "study_page"]
 
@@ -52,7 +52,7 @@ def study_page(
     """
     panels = _panels(variants)
     legend = " ".join(
-        f"{chip(colour_of(number))}{escape(learning.variant)}&emsp;"
+        f"{chip(number)}{escape(learning.variant)}&emsp;"
         for number, learning in enumerate(variants)
     )
     body = [
@@ -61,7 +61,8 @@ def study_page(
         "</header><main><h2>Learning</h2>",
         f"<p>{legend}</p>",
         paragraph("Thin: every seed; point at one to see which. Bold: the interquartile mean of "
-                  "the seeds, and its 95 % interval.", "note"),
+                  "the seeds, and its 95 % interval; of the share of races that complete, the mean "
+                  "alone.", "note"),
         f'<div class="panels">{"".join(_frame(panel) for panel in panels)}</div>',
     ]  # fmt: skip
     for section in sections:
@@ -95,8 +96,8 @@ def _panels(variants: Sequence[Learning]) -> list[dict[str, Any]]:
 def _curve(text: str, number: int, x: Array, y: Array, **more: Any) -> dict[str, Any]:
     """Return a curve as the script draws it; what is not finite leaves a gap."""
     values = [round(float(value), 4) if np.isfinite(value) else None for value in y]
-    colour = colour_of(number)
-    return {"text": escape(text), "colour": colour, "x": x.tolist(), "y": values, **more}
+    looks = {"colour": colour_of(number), "dash": dash_of(number)}
+    return {"text": escape(text), **looks, "x": x.tolist(), "y": values, **more}
 
 
 def _mean(learning: Learning, number: int, name: str) -> list[dict[str, Any]]:

@@ -110,7 +110,8 @@ def write_report(folder: Path, output: Path) -> Path:
     trials = read_results(folder)
     study = trials[0].train[0]["study"]
     notes = [NOTE, *_waiting(folder), *_diverged(folder)]
-    sections = [_summary(trials), _seeds(trials), _ladder(trials), _shares(trials)]
+    every = [_summary(trials), _seeds(trials), _ladder(trials), _shares(trials)]
+    sections = [section for section in every if section.rows]
     lines = [f"# {study}", ""]
     for note in notes:
         lines += [note, ""]
@@ -126,8 +127,9 @@ def write_report(folder: Path, output: Path) -> Path:
         shown = f"![{learning.variant}]({picture.name})"
         lines += [f"## Learning: {learning.variant}", "", shown, ""]
     lines += [
-        "Thin: every seed; bold: the interquartile mean of the seeds. A seed without a lap counts "
-        "as infinitely slow, so the mean of the lap times begins when enough seeds have one. "
+        "Thin: every seed; bold: the interquartile mean of the seeds, and of the share of races "
+        "that complete the mean of all. A seed without a lap counts as infinitely slow, so the "
+        "mean of the lap times begins when enough seeds have one. "
         "Bold curves end where the seed ends that has come least far.",
         "",
     ]
@@ -200,8 +202,14 @@ def _summary(trials: Sequence[Results]) -> Section:
                 _seconds(_median(laps)),
                 "-" if middle is None else _with_interval(middle),
                 *(
-                    _count(_median([NO_LAP if row is None else row[key] / unit for row in firsts]))
-                    for key, unit in (("decisions", 1.0), ("episodes", 1.0), ("wall_s", 60.0))
+                    _count(
+                        _median([NO_LAP if row is None else row[key] / unit for row in firsts]), n
+                    )
+                    for key, unit, n in (
+                        ("decisions", 1.0, 0),
+                        ("episodes", 1.0, 0),
+                        ("wall_s", 60.0, 1),
+                    )
                 ),
             ]
         )
@@ -214,6 +222,8 @@ def _summary(trials: Sequence[Results]) -> Section:
 
 def _completing(homes: Sequence[dict[str, Any]], seeds: int) -> str:
     """Count the seeds that complete all laps, and those without a result."""
+    if not homes:
+        return "not measured yet"
     counted = f"{sum(row['completes'] for row in homes)} of {len(homes)}"
     return counted if len(homes) == seeds else f"{counted}, {seeds - len(homes)} not measured"
 
@@ -223,8 +233,8 @@ def _median(values: Sequence[float]) -> float | None:
     return sorted(values)[len(values) // 2] if values else None
 
 
-def _count(value: float | None) -> str:
-    return "-" if value is None or not math.isfinite(value) else f"{value:,.0f}"
+def _count(value: float | None, decimals: int) -> str:
+    return "-" if value is None or not math.isfinite(value) else f"{value:,.{decimals}f}"
 
 
 def _with_interval(figure: Estimate) -> str:

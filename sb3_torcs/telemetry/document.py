@@ -20,6 +20,7 @@ __all__ = [
     "Cell",
     "chip",
     "colour_of",
+    "dash_of",
     "document",
     "paragraph",
     "table",
@@ -32,6 +33,9 @@ LONG = 60  # rows; a table with more scrolls on the screen
 
 OKABE_ITO = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
 """Colours that colour-blind people tell apart; without the yellow, which is weak on white."""
+
+DASHES = ("solid", "dash", "dot")
+"""Lines of those who have the colours first, of those who have them again, and so on."""
 
 PAGE = """\
 <!DOCTYPE html>
@@ -123,9 +127,22 @@ def colour_of(number: int) -> str:
     return OKABE_ITO[number % len(OKABE_ITO)]
 
 
-def chip(colour: str) -> str:
-    """Return a coloured dot, as HTML."""
-    return f'<span class="chip" style="background:{colour}"></span>'
+def dash_of(number: int) -> str:
+    """
+    Choose how a line is drawn, as Plotly calls it.
+
+    :param number: of what has it, from 0; colour and dash together come again after 21
+    """
+    return DASHES[number // len(OKABE_ITO) % len(DASHES)]
+
+
+def chip(number: int) -> str:
+    """
+    Return a dot in the colour of something, filled if its line is solid, as HTML.
+
+    :param number: of what it stands for
+    """
+    return f'<span class="chip {dash_of(number)}" style="--colour:{colour_of(number)}"></span>'
 
 
 def paragraph(text: str, kind: str = "") -> str:

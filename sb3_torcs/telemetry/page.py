@@ -13,10 +13,10 @@ from sb3_torcs.car import KMH, FloatArray
 from sb3_torcs.telemetry.comparison import Comparison, CornerPass, DriverLap
 from sb3_torcs.telemetry.document import (
     FOLDER,
-    OKABE_ITO,
     Cell,
     chip,
     colour_of,
+    dash_of,
     document,
     paragraph,
     table,
@@ -30,7 +30,6 @@ __all__ = ["lap_report", "missing", "summary"]
 MOST_SLIP = 0.5  # [-] that is shown; a car that turns round slips by any number
 EQUAL = 0.0005  # [s] less is no difference
 IN_TITLE = 3  # laps that the title names
-DASHES = ("solid", "dash", "dot")  # of the first seven drivers, the next seven, and so on
 BESIDE = 1.6  # [-] of the road's width, from its middle to a corner's number
 
 
@@ -151,7 +150,7 @@ def missing(comparison: Comparison) -> list[str]:
 def _name(number: int, one: DriverLap) -> Cell:
     """Cell with a driver's colour and name."""
     name = one.drive.driver
-    return Cell(name, html=f"{chip(colour_of(number))}{escape(name)}")
+    return Cell(name, html=f"{chip(number)}{escape(name)}")
 
 
 def _moment(drivers: Sequence[DriverLap]) -> str:
@@ -254,7 +253,7 @@ def _data(comparison: Comparison) -> dict[str, Any]:
             {
                 "name": one.drive.driver,
                 "colour": colour_of(number),
-                "dash": DASHES[number // len(OKABE_ITO) % len(DASHES)],
+                "dash": dash_of(number),
                 "columns": {name: _packed(own) for name, own in _columns(one, track, grid).items()},
             }
             for number, one in enumerate(comparison.drivers)

@@ -8,14 +8,16 @@ const THIN = 1, BOLD = 3; // [px]
 
 function draw(panel) {
   const plot = document.getElementById(panel.id);
-  const curves = panel.curves.map(({ text, colour, band, bold, x, y }) => ({
+  const curves = panel.curves.map(({ text, colour, dash, band, bold, x, y }) => ({
     x, y, type: "scatter", mode: band ? "none" : "lines", fill: band ? "toself" : undefined,
     fillcolor: `${colour}33`, opacity: bold || band ? 1 : 0.45, connectgaps: false,
-    line: { color: colour, width: bold ? BOLD : THIN },
+    line: { color: colour, dash, width: bold ? BOLD : THIN },
     ...(band ? { hoverinfo: "skip" } : { hovertemplate: `${text}<br>%{x:,} timesteps: %{y}<extra></extra>` }),
   }));
   const axis = { gridcolor: "#e6e9ed", zeroline: false };
+  const empty = !curves.some(({ y }) => y.some((value) => value !== null));
   const layout = {
+    annotations: empty ? [{ text: "no seed has one", showarrow: false, xref: "paper", yref: "paper", x: 0.5, y: 0.5 }] : [],
     font: FONT, showlegend: false, hovermode: "closest", height: 340,
     margin: { l: 52, r: 12, t: 30, b: 44 }, title: { text: panel.title, font: { size: 13 }, x: 0.02 },
     xaxis: { ...axis, title: { text: "timesteps learned from" } },

@@ -53,5 +53,5 @@ class RobotResult:
 
     @property
     def driver(self) -> str:
-        """The driver's name for tables."""
-        return self.client or f"{self.robot} {self.index}"
+        """The driver's name for tables, as it is given to commands."""
+        return self.client or f"{self.robot}:{self.index}"

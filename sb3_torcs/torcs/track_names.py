@@ -68,6 +68,12 @@ def find_track(track: str | os.PathLike[str] | TrackFile, game: Game | None = No
             return file
     if game is not None:
         _refuse_half_a_track(name, game)
+    of_that_kind = [full for full in known if full.startswith(f"{name}/")]
+    if of_that_kind:
+        raise TrackNotFound(
+            f"'{name}' is a kind of tracks; name one of the {len(of_that_kind)}, "
+            f"e.g. '{of_that_kind[0]}'"
+        )
     names = [word for full in known for word in (full.rpartition("/")[2], full)]
     raise TrackNotFound(f"no track '{name}'{near_miss(name, names, LISTED)}{_hint(name, game)}")
 

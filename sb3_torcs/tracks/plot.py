@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,7 +10,7 @@ import numpy as np
 
 from sb3_torcs.car import KMH, FloatArray
 from sb3_torcs.errors import InvalidOption
-from sb3_torcs.files import IN_A_FOLDER, whole_file
+from sb3_torcs.files import IN_A_FOLDER, PICTURES, checked_ending, whole_file
 from sb3_torcs.tracks.track import CURVATURE, LENGTH, Track
 
 if TYPE_CHECKING:
@@ -30,11 +29,12 @@ START_COLOUR = "#c1272d"
 
 def plot_track(
     track: Track,
-    path: str | os.PathLike[str],
+    path: str | Path,
     line: FloatArray | None = None,
     speed: FloatArray | None = None,
     title: str | None = None,
     fastest: float | None = None,
+    label: str = "speed [km/h]",
 ) -> None:
     """
     Draw a track seen from above, to scale.
@@ -46,14 +46,17 @@ def plot_track(
     :param title: above the picture; ``None`` is the track's name and measures
     :param fastest: speed at the end of the colours, which begin at 0 [m/s]; ``None`` spreads them
         over the given speeds
+    :param label: of the colours
     :raises InvalidOption: if ``track`` is no track
-    :raises OutputNotWritable: if the file cannot be written; the previous one is kept
+    :raises OutputNotWritable: if the file cannot be written, or has another suffix; the previous
+        one is kept
     """
     if not isinstance(track, Track):
         raise InvalidOption(
             f"track is {track!r}; expected a track, e.g. "
             'sb3_torcs.tracks.catalogue.load_track("aalborg")'
         )
+    path = checked_ending(path, PICTURES)
     # Drawing is rare and its import is slow. Figures of their own leave the caller's windows be.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -69,7 +72,7 @@ def plot_track(
         if drawn is not None:
             if fastest is not None:
                 drawn.set_clim(0.0, KMH * fastest)
-            figure.colorbar(drawn, ax=axes, label="speed [km/h]", shrink=0.8)
+            figure.colorbar(drawn, ax=axes, label=label, shrink=0.8)
     measures = (
         f"{track.category}/{track.name}: {track.length:.0f} m, {track.width:.0f} m wide, "
         f"tightest bend {track.tightest_radius:.0f} m"
@@ -77,8 +80,8 @@ def plot_track(
     axes.set_title(measures if title is None else title)
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")
-    with whole_file(Path(path), IN_A_FOLDER) as aside:
-        figure.savefig(aside, dpi=120, format=aside.suffix[1:] or "png")
+    with whole_file(path, IN_A_FOLDER) as aside:
+        figure.savefig(aside, dpi=120)
 
 
 def _size(track: Track) -> tuple[float, float]:
