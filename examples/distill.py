@@ -22,6 +22,8 @@ from sb3_torcs.agents.saved.algorithm import told_algorithm
 from sb3_torcs.agents.saved.file import learned_weights, saved_data
 from sb3_torcs.agents.saved.record import DRIVEN_WITH
 from sb3_torcs.agents.saved.writing import recipe, write_record
+from sb3_torcs.agents.wrapping import frames_of
+from sb3_torcs.car import DEFAULT_CAR, check_count
 from sb3_torcs.errors import ends_in_a_line
 from sb3_torcs.policies import BoundedPolicy
 from sb3_torcs.policies.imitation import Imitation, mean_actions
@@ -105,7 +107,10 @@ class School:
 
 def _same_for_all(teachers: Sequence[str]) -> dict:
     """Return the options of driving, which all teachers have to share."""
-    found = [driver_record(teacher).kept(DRIVEN_WITH) for teacher in teachers]
+    found = [
+        {"car": DEFAULT_CAR, **driver_record(teacher).kept(("car", *DRIVEN_WITH))}
+        for teacher in teachers
+    ]
     for teacher, options in zip(teachers, found, strict=True):
         if options != found[0]:
             raise SystemExit(f"{teacher} drives with {options}, and {teachers[0]} with {found[0]}")
@@ -119,7 +124,15 @@ def _policy(name: str) -> ActorCriticPolicy:
         raise SystemExit(f"{name} is no model of PPO; give one, e.g. ppo-roads")
     if driver_record(name).env_kwargs.get("action") != "pedal":
         raise SystemExit(f'{name} does not drive with action="pedal"; give one, e.g. ppo-roads')
+    refuse_frames(name)
     return PPO.load(file, device="cpu").policy
+
+
+def refuse_frames(name: str) -> None:
+    """Refuse an agent that sees several timesteps at once, which a school does not show."""
+    frames = frames_of(driver_record(name).hyperparameters)
+    if frames is not None:
+        raise SystemExit(f"{name} sees {frames} timesteps at once; give another, e.g. ppo-roads")
 
 
 def teach(model: PPO, school: School, args: argparse.Namespace) -> None:
@@ -154,6 +167,7 @@ def teach(model: PPO, school: School, args: argparse.Namespace) -> None:
 
 def main() -> None:
     args = parser.parse_args()
+    check_count("--rounds", args.rounds)
     school = School(args)
     policy_kwargs = {
         "net_arch": [args.width, args.width],
@@ -161,6 +175,8 @@ def main() -> None:
         "log_std_init": [-2.0, -0.7],  # steering, pedal, for a training that goes on from it
         "actor_sensors": args.actor_sensors,
     }
+    if args.student:
+        refuse_frames(args.student)
     file = find_model(args.student) if args.student else None
     known = PPO.load(file, device="cpu") if file else None
     model = PPO(

@@ -6,6 +6,7 @@ import time
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 
+from sb3_torcs.errors import ends_in_a_line
 from sb3_torcs.evaluation.protocol import RACE_LAPS, evaluate, race_environment
 from sb3_torcs.training import zoo
 from sb3_torcs.training.manager import build
@@ -59,4 +60,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with ends_in_a_line():
+        main()

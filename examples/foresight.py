@@ -6,6 +6,7 @@ import gymnasium as gym
 import numpy as np
 
 from sb3_torcs.agents.models import agent_record, load_driver
+from sb3_torcs.errors import ends_in_a_line
 from sb3_torcs.torcs.installation import find_game
 
 ROBOTS = ("berniw", "bt", "inferno", "lliaw", "olethros", "tita", "inferno:4", "bt:3", "tita:4")
@@ -90,4 +91,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with ends_in_a_line():
+        main()

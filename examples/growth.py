@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from sb3_torcs import cores
 from sb3_torcs.bench.drives import scripted_actions
 from sb3_torcs.bench.updates import default_model
+from sb3_torcs.errors import ends_in_a_line
 from sb3_torcs.policies.updates import LeanUpdates
 from sb3_torcs.training.zoo import config_file, read_entry
 from sb3_torcs.vec_env import TorcsVecEnv
@@ -123,4 +124,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with ends_in_a_line():
+        main()

@@ -10,6 +10,9 @@ parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("runs", nargs="+", type=Path, help="folders of runs, with evaluations.npz")
 parser.add_argument("--out", type=Path, default=Path("evaluations.png"))
 args = parser.parse_args()
+for run in args.runs:
+    if not (run / "evaluations.npz").is_file():
+        parser.error(f"'{run}' has no evaluations.npz; give the folder of a `sb3-torcs train`")
 
 figure = Figure(figsize=(8.0, 1.2 + 1.1 * len(args.runs)), layout="constrained")
 rows = figure.subplots(len(args.runs), 1, sharex=True, sharey=True, squeeze=False)[:, 0]

@@ -18,6 +18,7 @@ from sb3_torcs.agents.models import driver_record, find_model
 from sb3_torcs.agents.saved.algorithm import told_algorithm
 from sb3_torcs.agents.saved.file import learned_weights, saved_data
 from sb3_torcs.agents.saved.writing import RecordCallback, recipe
+from sb3_torcs.agents.wrapping import frames_of
 from sb3_torcs.callbacks import (
     AdaptiveLearningRateCallback,
     LeanUpdatesCallback,
@@ -25,6 +26,7 @@ from sb3_torcs.callbacks import (
     RewardCallback,
 )
 from sb3_torcs.callbacks.learning import learn_values
+from sb3_torcs.car import check_count
 from sb3_torcs.errors import ends_in_a_line
 from sb3_torcs.vec_env import MirrorVecEnv, TorcsVecEnv
 
@@ -123,6 +125,11 @@ def go_on(args: argparse.Namespace, tracks: list[str], settings: Settings) -> Pa
         raise SystemExit(
             f'{args.driver} does not drive with action="pedal"; give one, e.g. ppo-roads'
         )
+    frames = frames_of(driver_record(args.driver).hyperparameters)
+    if frames is not None:
+        raise SystemExit(
+            f"{args.driver} sees {frames} timesteps at once; give another, e.g. ppo-roads"
+        )
     env_kwargs = {name: value for name, value in trained.items() if name not in NOT_DRIVING}
     env_kwargs["track"] = tracks if len(tracks) > 1 else tracks[0]
     cars = make_cars(args, env_kwargs, settings)
@@ -153,13 +160,17 @@ def go_on(args: argparse.Namespace, tracks: list[str], settings: Settings) -> Pa
 
 def main() -> None:
     args = parser.parse_args()
+    check_count("--timesteps", args.timesteps)
     args.folder.mkdir(parents=True, exist_ok=True)
     th.set_num_threads(1)
     together = args.together
     settings = TOGETHER if together else SPECIALIST
     for tracks in [args.track] if together else [[track] for track in args.track]:
         file = go_on(args, tracks, settings)
-        print(f"saved {file}; drive it: sb3-torcs evaluate {file}")
+        choice = f" --track {tracks[0]}" if len(tracks) > 1 else ""
+        cars = driver_record(file).env_kwargs.get("car")
+        choice += f" --car {cars[0]}" if isinstance(cars, list) else ""
+        print(f"saved {file}; drive it: sb3-torcs evaluate {file}{choice}")
 
 
 if __name__ == "__main__":

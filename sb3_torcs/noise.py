@@ -33,6 +33,7 @@ __all__ = [
     "bind",
     "checked_dt",
     "noises_of",
+    "parameters_of",
 ]
 
 LOW, HIGH = np.array(ACTION_LOW), np.array(ACTION_HIGH)  # [-] steering, throttle, brake
@@ -49,11 +50,16 @@ class OUParameters(NamedTuple):
     sigma: float  # [actuator's unit per root of theta's time] how much chance
 
     @classmethod
-    def of(cls, value: OUParameters | Sequence[float] | Mapping[str, float]) -> OUParameters:
+    def of(
+        cls,
+        value: OUParameters | Sequence[float] | Mapping[str, float],
+        actuator: str = "a noise",
+    ) -> OUParameters:
         """
         Read the parameters from what a hyperparameter file can hold.
 
         :param value: ``[mu, theta, sigma]``, or a mapping with these names
+        :param actuator: whose noise it is, for the error
         :return: the parameters, checked
         """
         try:
@@ -63,10 +69,23 @@ class OUParameters(NamedTuple):
             found = cls(np.nan, np.nan, np.nan)
         if not np.isfinite(found).all() or found.theta < 0.0 or found.sigma < 0.0:
             raise InvalidOption(
-                f"{value!r} are not noise parameters; pass [mu, theta, sigma], or a mapping with "
-                "these names: finite numbers, theta and sigma not negative, e.g. [0.0, 0.6, 0.3]"
+                f"{actuator} is {value!r}; expected [mu, theta, sigma], or a mapping with these "
+                "names: finite numbers, theta and sigma not negative, e.g. [0.0, 0.6, 0.3]"
             )
         return found
+
+
+def parameters_of(steering: Any, throttle: Any, brake: Any) -> tuple[OUParameters, ...]:
+    """
+    Read the parameters of all actuators.
+
+    :param steering: as of :meth:`OUParameters.of`
+    :param throttle: the same
+    :param brake: the same
+    :return: of steering, throttle and brake, checked
+    """
+    values = {"steering": steering, "throttle": throttle, "brake": brake}
+    return tuple(OUParameters.of(value, name) for name, value in values.items())
 
 
 BLOG = (
@@ -137,7 +156,7 @@ class ActuatorNoise(ActionNoise):
         seed: int | None = None,
     ) -> None:
         super().__init__()
-        self.parameters = tuple(OUParameters.of(value) for value in (steering, throttle, brake))
+        self.parameters = parameters_of(steering, throttle, brake)
         self.scale = 1.0
         self.timesteps = 0
         self.n_envs = 1

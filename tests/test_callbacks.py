@@ -117,6 +117,16 @@ def test_the_seed_of_the_callback_comes_first():
     assert not np.array_equal(one.actions, two.actions)
 
 
+@pytest.mark.parametrize(("kwargs", "message"), [
+    ({"seed": "abc"}, "seed is 'abc'; expected a whole number >= 0"),
+    ({"seed": -1}, "seed is -1; expected a whole number >= 0"),
+    ({"throttle": 5}, r"throttle is 5; expected \[mu, theta, sigma\]"),
+])  # fmt: skip
+def test_a_wrong_argument_of_the_noise_is_told(kwargs, message):
+    with pytest.raises(InvalidOption, match=message):
+        NoiseCallback(**kwargs)
+
+
 def test_nothing_is_added_during_the_warm_up():
     """Before learning_starts SB3 samples; the set point must not pull those actions."""
     model = make_model(learning_starts=8)

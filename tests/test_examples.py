@@ -163,6 +163,24 @@ def test_specialists_teach_one_student(monkeypatch, capsys, tmp_path, game):
     assert driver_record(student).env_kwargs["track"] == ["forza", "aalborg", "eroad"]
 
 
+@pytest.mark.parametrize("words", [
+    ["specialize.py", "ppo-robust", "--track", "forza"],
+    ["distill.py", "--teach", "ppo-robust", "forza"],
+    ["distill.py", "--teach", "ppo-roads", "forza", "--student", "ppo-robust"],
+])  # fmt: skip
+def test_an_agent_that_sees_several_timesteps_is_refused(words, monkeypatch, tmp_path, game):
+    with pytest.raises(SystemExit, match="ppo-robust sees 4 timesteps at once; give another"):
+        run(monkeypatch, *words, "--folder", str(tmp_path))
+
+
+@pytest.mark.parametrize("words", [
+    ["--teach", "ppo-league", "corkscrew", "--teach", "ppo-roads", "forza"],
+])  # fmt: skip
+def test_teachers_of_different_cars_are_refused(words, monkeypatch, tmp_path, game):
+    with pytest.raises(SystemExit, match=r"ppo-roads drives with .*'car1-trb1'.*'car1-ow1'"):
+        run(monkeypatch, "distill.py", *words, "--folder", str(tmp_path))
+
+
 def test_a_specialist_of_a_student_learns_its_value_function_anew(monkeypatch, tmp_path, game):
     """The shipped file of a student has NaN where its value function would be."""
     words = ["ppo-everywhere", "--track", "forza", "--timesteps=1", "--folder", str(tmp_path)]
@@ -181,7 +199,8 @@ def test_a_student_that_sees_less_goes_on_learning_on_its_tracks_together(
     student = str(tmp_path / "model.zip")
     words = ["--track", "forza", "aalborg", "--timesteps=1", "--values=1"]
     run(monkeypatch, "specialize.py", student, "--together", *words, "--folder", str(tmp_path))
-    assert f"sb3-torcs evaluate {tmp_path / 'together.zip'}" in capsys.readouterr().out
+    told = f"sb3-torcs evaluate {tmp_path / 'together.zip'} --track forza"
+    assert told in capsys.readouterr().out
     policy = PPO.load(tmp_path / "together.zip", device="cpu").policy
     assert policy.actor_sensors == ("base",)
     assert policy.mlp_extractor.policy_net[0].in_features == 29

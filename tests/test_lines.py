@@ -39,7 +39,7 @@ class Evaluations(EvalCallback):
         if self.n_calls % EVERY == 0 and self.lines:
             line = self.lines.pop(0)
             for listener in self.metrics.listeners:
-                listener(line)
+                listener.take_line(line)
         return True
 
 
@@ -95,6 +95,19 @@ def test_each_evaluation_is_told_and_the_first_lap_and_the_best(oval):
         "0 s: a whole lap, 98.10 s, the best so far",
         "0 s: a whole lap, 99.00 s",
     ]
+
+
+@pytest.mark.usefixtures("clock")
+def test_who_showed_an_earlier_training_is_not_told_of_the_next(oval):
+    metrics, old = DrivingMetricsCallback(), io.StringIO()
+    env = DummyVecEnv([lambda: RacingEnv(ScriptedBackend(oval))])
+    model = PPO("MlpPolicy", env, n_steps=32, batch_size=32, n_epochs=1, device="cpu", seed=0)
+    for stream, lines in ((old, 1), (io.StringIO(), 2)):
+        drives = [driven(oval, 296.0)] * lines
+        progress = RacingProgressCallback(stream=stream)
+        model.learn(32, [progress, metrics, Evaluations(env, metrics, drives)])
+        assert stream.getvalue().count("296 m\n") == lines
+    assert old.getvalue().count("296 m\n") == 1
 
 
 @pytest.mark.usefixtures("clock")

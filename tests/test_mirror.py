@@ -229,11 +229,13 @@ def test_what_has_no_mirror_image_is_told_at_once():
     ppo = PPO("MlpPolicy", make_vec_env(MirrorToy), n_steps=8, batch_size=8, device="cpu")
     normalized = make_model(env=MirrorToy)
     normalized.set_env(VecNormalize(normalized.get_env()))
+    stacked = DDPG("MlpPolicy", VecFrameStack(make_vec_env(MirrorToy), 2), device="cpu")
     for model, message in (
         (ppo, "PPO has none"),
         (normalized, "take 'normalize' away"),
         (make_model(env=OneSided), "pass 'scr' or 'narrow'"),
         (make_model(env=ToyRace), "has no range_finder_angles"),
+        (stacked, "MirrorCallback: only observations of .* take out what changes their"),
     ):
         with pytest.raises(InvalidOption, match=message):
             model.learn(10, callback=MirrorCallback())

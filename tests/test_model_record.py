@@ -383,7 +383,7 @@ def test_a_driver_alone_drives_the_same_and_learns_nothing(env, tmp_path, record
     if not recorded:
         del model.sb3_torcs
     model.save(tmp_path / "whole.zip")
-    write_driver(tmp_path / "whole.zip", tmp_path / "driver.zip")
+    write_driver(tmp_path / "whole", tmp_path / "driver.zip")  # as model.save takes it
     assert models.training_record(tmp_path / "driver.zip").driver_only
     stock = DDPG.load(tmp_path / "driver.zip", env, device="cpu")
     expected, _ = model.predict(OBSERVATIONS, deterministic=True)
@@ -391,6 +391,14 @@ def test_a_driver_alone_drives_the_same_and_learns_nothing(env, tmp_path, record
         np.testing.assert_array_equal(driver.predict(OBSERVATIONS, deterministic=True)[0], expected)
     with pytest.raises(InvalidAction, match="nan"):
         stock.learn(20)
+
+
+def test_a_subclass_is_recorded_as_the_algorithm_that_the_zoo_knows(env, tmp_path):
+    class OwnPPO(PPO):
+        """With something of its own."""
+
+    trained(OwnPPO, "MlpPolicy", env, n_steps=4, batch_size=4).save(tmp_path / "own.zip")
+    assert models.training_record(tmp_path / "own.zip").algo == "ppo"
 
 
 def test_a_driver_may_take_the_place_of_its_model(env, file):

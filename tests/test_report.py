@@ -257,9 +257,7 @@ def test_an_interval_lies_around_its_figure_and_is_the_same_each_time():
 def test_a_study_in_which_nobody_laps_is_reported_too(tmp_path):
     rows = [row(seed, laps=(), kept=1, timesteps=n) for seed in (0, 1) for n in (100, 200)]
     report = write_report(written(tmp_path / "study", rows), tmp_path / "out")
-    assert lines_of(report, "| base |") == [
-        "| base | not measured yet | - | - | - | - | - | - |"
-    ]
+    assert lines_of(report, "| base |") == ["| base | not measured yet | - | - | - | - | - | - |"]
 
 
 def test_one_picture_shows_all_variants(tmp_path):

@@ -20,6 +20,7 @@ from sb3_torcs.noise import (
     bind,
     checked_dt,
     noises_of,
+    parameters_of,
 )
 
 __all__ = [
@@ -62,8 +63,10 @@ class NoiseCallback(BaseCallback):
     ) -> None:
         super().__init__(verbose)
         self.kind = checked_choice("kind", kind, KINDS)
-        self.parameters = tuple(OUParameters.of(value) for value in (steering, throttle, brake))
+        self.parameters = parameters_of(steering, throttle, brake)
         self.dt = checked_dt(dt)
+        if seed is not None:
+            check_count("seed", seed, least=0)
         self.seed = seed
 
     def _on_training_start(self) -> None:
@@ -186,7 +189,7 @@ class StochasticBrakeCallback(_NoiseUser):
             raise InvalidOption(
                 f"probability={probability!r}: pass a share of the timesteps in [0, 1]"
             )
-        self.brake = StochasticBrake(probability, OUParameters.of((mu, theta, sigma)))
+        self.brake = StochasticBrake(probability, OUParameters.of((mu, theta, sigma), "brake"))
 
     def _apply(self) -> None:
         for noise in self.noises:

@@ -22,7 +22,7 @@ from sb3_torcs.callbacks.tree import require_method
 from sb3_torcs.car import check_count, is_number
 from sb3_torcs.errors import InvalidOption, renamed
 from sb3_torcs.policies import ppo, updates
-from sb3_torcs.policies.mirror import check_angles
+from sb3_torcs.policies.mirror import check_angles, mirror_image
 from sb3_torcs.policies.mirrored_replay import sample_mirrored
 from sb3_torcs.policies.ppo import LeanForward, LeanPPO
 from sb3_torcs.policies.split_head import SplitHeadPolicy
@@ -303,8 +303,8 @@ class ValuesOnlyCallback(BaseCallback):
     """
     Put the policy of PPO or A2C back after each update, so that only its value function learns.
 
-    A shipped agent or a student drives, but comes without a value function, and a new one would
-    spoil it. So let the value function learn first, in a training of its own, as
+    A student, and most shipped agents, drive, but come without a value function, and a new one may
+    spoil them. So let the value function learn first, in a training of its own, as
     :func:`learn_values` does; in a second training, without this callback, both learn.
 
     :param verbose: as in ``BaseCallback``
@@ -390,6 +390,10 @@ class MirrorCallback(WhileLearning):
         require_method(self.training_env, "range_finder_angles")
         for angles in self.training_env.get_attr("range_finder_angles"):
             check_angles(angles, type(self).__name__)
+        try:
+            mirror_image(buffer.observation_space)
+        except InvalidOption as error:
+            raise InvalidOption(f"{type(self).__name__}: {error}") from error
         self._buffer = buffer
 
     def _change(self) -> None:

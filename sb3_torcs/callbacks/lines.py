@@ -91,14 +91,12 @@ class LinePicturesCallback(BaseCallback):
 
     def _on_training_start(self) -> None:
         callbacks = list(callbacks_in(self.locals.get("callback")))
-        drivers = [item for item in callbacks if isinstance(item, DrivingMetricsCallback)]
-        if not drivers or not any(isinstance(item, EvalCallback) for item in callbacks):
+        needed = DrivingMetricsCallback, EvalCallback
+        if not all(any(isinstance(item, kind) for item in callbacks) for kind in needed):
             raise InvalidOption(
                 f"{type(self).__name__} draws what DrivingMetricsCallback drives after "
                 "evaluations; add sb3_torcs.callbacks.DrivingMetricsCallback and an EvalCallback"
             )
-        if self._take not in drivers[0].listeners:
-            drivers[0].listeners.append(self._take)
         self._progress = [item for item in callbacks if isinstance(item, RacingProgressCallback)]
         self._begun, self._first = time.monotonic(), self.model.num_timesteps
         self._due = -math.inf  # [s] since then
@@ -109,8 +107,12 @@ class LinePicturesCallback(BaseCallback):
     def _on_step(self) -> bool:
         return True
 
-    def _take(self, line: DrivenLine) -> None:
-        """Keep one line."""
+    def take_line(self, line: DrivenLine) -> None:
+        """
+        Keep one line.
+
+        :param line: that was driven after an evaluation
+        """
         if not self.writable:
             return
         now = time.monotonic() - self._begun

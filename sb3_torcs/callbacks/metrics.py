@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -149,6 +148,18 @@ class _Watched:
     seen: int
 
 
+@runtime_checkable
+class LineListener(Protocol):
+    """A callback that is given the line of each lap that is driven after an evaluation."""
+
+    def take_line(self, line: DrivenLine) -> None:
+        """
+        Take a line.
+
+        :param line: that has just been driven
+        """
+
+
 class DrivingMetricsCallback(BaseCallback):
     """
     Log how the car drives, for any algorithm, number of environments and kind of ``VecEnv``.
@@ -173,12 +184,12 @@ class DrivingMetricsCallback(BaseCallback):
     that ended.
 
     Means are taken since the logger's previous row. After each evaluation of an
-    ``EvalCallback`` of the training, one more lap is driven in its environment if TensorBoard is
-    used, which then shows its line, or if there are :attr:`listeners`, which are given the line.
+    ``EvalCallback`` of the training, one more lap is driven in its environment if TensorBoard
+    shows its line, or if another callback of the training has ``take_line``, which then gets it.
 
     :param q_every: timesteps of the vector of environments between two estimates of Q
     :param q_size: transitions to ask the critic about
-    :param line: whether to draw the line after evaluations
+    :param line: whether TensorBoard shows the line after evaluations
     :param line_timesteps: timesteps after which a lap is given up
     :param verbose: as in ``BaseCallback``
     """
@@ -206,7 +217,7 @@ class DrivingMetricsCallback(BaseCallback):
         self.line_timesteps = line_timesteps
         self.best_lap_time: float | None = None  # [s] of the training
         self.best_evaluation_lap_time: float | None = None  # [s] of the lines driven
-        self.listeners: list[Callable[[DrivenLine], None]] = []
+        self.listeners: list[LineListener] = []  # of the training
 
     def _on_training_start(self) -> None:
         space = self.training_env.action_space
@@ -228,9 +239,11 @@ class DrivingMetricsCallback(BaseCallback):
         self._limits = low + margin, high - margin
         if self.model.num_timesteps == 0:  # not one that goes on
             self.best_lap_time = self.best_evaluation_lap_time = None
+        others = list(callbacks_in(self.locals.get("callback")))
+        self.listeners = [callback for callback in others if isinstance(callback, LineListener)]
         self._evaluations = [
             _Watched(callback, callback.n_calls)
-            for callback in callbacks_in(self.locals.get("callback"))
+            for callback in others
             if isinstance(callback, EvalCallback)
         ]
 
@@ -309,8 +322,8 @@ class DrivingMetricsCallback(BaseCallback):
 
     def _record_line(self, env: VecEnv) -> None:
         formats = self.logger.output_formats
-        shown = any(isinstance(f, TensorBoardOutputFormat) for f in formats)
-        if not self.line or not (shown or self.listeners):
+        shown = self.line and any(isinstance(f, TensorBoardOutputFormat) for f in formats)
+        if not (shown or self.listeners):
             return
         chance = copy.deepcopy(env.get_attr("np_random"))
         line = drive_lap(self.model, env, self.line_timesteps)
@@ -321,7 +334,7 @@ class DrivingMetricsCallback(BaseCallback):
             self.best_evaluation_lap_time = min(line.lap_time, best)
             self.logger.record("driving/evaluation_lap_time", line.lap_time)
         for listener in self.listeners:
-            listener(line)
+            listener.take_line(line)
         if shown:
             picture = line_image(line)
             self.logger.record("driving/line", Image(picture, "HWC"), exclude=TEXT_FORMATS)

@@ -97,9 +97,6 @@ class RacingProgressCallback(BaseCallback):
             for callback in callbacks_in(self.locals.get("callback"))
             if isinstance(callback, DrivingMetricsCallback)
         ]
-        for metrics in self._metrics:
-            if self._take_line not in metrics.listeners:
-                metrics.listeners.append(self._take_line)
         if stream.isatty() and os.environ.get("TERM") != "dumb":
             self._display = Display(stream, self._total)
 
@@ -166,8 +163,12 @@ class RacingProgressCallback(BaseCallback):
             self.say(f"{self._moment()}: the first whole lap, {seconds:.2f} s{where}", FIRST_LAP)
         self.best_lap_time = seconds
 
-    def _take_line(self, line: DrivenLine) -> None:
-        """Tell what was driven after an evaluation."""
+    def take_line(self, line: DrivenLine) -> None:
+        """
+        Tell what was driven after an evaluation.
+
+        :param line: that was driven
+        """
         lap_time, known = line.lap_time, [seconds for seconds in self._lap_times if seconds]
         self._distances.append(line.distance)
         self._lap_times.append(lap_time)

@@ -279,7 +279,7 @@ def _log_std(given: Any, actuators: int) -> float | list[float]:
         numbers = np.asarray(given, dtype=float)
     except (TypeError, ValueError):
         numbers = np.array(np.nan)
-    if numbers.size not in (1, actuators):
+    if numbers.size not in (1, actuators) or numbers.ndim > 1:
         raise InvalidOption(
             f"log_std_init has {numbers.size} numbers; expected one, or {actuators}, one per "
             "actuator"

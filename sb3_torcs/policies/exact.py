@@ -7,7 +7,7 @@ a lap. Actions in double precision, rounded to single, are the same on all of th
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any, cast
 
 import numpy as np
@@ -29,14 +29,23 @@ def check_sizes(net_arch: Any) -> None:
     Check the numbers of hidden units of a policy.
 
     :param net_arch: as of SB3's policies: a list of sizes, or a mapping to such lists
-    :raises InvalidOption: if one is no whole number of at least 1
+    :raises InvalidOption: if it is none, or a size is no whole number of at least 1
     """
-    for size in _sizes(net_arch):
-        if not is_count(size):
+    # SB3 still takes its older form, a list of one mapping.
+    nested = isinstance(net_arch, list) and len(net_arch) == 1 and isinstance(net_arch[0], Mapping)
+    said = net_arch[0] if nested else net_arch
+    for sizes in said.values() if isinstance(said, Mapping) else [said]:
+        if not isinstance(sizes, list | tuple):
             raise InvalidOption(
-                f"net_arch={net_arch!r}: {size!r} is no layer size; pass whole numbers >= 1, e.g. "
+                f"net_arch={net_arch!r}: {sizes!r} is no list of layer sizes; pass e.g. "
                 "net_arch=[300, 600]"
             )
+        for size in sizes:
+            if not is_count(size):
+                raise InvalidOption(
+                    f"net_arch={net_arch!r}: {size!r} is no layer size; pass whole numbers >= 1, "
+                    "e.g. net_arch=[300, 600]"
+                )
 
 
 def checked_decay(ema_decay: Any) -> float | None:
@@ -52,15 +61,6 @@ def checked_decay(ema_decay: Any) -> float | None:
             f"ema_decay={ema_decay!r}: pass a share in [0, 1), e.g. ema_decay=0.9995, or None"
         )
     return None if ema_decay is None else float(ema_decay)
-
-
-def _sizes(net_arch: Any) -> Iterator[Any]:
-    """Walk over the sizes of layers."""
-    if isinstance(net_arch, Mapping | list | tuple):
-        for part in net_arch.values() if isinstance(net_arch, Mapping) else net_arch:
-            yield from _sizes(part)
-    else:
-        yield net_arch
 
 
 class ExactDriver(nn.Module):

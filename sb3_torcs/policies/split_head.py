@@ -102,8 +102,8 @@ class SplitHeadPolicy(ExactPolicy, TD3Policy):
         net_arch = kwargs.pop("net_arch", None)
         net_arch = list(NET_ARCH) if net_arch is None else net_arch
         heads = heads_for(action_space) if heads is None else heads
+        _check_heads(heads, action_space)
         bias = _bias(head_bias, len(heads))
-        _check_heads(heads, bias, action_space)
         _check_net_arch(net_arch)
         layer_norm = checked_flag("layer_norm", layer_norm)
         fast_matmul = checked_flag("fast_matmul", fast_matmul)
@@ -228,11 +228,10 @@ def heads_for(action_space: spaces.Box) -> tuple[str, ...]:
     return tuple("sigmoid" if low == 0.0 else "tanh" for low in action_space.low.flatten())
 
 
-def _check_heads(heads: Sequence[str], bias: Sequence[float], action_space: spaces.Box) -> None:
+def _check_heads(heads: Any, action_space: spaces.Box) -> None:
     n_actions = get_action_dim(action_space)
     allowed = " or ".join(repr(name) for name in HEAD_GAINS)
-    unknown = [head for head in heads if head not in HEAD_GAINS]
-    if isinstance(heads, str) or unknown:
+    if not isinstance(heads, list | tuple) or any(head not in HEAD_GAINS for head in heads):
         raise InvalidOption(
             f"heads={heads!r}: each head is {allowed}; "
             f"pass policy_kwargs=dict(heads={heads_for(action_space)!r})"
@@ -243,26 +242,27 @@ def _check_heads(heads: Sequence[str], bias: Sequence[float], action_space: spac
             f"{n_actions} actions; pass policy_kwargs=dict(heads=...) with {n_actions} "
             f"entries, each {allowed}"
         )
-    if len(bias) != n_actions:
-        raise InvalidOption(
-            f"head_bias={tuple(bias)!r} has {len(bias)} entries, but the action space has "
-            f"{n_actions} actions; pass one number per action, e.g. {(0.0,) * n_actions}"
-        )
 
 
 def _bias(given: Any, number: int) -> tuple[float, ...]:
     """Check the initial values before the output functions; ``None`` is 0 for each."""
     if given is None:
         return (0.0,) * number
-    values = np.asarray(given)
-    if values.ndim != 1 or not all(is_number(value) for value in values.tolist()):
+    values = given.tolist() if isinstance(given, np.ndarray) else given
+    if not isinstance(values, list | tuple) or not all(map(is_number, values)):
         raise InvalidOption(
             f"head_bias={given!r}: pass one finite number per action, e.g. {(0.0,) * number}"
+        )
+    if len(values) != number:
+        raise InvalidOption(
+            f"head_bias={tuple(values)!r} has {len(values)} entries, but the action space has "
+            f"{number} actions; pass one number per action, e.g. {(0.0,) * number}"
         )
     return tuple(map(float, values))
 
 
 def _check_net_arch(net_arch: Any) -> None:
+    check_sizes(net_arch)
     critic = net_arch.get("qf") if isinstance(net_arch, dict) else net_arch
     actor = net_arch.get("pi") if isinstance(net_arch, dict) else net_arch
     others = isinstance(net_arch, dict) and net_arch.keys() - {"pi", "qf"}
@@ -272,7 +272,6 @@ def _check_net_arch(net_arch: Any) -> None:
             "second) and the actor at least one; pass net_arch=[300, 600], or "
             "net_arch=dict(pi=[300, 600], qf=[300, 600])"
         )
-    check_sizes(net_arch)
 
 
 def _positive(name: str, value: float) -> float:

@@ -9,7 +9,15 @@ from typing import Any
 from sb3_torcs.agents.saved.file import referenced_class
 from sb3_torcs.errors import InvalidOption, ModelMismatch, PackageMissing, near_miss
 
-__all__ = ["SBX", "algorithm_class", "algorithm_of", "check_same", "is_sbx", "told_algorithm"]
+__all__ = [
+    "SBX",
+    "algorithm_class",
+    "algorithm_of",
+    "check_same",
+    "is_sbx",
+    "told_algorithm",
+    "zoo_name",
+]
 
 SBX = "sbx_"
 """Begins the names of SBX's algorithms, which are SB3's in JAX: ``"sbx_tqc"``."""
@@ -47,6 +55,21 @@ def algorithm_class(name: str) -> Any:
         advice = f"it has: {', '.join(sorted(classes))}"
         raise InvalidOption(f"{owner} has no algorithm '{name}'{near_miss(name, classes, advice)}")
     return classes[name]
+
+
+def zoo_name(own: type) -> str | None:
+    """
+    Name an algorithm, or the one of which it is a subclass.
+
+    :param own: class of the algorithm
+    :return: the zoo's name; ``None`` if the zoo does not have it
+    """
+    from rl_zoo3.utils import ALGOS
+
+    if own.__module__.startswith("sbx."):
+        return own.__name__.lower()
+    names = {algorithm: name for name, algorithm in ALGOS.items()}
+    return next((names[parent] for parent in own.__mro__ if parent in names), None)
 
 
 def _sbx_algorithms(name: str) -> dict[str, Any]:

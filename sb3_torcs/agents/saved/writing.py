@@ -24,6 +24,7 @@ from stable_baselines3.common.save_util import data_to_json
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize, unwrap_vec_wrapper
 
 from sb3_torcs import __version__
+from sb3_torcs.agents.saved.algorithm import zoo_name
 from sb3_torcs.agents.saved.file import IDLE, VALUES, saved_data, saved_weights
 from sb3_torcs.agents.saved.policy import (
     plain,
@@ -144,7 +145,7 @@ def write_driver(model: str | Path, driver: str | Path, *, value_function: bool 
             f"model is a {type(model).__name__}; write_driver takes the path of a saved one: "
             "model.save('model.zip'), then write_driver('model.zip', 'driver.zip')"
         )
-    model, driver = Path(os.path.expanduser(model)), Path(os.path.expanduser(driver))
+    model, driver = _saved_as(model), Path(os.path.expanduser(driver))
     data, weights = saved_data(model), saved_weights(model)
     data[RECORD] = {**_record_in(model, data), "driver_only": True}
     if not value_function:
@@ -222,13 +223,19 @@ def _record_in(model: Path, data: Mapping[str, Any]) -> Recipe:
     }
 
 
+def _saved_as(model: str | Path) -> Path:
+    """Return the file that ``model.save`` has written: it adds the ending."""
+    path = Path(os.path.expanduser(model))
+    zipped = path.with_name(f"{path.name}.zip")
+    return zipped if not path.exists() and zipped.is_file() else path
+
+
 def _recipe_of_environment(model: BaseAlgorithm) -> Recipe:
     """Compose the recipe of a script's training from the arguments of ``gym.make``."""
     env = model.get_env()
     assert env is not None
     (spec,) = env.get_attr("spec", 0)
-    name = type(model).__name__
-    algo = "ppo_lstm" if name == "RecurrentPPO" else name.lower()
+    algo = zoo_name(type(model))
     seen = _frames_of(env)
     if spec is None:
         return recipe(algo, None, seen)
