@@ -127,6 +127,12 @@ def test_a_wrong_argument_of_the_noise_is_told(kwargs, message):
         NoiseCallback(**kwargs)
 
 
+@pytest.mark.parametrize("mu", [-0.1, 5, "x"])
+def test_a_brake_that_cannot_be_is_refused(mu):
+    with pytest.raises(InvalidOption, match="expected how far to brake, from 0 to 1"):
+        StochasticBrakeCallback(mu=mu)
+
+
 def test_nothing_is_added_during_the_warm_up():
     """Before learning_starts SB3 samples; the set point must not pull those actions."""
     model = make_model(learning_starts=8)
@@ -189,8 +195,10 @@ def test_noise_works_with_sac_too():
 def test_an_algorithm_without_action_noise_is_refused():
     """PPO explores by its own distribution."""
     model = PPO("MlpPolicy", DummyVecEnv([ToyRace]), n_steps=8, batch_size=8, device="cpu")
-    with pytest.raises(InvalidOption, match="PPO takes no action noise"):
-        model.learn(8, callback=NoiseCallback())
+    for callback in (NoiseCallback, NoiseDecayCallback, StochasticBrakeCallback):
+        told = f"PPO takes no action noise; use {callback.__name__} with DDPG, TD3 or SAC"
+        with pytest.raises(InvalidOption, match=told):
+            model.learn(8, callback=callback())
 
 
 def test_an_unknown_kind_shows_the_near_one():

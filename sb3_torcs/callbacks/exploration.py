@@ -70,11 +70,7 @@ class NoiseCallback(BaseCallback):
         self.seed = seed
 
     def _on_training_start(self) -> None:
-        if not isinstance(self.model, OffPolicyAlgorithm):
-            raise InvalidOption(
-                f"{type(self.model).__name__} takes no action noise; use NoiseCallback with DDPG, "
-                "TD3 or SAC"
-            )
+        _require_noise(self)
         saved = noises_of(self.model)
         if len(saved) != self.model.n_envs or type(saved[0]) is not KINDS[self.kind]:
             noise = self._continued(saved[0]) if saved else self._new()
@@ -103,12 +99,22 @@ class NoiseCallback(BaseCallback):
         return True
 
 
+def _require_noise(callback: BaseCallback) -> None:
+    """Make sure that an algorithm adds a noise to its actions."""
+    if not isinstance(callback.model, OffPolicyAlgorithm):
+        raise InvalidOption(
+            f"{type(callback.model).__name__} takes no action noise; use "
+            f"{type(callback).__name__} with DDPG, TD3 or SAC"
+        )
+
+
 class _NoiseUser(BaseCallback):
     """Base of callbacks that change the noise, which they find before the first timestep."""
 
     noises: Sequence[ActuatorNoise] = ()
 
     def _on_training_start(self) -> None:
+        _require_noise(self)
         self.noises = ()
 
     def _on_rollout_start(self) -> None:
@@ -189,6 +195,8 @@ class StochasticBrakeCallback(_NoiseUser):
             raise InvalidOption(
                 f"probability={probability!r}: pass a share of the timesteps in [0, 1]"
             )
+        if not is_number(mu) or not 0.0 <= mu <= 1.0:
+            raise InvalidOption(f"mu is {mu!r}; expected how far to brake, from 0 to 1")
         self.brake = StochasticBrake(probability, OUParameters.of((mu, theta, sigma), "brake"))
 
     def _apply(self) -> None:
