@@ -130,8 +130,8 @@ def _policy(name: str) -> ActorCriticPolicy:
 
 def refuse_frames(name: str) -> None:
     """Refuse an agent that sees several timesteps at once, which a school does not show."""
-    frames = frames_of(driver_record(name).hyperparameters)
-    if frames is not None:
+    frames = frames_of(driver_record(name).hyperparameters) or 1
+    if frames > 1:
         raise SystemExit(f"{name} sees {frames} timesteps at once; give another, e.g. ppo-roads")
 
 
@@ -168,6 +168,8 @@ def teach(model: PPO, school: School, args: argparse.Namespace) -> None:
 def main() -> None:
     args = parser.parse_args()
     check_count("--rounds", args.rounds)
+    if args.student:
+        refuse_frames(args.student)
     school = School(args)
     policy_kwargs = {
         "net_arch": [args.width, args.width],
@@ -175,8 +177,6 @@ def main() -> None:
         "log_std_init": [-2.0, -0.7],  # steering, pedal, for a training that goes on from it
         "actor_sensors": args.actor_sensors,
     }
-    if args.student:
-        refuse_frames(args.student)
     file = find_model(args.student) if args.student else None
     known = PPO.load(file, device="cpu") if file else None
     model = PPO(
@@ -195,6 +195,8 @@ def main() -> None:
     school.cars.close()
     model.save(args.folder / "model")
     drive = f"sb3-torcs evaluate {args.folder}/model.zip --track {school.tracks[0]}"
+    cars = env_kwargs["car"]
+    drive += f" --car {cars[0]}" if isinstance(cars, list) else ""
     print(f"saved {args.folder}/model.zip; drive it: {drive}")
 
 

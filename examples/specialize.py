@@ -125,8 +125,8 @@ def go_on(args: argparse.Namespace, tracks: list[str], settings: Settings) -> Pa
         raise SystemExit(
             f'{args.driver} does not drive with action="pedal"; give one, e.g. ppo-roads'
         )
-    frames = frames_of(driver_record(args.driver).hyperparameters)
-    if frames is not None:
+    frames = frames_of(driver_record(args.driver).hyperparameters) or 1
+    if frames > 1:
         raise SystemExit(
             f"{args.driver} sees {frames} timesteps at once; give another, e.g. ppo-roads"
         )

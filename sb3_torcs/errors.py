@@ -221,6 +221,16 @@ class ZooConfigError(Sb3TorcsError, ValueError):
     """A hyperparameter file has a mistake, such as a key that nothing reads."""
 
 
+ELSEWHERE = {
+    "agents": "races of several agents are sb3_torcs.vec_env.TorcsVecEnv and "
+    "sb3_torcs.parallel_env",
+    "frame_skip": "it is called 'action_repeat' here",
+    "num_envs": "gym.make_vec makes several environments",
+    "threads": "gym.make_vec('Torcs-v0') and sb3_torcs.vec_env.TorcsVecEnv drive on threads",
+}
+"""Arguments that people try where they are not, and what has them."""
+
+
 @contextlib.contextmanager
 def ends_in_a_line() -> Iterator[None]:
     """
@@ -291,6 +301,8 @@ def unknown_argument(owner: str, name: str, known: Iterable[str]) -> TypeError:
     :param name: of the argument
     :param known: the names that it has
     """
+    if name in ELSEWHERE:
+        return TypeError(f"{owner} has no argument {name!r}; {ELSEWHERE[name]}")
     return TypeError(f"{owner} has no argument {name!r}{near_miss(name, known)}")
 
 

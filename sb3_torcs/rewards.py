@@ -282,6 +282,16 @@ class Reward:
         for name, term, weight in self.terms:
             # The state of a lost car does not advance: without time there is no rate.
             terms[name] = weight * seconds * term(before, after, controls) if seconds else 0.0
+        return self.ended(terms, end)
+
+    def ended(self, terms: dict[str, float], end: str | None) -> dict[str, float]:
+        """
+        Add what an end costs.
+
+        :param terms: the weighted terms of a timestep, changed
+        :param end: why the episode ended, or ``None``
+        :return: the same, with ``crash`` last
+        """
         terms["crash"] = self._crash if end in CRASHES else 0.0
         return terms
 

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import copy
 import csv
 import json
+import pickle
 import re
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from sb3_torcs.agents import models
 from sb3_torcs.agents.saved import record as model_record
+from sb3_torcs.agents.saved.policy import build_policy
 from sb3_torcs.cli import main
 from sb3_torcs.evaluation.ladder import REFERENCE_FILE
 
@@ -79,6 +83,17 @@ def test_stock_sb3_loads_each():
         told.append(f"{file} {'(3,)' if algo == 'DDPG' else '(2,)'}")
     run = subprocess.run(command, check=True, capture_output=True, text=True)
     assert run.stdout.splitlines() == told, run.stderr
+
+
+@pytest.mark.parametrize("name", AGENTS)
+def test_its_policy_can_be_pickled_and_copied(name):
+    """For drivers in other processes."""
+    record = models.training_record(models.AGENTS / name / "best_model.zip")
+    policy = build_policy(record.policy, record.spaces)
+    seen = record.spaces[0].sample()
+    for copied in (pickle.loads(pickle.dumps(policy)), copy.deepcopy(policy)):
+        action, _ = copied.predict(seen, deterministic=True)
+        np.testing.assert_array_equal(action, policy.predict(seen, deterministic=True)[0])
 
 
 @pytest.mark.parametrize("name", AGENTS)

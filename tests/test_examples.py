@@ -173,10 +173,8 @@ def test_an_agent_that_sees_several_timesteps_is_refused(words, monkeypatch, tmp
         run(monkeypatch, *words, "--folder", str(tmp_path))
 
 
-@pytest.mark.parametrize("words", [
-    ["--teach", "ppo-league", "corkscrew", "--teach", "ppo-roads", "forza"],
-])  # fmt: skip
-def test_teachers_of_different_cars_are_refused(words, monkeypatch, tmp_path, game):
+def test_teachers_of_different_cars_are_refused(monkeypatch, tmp_path, game):
+    words = ["--teach", "ppo-league", "corkscrew", "--teach", "ppo-roads", "forza"]
     with pytest.raises(SystemExit, match=r"ppo-roads drives with .*'car1-trb1'.*'car1-ow1'"):
         run(monkeypatch, "distill.py", *words, "--folder", str(tmp_path))
 

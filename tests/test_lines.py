@@ -105,7 +105,9 @@ def test_who_showed_an_earlier_training_is_not_told_of_the_next(oval):
     for stream, lines in ((old, 1), (io.StringIO(), 2)):
         drives = [driven(oval, 296.0)] * lines
         progress = RacingProgressCallback(stream=stream)
-        model.learn(32, [progress, metrics, Evaluations(env, metrics, drives)])
+        second = DrivingMetricsCallback()  # which tells nobody once more
+        model.learn(32, [progress, metrics, second, Evaluations(env, metrics, drives)])
+        assert second.listeners == []
         assert stream.getvalue().count("296 m\n") == lines
     assert old.getvalue().count("296 m\n") == 1
 

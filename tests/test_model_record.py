@@ -6,6 +6,7 @@ import io
 import json
 import pickle
 import re
+import subprocess
 import sys
 import zipfile
 
@@ -39,6 +40,7 @@ from sb3_torcs.errors import (
 from sb3_torcs.evaluation.protocol import evaluate
 from sb3_torcs.policies import BoundedPolicy, SplitHeadPolicy
 from sb3_torcs.tracks.catalogue import load_track
+from sb3_torcs.training.resuming import check_resumable
 
 OBSERVATIONS = np.linspace(-0.5, 0.5, 4 * 29, dtype=np.float32).reshape(4, 29)
 SPLIT = {"net_arch": [8, 8], "ema_decay": 0.9, "symmetric": True}
@@ -398,7 +400,28 @@ def test_a_subclass_is_recorded_as_the_algorithm_that_the_zoo_knows(env, tmp_pat
         """With something of its own."""
 
     trained(OwnPPO, "MlpPolicy", env, n_steps=4, batch_size=4).save(tmp_path / "own.zip")
-    assert models.training_record(tmp_path / "own.zip").algo == "ppo"
+    record = models.training_record(tmp_path / "own.zip")
+    assert record.algo == "ppo"
+    assert record.subclass.endswith("OwnPPO")
+    with pytest.raises(ModelMismatch, match=r"has learned by .*OwnPPO, and would go on by plain"):
+        check_resumable(tmp_path / "own.zip", env, "ppo", {})
+
+
+def test_recording_does_not_import_the_zoo_which_patches_gymnasium():
+    code = (
+        "import sys; from stable_baselines3 import PPO;"
+        "from sb3_torcs.callbacks import RecordCallback;"
+        "PPO('MlpPolicy', 'Pendulum-v1', n_steps=4, batch_size=4).learn(4, RecordCallback());"
+        "print('rl_zoo3' in sys.modules)"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout == "False\n"
+
+
+def test_who_writes_a_driver_of_nothing_is_told(tmp_path):
+    for nothing in ("", ".", "/"):
+        with pytest.raises(ModelMismatch, match="is not a model that Stable-Baselines3 saved"):
+            write_driver(nothing, tmp_path / "driver.zip")
 
 
 def test_a_driver_may_take_the_place_of_its_model(env, file):

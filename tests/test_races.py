@@ -143,7 +143,7 @@ class TestGrid:
     @pytest.mark.parametrize(
         ("options", "message"),
         [
-            ({"field_size": 5}, "field is 5; expected a whole number from 1 to 4, as many drivers"),
+            ({"field_size": 5}, "5 drivers in each race, by --field .*from 1 to 4, as many"),
             ({"grid": "front"}, "grid is 'front'; expected 'last', 'reverse' or 'random'"),
         ],
     )
@@ -404,12 +404,13 @@ def test_the_picture_ends_with_the_race_and_a_line_where_its_car_stops(tmp_path,
 
     monkeypatch.setattr("matplotlib.figure.Figure.savefig", savefig)
     standings = [standing("a", 1), standing("b", 2, out=True)]
-    distances = np.array([[0.0, -10.0], [60.0, 40.0], [90.0, 40.5], [105.0, 40.5]])
+    distances = np.array([[0.0, -10.0], [60.0, 42.0], [90.0, 40.5], [105.0, 40.0]])
     draw_race(
         Race(0, standings, {}, ["a", "b"], distances, np.ones((4, 2)), 100.0), tmp_path / "r.png"
     )
     _, gaps = drawn[0].axes
-    assert [line.get_ydata().tolist() for line in gaps.lines] == [[0.0, 0.0, 0.0], [10.0, 20.0]]
+    behind = [[0.0, 0.0, 0.0], [10.0, 18.0, 49.5]]
+    assert [line.get_ydata().tolist() for line in gaps.lines] == behind
     assert [line.get_marker() for line in gaps.lines] == ["None", "x"]
     assert gaps.yaxis_inverted()
 

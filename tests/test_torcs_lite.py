@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import gymnasium as gym
 import numpy as np
 import pytest
 
 import sb3_torcs
 from sb3_torcs.errors import InvalidOption, TrackFileError, TrackNotFound, UnknownRewardTerm
+from sb3_torcs.tracks.catalogue import load_track
+from sb3_torcs.tracks.compact import write_track_file
 
 
 def track_of(env):
@@ -64,6 +68,24 @@ def test_nobody_remembers_places_of_a_random_track():
     while not ended:
         ended = env.step([1.0, 1.0, 0.0])[2]
     assert env.unwrapped.mishaps() == {}
+
+
+def test_places_of_files_with_one_name_are_told_apart(tmp_path):
+    tracks = []
+    for number, name in enumerate(("aalborg", "corkscrew")):
+        tracks.append(str(tmp_path / f"{number}.csv"))
+        write_track_file(replace(load_track(name), name="random"), tracks[-1])
+    env = gym.make("TorcsLite-v0", track=tracks, start="random")
+    for seed in range(8):
+        env.reset(seed=seed)
+        while not env.step([1.0, 1.0, 0.0])[2]:
+            pass
+    assert set(env.unwrapped.mishaps()) == set(tracks)
+
+
+def test_an_argument_of_something_else_is_told():
+    with pytest.raises(TypeError, match="no argument 'frame_skip'; it is called 'action_repeat'"):
+        gym.make("TorcsLite-v0", frame_skip=4)
 
 
 def test_a_start_can_be_chosen_to_the_metre():

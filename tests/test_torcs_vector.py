@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import gc
 import multiprocessing
 import pickle
@@ -152,8 +153,8 @@ def test_what_was_returned_stays_as_it_was(make):
     copies = [observations.copy() for observations in kept]
     envs.step(np.stack([GAS, GAS]))
     envs.reset(seed=1)
-    for one, copy in zip(kept, copies, strict=True):
-        np.testing.assert_array_equal(one, copy)
+    for one, copied in zip(kept, copies, strict=True):
+        np.testing.assert_array_equal(one, copied)
 
 
 def test_pictures_are_taken_of_each_race(make):
@@ -259,6 +260,12 @@ def test_before_a_reset_and_after_close_there_is_no_step(make):
     with pytest.raises(EnvClosed, match="step after close"):
         envs.step(np.stack([GAS, GAS]))
     assert all(env._closed for env in envs.envs)
+
+
+def test_all_of_them_cannot_be_copied(make):
+    for copied in (copy.copy, copy.deepcopy, pickle.dumps):
+        with pytest.raises(InvalidOption, match=r"TorcsVectorEnv, whose threads .* make another"):
+            copied(make(num_envs=1))
 
 
 def test_without_autoreset_an_ended_episode_has_to_be_reset(make):

@@ -354,6 +354,10 @@ class TestPlot:
             plot_track("aalborg", tmp_path / "a.png")
         assert list(tmp_path.iterdir()) == []
 
+    def test_another_kind_of_picture_is_refused(self, oval, tmp_path):
+        with pytest.raises(OutputNotWritable, match=r"should end in \.png or \.svg or \.pdf"):
+            plot_track(oval, tmp_path / "a.jpg")
+
     def test_the_line_and_its_speed_may_be_left_out(self, oval, tmp_path):
         plot_track(oval, tmp_path / "a.png")
         plot_track(oval, tmp_path / "b.png", np.zeros((2, 2)))

@@ -340,6 +340,26 @@ def test_a_term_that_somebody_adds_is_asked(make, monkeypatch):
     assert_same_drives(ours, theirs, 60)
 
 
+def test_a_term_with_a_state_is_asked_once_for_each_timestep(make, monkeypatch):
+    """At the end of an episode, too, which the environment finishes by itself."""
+    calls = []
+
+    def counts(before, after, controls):
+        calls.append(after.time)
+        return len(calls)
+
+    monkeypatch.setitem(rewards.TERMS, "counts", counts)
+    options = {"reward": {"counts": 1.0, "crash": -1.0}, "max_episode_steps": 20}
+    asked = []
+    for envs in (make(2, env_id=LITE, **options), plain(2, LITE, **options)):
+        calls.clear()
+        envs.seed(0)
+        envs.reset()
+        asked.append([envs.step([GAS, GAS])[1].tolist() for _ in range(50)])
+        assert len(calls) == 100
+    assert asked[0] == asked[1]
+
+
 def test_after_a_term_that_fails_each_timestep_is_paid_once(make, monkeypatch):
     """The cars have driven on, and the next timestep begins where they are."""
     fails = [False]

@@ -70,13 +70,13 @@ class NoiseCallback(BaseCallback):
         self.seed = seed
 
     def _on_training_start(self) -> None:
-        _require_noise(self)
-        saved = noises_of(self.model)
+        model = _noisy(self)
+        saved = noises_of(model)
         if len(saved) != self.model.n_envs or type(saved[0]) is not KINDS[self.kind]:
             noise = self._continued(saved[0]) if saved else self._new()
             n_envs = self.model.n_envs
             self.model.action_noise = noise if n_envs == 1 else VectorizedActionNoise(noise, n_envs)
-        for noise in bind(self.model):
+        for noise in bind(model):
             noise.parameters = self.parameters
             noise.stochastic_brake = None  # of a training that an error has ended
             if isinstance(noise, OUNoise):
@@ -99,13 +99,14 @@ class NoiseCallback(BaseCallback):
         return True
 
 
-def _require_noise(callback: BaseCallback) -> None:
-    """Make sure that an algorithm adds a noise to its actions."""
+def _noisy(callback: BaseCallback) -> OffPolicyAlgorithm:
+    """Return the algorithm of a callback, which has to add a noise to its actions."""
     if not isinstance(callback.model, OffPolicyAlgorithm):
         raise InvalidOption(
             f"{type(callback.model).__name__} takes no action noise; use "
             f"{type(callback).__name__} with DDPG, TD3 or SAC"
         )
+    return callback.model
 
 
 class _NoiseUser(BaseCallback):
@@ -114,7 +115,7 @@ class _NoiseUser(BaseCallback):
     noises: Sequence[ActuatorNoise] = ()
 
     def _on_training_start(self) -> None:
-        _require_noise(self)
+        _noisy(self)
         self.noises = ()
 
     def _on_rollout_start(self) -> None:

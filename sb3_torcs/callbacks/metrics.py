@@ -240,7 +240,11 @@ class DrivingMetricsCallback(BaseCallback):
         if self.model.num_timesteps == 0:  # not one that goes on
             self.best_lap_time = self.best_evaluation_lap_time = None
         others = list(callbacks_in(self.locals.get("callback")))
-        self.listeners = [callback for callback in others if isinstance(callback, LineListener)]
+        first = next(callback for callback in others if isinstance(callback, type(self)))
+        listening: list[LineListener] = [
+            callback for callback in others if isinstance(callback, LineListener)
+        ]
+        self.listeners = listening if first is self else []  # each line once
         self._evaluations = [
             _Watched(callback, callback.n_calls)
             for callback in others

@@ -78,7 +78,9 @@ def run(args: argparse.Namespace) -> int:
 
     record = told_record(args.model)
     settings = record.kept(("track", "car", *DRIVEN_WITH))
-    check_told(args.model, settings, f"`sb3-torcs race {args.model} inferno` races it elsewhere")
+    check_told(
+        args.model, settings, f"`sb3-torcs race {args.model} inferno` races it in the engine"
+    )
     given = {"track": args.track, "car": args.car, "host": args.host, "port": args.port}
     settings |= {name: value for name, value in given.items() if value is not None}
     sees_road = NEEDS_ROAD.intersection(settings.get("sensors", ()))

@@ -151,10 +151,10 @@ def _shows(game: Game, names: Sequence[str], args: argparse.Namespace) -> list[S
         for name, robot in zip(names, robots, strict=True)
     ]
     for name, record in zip(names, records, strict=True):
-        elsewhere = (
-            f"`sb3-torcs race {name} inferno --video FILE.mp4` races and records it elsewhere"
+        instead = (
+            f"`sb3-torcs race {name} inferno --video FILE.mp4` races and records it in the engine"
         )
-        check_told(name, record.kept(DRIVEN_WITH), elsewhere)
+        check_told(name, record.kept(DRIVEN_WITH), instead)
     trained = [r.env_kwargs["track"] for r in records if "track" in r.env_kwargs]
     usual = next(iter(trained), "aalborg")
     track = one_of("track", usual if args.track is None else args.track)

@@ -277,10 +277,11 @@ class Batch:
         env.arrive(before, env.controls, *_clocks(timestep.rules[index]))
         env.delay.waiting = timestep.waiting[index]
         env.driven = partial(timestep.car, index)
+        env.valued = dict(zip(timestep.names[index], timestep.terms[index], strict=False))
         try:
             return act()
         finally:
-            env.driven = None
+            env.driven = env.valued = None
             self._driven[index] = []
 
     def close(self) -> None:
@@ -329,7 +330,7 @@ class Batch:
         """Turn the actions into controls, (n, 5)."""
         low, high = self._bounds
         controls = np.empty((len(self.envs), len(Controls._fields)))
-        if isinstance(asked, np.ndarray) and asked.dtype.char in "fd":
+        if isinstance(asked, np.ndarray) and asked.dtype.char in "fd" and asked.dtype.isnative:
             fits = asked.shape == (len(self.envs), len(low))
             if fits and read_actions(np.ascontiguousarray(asked), low, high, controls):
                 return controls

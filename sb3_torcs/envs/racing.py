@@ -165,6 +165,8 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         """Whether the next step after the end of an episode is worth a warning."""
         self.driven: Callable[[], CarState] | None = None
         """Returns the car after a timestep that a batch of races has driven."""
+        self.valued: dict[str, float] | None = None
+        """The terms of the reward for it, which are asked once, since a term may have a state."""
 
     def __getstate__(self) -> dict[str, Any]:
         # pygame's surfaces cannot be pickled; a copy makes its own.
@@ -405,7 +407,10 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         self.car = after
         if end in CRASHES:
             self._starts.remember(self.track, after.distance_from_start)
-        terms = self.reward(before, after, self._controls, end)
+        if self.valued is None:
+            terms = self.reward(before, after, self._controls, end)
+        else:
+            terms = self.reward.ended(self.valued, end)
         lap_time = after.last_lap_time if after.laps > before.laps else 0.0
         info = racing_info(after, lap_time, terms, end)
         if self.render_mode == "human":

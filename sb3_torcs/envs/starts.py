@@ -12,7 +12,6 @@ import numpy as np
 from sb3_torcs.car import MAX_START_SPEED, Start, StartName, is_number
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.rewards import safe_speed
-from sb3_torcs.torcs.track_names import RANDOM_TRACK
 from sb3_torcs.tracks.track import Track
 
 __all__ = ["RESET_OPTIONS", "Starts", "read_start"]
@@ -51,15 +50,15 @@ class Starts:
         :param track: where it was driven
         :param distance: of its end from the start line [m]
         """
-        if track.name == RANDOM_TRACK:
+        if track.source == "random":
             return
-        self.mishaps.setdefault(track.name, deque(maxlen=REMEMBERED)).append(distance)
+        self.mishaps.setdefault(_key(track), deque(maxlen=REMEMBERED)).append(distance)
 
     def set_mishaps(self, mishaps: Mapping[str, Sequence[float]]) -> None:
         """
         Replace what was remembered.
 
-        :param mishaps: places of bad ends by the name of the track [m from the start line]
+        :param mishaps: places of bad ends by the track's name or file [m from the start line]
         """
         self.mishaps = {track: deque(places, REMEMBERED) for track, places in mishaps.items()}
 
@@ -73,7 +72,7 @@ class Starts:
         """
         if self.start == "grid" or rng.uniform() < RANDOM_GRID_SHARE:
             return None
-        places = self.mishaps.get(track.name)
+        places = self.mishaps.get(_key(track))
         if places and self.hard > 0.0 and rng.uniform() < self.hard:
             ahead = rng.uniform(*HARD_AHEAD)
             where = _on_lap(places[int(rng.integers(len(places)))] - ahead, track.length)
@@ -86,6 +85,11 @@ class Starts:
             rng.uniform(-RANDOM_HEADING_ERROR, RANDOM_HEADING_ERROR),
             rng.uniform(0.0, speed),
         )
+
+
+def _key(track: Track) -> str:
+    """Tell tracks apart: files may have any name."""
+    return track.name if track.source != "file" or track.file is None else str(track.file)
 
 
 def _on_lap(distance: float, length: float) -> float:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from functools import partial
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import numpy.typing as npt
@@ -198,6 +198,12 @@ class TorcsVectorEnv(SyncVectorEnv):
         if type(value) in (int, float, bool):
             return np.zeros(self.num_envs, type(value))
         return np.full(self.num_envs, None, object)
+
+    def __reduce__(self) -> NoReturn:
+        raise InvalidOption(
+            "a TorcsVectorEnv, whose threads drive its races, cannot be copied or pickled; make "
+            "another one with the same arguments"
+        )
 
     def close_extras(self, **kwargs: Any) -> None:
         """

@@ -179,7 +179,7 @@ class BoundedPolicy(ExactPolicy, ActorCriticPolicy):
             )
         if kwargs.get("use_sde"):
             raise InvalidOption("BoundedPolicy has no use_sde; leave it out, or use MlpPolicy")
-        check_sizes(kwargs.get("net_arch") or [])
+        check_sizes([] if kwargs.get("net_arch") is None else kwargs["net_arch"])
         self._first_log_std = _log_std(log_std_init, get_action_dim(action_space))
         self.symmetric = checked_flag("symmetric", symmetric)
         check_symmetric(self.symmetric, observation_space, action_space)
@@ -281,8 +281,8 @@ def _log_std(given: Any, actuators: int) -> float | list[float]:
         numbers = np.array(np.nan)
     if numbers.size not in (1, actuators) or numbers.ndim > 1:
         raise InvalidOption(
-            f"log_std_init has {numbers.size} numbers; expected one, or {actuators}, one per "
-            "actuator"
+            f"log_std_init has shape {numbers.shape}; expected one number, or ({actuators},), one "
+            "per actuator"
         )
     if not (np.abs(numbers) <= LARGEST_LOG_STD).all():
         raise InvalidOption(

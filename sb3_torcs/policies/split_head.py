@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, cast
 
-import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import ContinuousCritic
@@ -34,7 +33,7 @@ from sb3_torcs.policies.networks import (
     LateActionCritic,
     SplitHeadActor,
 )
-from sb3_torcs.policies.optimizers import LeanAdam, with_lr_scale
+from sb3_torcs.policies.optimizers import IdleOptimizer, LeanAdam, with_lr_scale
 
 __all__ = ["SplitHeadPolicy", "export_actor"]
 
@@ -101,7 +100,7 @@ class SplitHeadPolicy(ExactPolicy, TD3Policy):
             )
         net_arch = kwargs.pop("net_arch", None)
         net_arch = list(NET_ARCH) if net_arch is None else net_arch
-        heads = heads_for(action_space) if heads is None else heads
+        heads = heads_for(action_space) if heads is None else _listed(heads)
         _check_heads(heads, action_space)
         bias = _bias(head_bias, len(heads))
         _check_net_arch(net_arch)
@@ -161,7 +160,7 @@ class SplitHeadPolicy(ExactPolicy, TD3Policy):
         optimizer_class = self.optimizer_class
         if scale != 1.0:
             group["lr_scale"] = scale
-            if not issubclass(optimizer_class, LeanAdam):
+            if not issubclass(optimizer_class, (LeanAdam, IdleOptimizer)):
                 optimizer_class = with_lr_scale(optimizer_class)
         rate = lr_schedule(1)
         return optimizer_class([group], lr=rate, **self.optimizer_kwargs)  # type: ignore[call-arg]
@@ -231,7 +230,7 @@ def heads_for(action_space: spaces.Box) -> tuple[str, ...]:
 def _check_heads(heads: Any, action_space: spaces.Box) -> None:
     n_actions = get_action_dim(action_space)
     allowed = " or ".join(repr(name) for name in HEAD_GAINS)
-    if not isinstance(heads, list | tuple) or any(head not in HEAD_GAINS for head in heads):
+    if not isinstance(heads, list | tuple) or any(str(head) not in HEAD_GAINS for head in heads):
         raise InvalidOption(
             f"heads={heads!r}: each head is {allowed}; "
             f"pass policy_kwargs=dict(heads={heads_for(action_space)!r})"
@@ -244,11 +243,18 @@ def _check_heads(heads: Any, action_space: spaces.Box) -> None:
         )
 
 
+def _listed(given: Any) -> Any:
+    """Make a list of an array, a tensor or a range."""
+    if isinstance(given, range):
+        return list(given)
+    return given.tolist() if hasattr(given, "tolist") else given
+
+
 def _bias(given: Any, number: int) -> tuple[float, ...]:
     """Check the initial values before the output functions; ``None`` is 0 for each."""
     if given is None:
         return (0.0,) * number
-    values = given.tolist() if isinstance(given, np.ndarray) else given
+    values = _listed(given)
     if not isinstance(values, list | tuple) or not all(map(is_number, values)):
         raise InvalidOption(
             f"head_bias={given!r}: pass one finite number per action, e.g. {(0.0,) * number}"

@@ -34,9 +34,11 @@ def draw_race(race: Race, path: Path) -> None:
     out = {standing.driver for standing in race.standings if standing.out}
     for car, driver in enumerate(race.drivers):
         distance = race.distances[:, car]
-        last = np.argmax(distance >= distance[-1] - AT_REST) + 1 if driver in out else raced
+        moved = np.flatnonzero(np.abs(distance - distance[-1]) > AT_REST)
+        last = moved[-1] + 2 if driver in out and len(moved) else len(distance)
         kept = slice(min(last, raced))
-        looks = {"marker": "x", "markevery": [-1]} if last < raced else {}
+        stops = driver in out and last <= raced
+        looks = {"marker": "x", "markevery": [-1]} if stops else {}
         x = leader[kept] / 1000.0
         places.step(x, race.places[kept, car], where="post", label=driver, **looks)
         gaps.plot(x, leader[kept] - distance[kept], **looks)

@@ -155,8 +155,8 @@ def run_races(
     size = len(entrants) if field_size is None else field_size
     if not 1 <= size <= len(entrants):
         raise InvalidOption(
-            f"field is {size}; expected a whole number from 1 to {len(entrants)}, as many drivers "
-            "as there are"
+            f"{size} drivers in each race, by --field or field_size; expected a whole number from "
+            f"1 to {len(entrants)}, as many as there are"
         )
     if size > GRID_SLOTS:
         raise InvalidOption(

@@ -106,7 +106,7 @@ class ScrClient:
         except (OSError, OverflowError, TypeError, UnicodeError) as error:  # no name of a host
             self.close()
             raise ServerNotFound(
-                f"{self.address} cannot be reached ({error}); check --host and --port"
+                f"{self.address} cannot be reached ({error}); check host and port"
             ) from error
         here = self._socket.getpeername()[0].startswith("127.")
         self._silence = patience if silence is None else math.inf if here else silence
@@ -124,7 +124,7 @@ class ScrClient:
         if not self._ask(words, IDENTIFIED, FIRST_PAUSE):
             raise ServerNotFound(
                 f"no SCR server answers at {self.address}, tried for {self._patience:g} s; start "
-                "one with `sb3-torcs serve --track aalborg`, or check --host and --port"
+                "one with `sb3-torcs serve --track aalborg`, or check host and port"
             )
         self.over = self.restarted = False
 

@@ -61,8 +61,8 @@ def study_page(
         "</header><main><h2>Learning</h2>",
         f"<p>{legend}</p>",
         paragraph("Thin: every seed; point at one to see which. Bold: the interquartile mean of "
-                  "the seeds, and its 95 % interval; of the share of races that complete, the mean "
-                  "alone.", "note"),
+                  "the seeds, and its 95 % interval. Of the share of races that complete: the mean "
+                  "of all seeds, and its interval, without single seeds.", "note"),
         f'<div class="panels">{"".join(_frame(panel) for panel in panels)}</div>',
     ]  # fmt: skip
     for section in sections:

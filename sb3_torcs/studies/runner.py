@@ -42,7 +42,7 @@ SESSION = ".session"  # where a killed run's temporary files are
 SCRATCH = "st-"  # prefix of folders for temporary files; short, since paths of sockets are limited
 MARK = ".of-a-study"  # a file that names the folder for temporary files
 PATIENCE = 30.0  # [s] until a folder for temporary files counts as one that cannot be removed
-GRACE = 10.0  # [s] that Ray has to end after SIGTERM
+GRACE = 20.0  # [s] that Ray has to end after SIGTERM
 PRIVATE = "sb3_torcs_study"  # a resource that marks a Ray that was started by a study
 FAILED = "failed"  # the phase of a row with an error instead of a race
 

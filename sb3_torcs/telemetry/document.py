@@ -16,7 +16,6 @@ from sb3_torcs.files import whole_file
 
 __all__ = [
     "FOLDER",
-    "OKABE_ITO",
     "Cell",
     "chip",
     "colour_of",
@@ -138,7 +137,7 @@ def dash_of(number: int) -> str:
 
 def chip(number: int) -> str:
     """
-    Return a dot in the colour of something, filled if its line is solid, as HTML.
+    Return a dot, or a stroke if its line is not solid, in the colour of something, as HTML.
 
     :param number: of what it stands for
     """

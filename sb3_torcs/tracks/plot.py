@@ -40,7 +40,7 @@ def plot_track(
     Draw a track seen from above, to scale.
 
     :param track: to draw
-    :param path: of the picture; its suffix says the format, e.g. ``.png``, ``.svg`` or ``.pdf``
+    :param path: of the picture; its suffix says the format: ``.png``, ``.svg`` or ``.pdf``
     :param line: places the car has passed, x and y, (n, 2) [m]
     :param speed: at these places, (n,) [m/s]; without it the line has one colour
     :param title: above the picture; ``None`` is the track's name and measures

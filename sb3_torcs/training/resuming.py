@@ -119,6 +119,11 @@ def check_resumable(
             "a model runs whatever code is pickled in it and in the replay buffer beside it; if "
             "you know who made them, add --trust"
         )
+    if record.subclass is not None:
+        raise ModelMismatch(
+            f"'{model}' has learned by {record.subclass}, and would go on by plain {record.algo}; "
+            "go on in your own script"
+        )
     known = record.algo is not None
     check_same(model, record.algo or told_algorithm(data), algo, to_learn=known)
     frames = frames_of(entry)

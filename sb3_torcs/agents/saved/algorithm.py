@@ -15,12 +15,15 @@ __all__ = [
     "algorithm_of",
     "check_same",
     "is_sbx",
+    "known_parent",
     "told_algorithm",
     "zoo_name",
 ]
 
 SBX = "sbx_"
 """Begins the names of SBX's algorithms, which are SB3's in JAX: ``"sbx_tqc"``."""
+
+LIBRARIES = ("stable_baselines3", "sb3_contrib", "sbx")
 
 SAVED_AS = {"ddpg": "td3"}  # models of the two cannot be told apart
 
@@ -57,19 +60,28 @@ def algorithm_class(name: str) -> Any:
     return classes[name]
 
 
-def zoo_name(own: type) -> str | None:
+def known_parent(own: type) -> type:
     """
-    Name an algorithm, or the one of which it is a subclass.
+    Find the algorithm of which another is a subclass, without importing the zoo, which patches.
 
-    :param own: class of the algorithm
-    :return: the zoo's name; ``None`` if the zoo does not have it
+    :param own: class of an algorithm
+    :return: the first of its parents in SB3, sb3-contrib or SBX; itself if there is none
     """
-    from rl_zoo3.utils import ALGOS
+    for parent in own.__mro__:
+        package, _, rest = parent.__module__.partition(".")
+        if package in LIBRARIES and not rest.startswith("common"):
+            return parent
+    return own
 
-    if own.__module__.startswith("sbx."):
-        return own.__name__.lower()
-    names = {algorithm: name for name, algorithm in ALGOS.items()}
-    return next((names[parent] for parent in own.__mro__ if parent in names), None)
+
+def zoo_name(algorithm: type) -> str:
+    """
+    Name an algorithm as the zoo does.
+
+    :param algorithm: its class; that of SBX is named without ``sbx_``
+    """
+    name = algorithm.__name__
+    return "ppo_lstm" if name == "RecurrentPPO" else name.lower()
 
 
 def _sbx_algorithms(name: str) -> dict[str, Any]:

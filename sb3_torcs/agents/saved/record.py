@@ -91,6 +91,7 @@ class TrainingRecord:
     policy: Mapping[str, Any] | None = None  # as of ``saved.policy.plain_policy``
     statistics: Statistics | None = None  # of VecNormalize
     statistics_file: Path | None = None  # the same, pickled by the zoo
+    subclass: str | None = None  # of the algorithm, by whose own code it has learned
     driver_only: bool = False  # whether the parts that only learning needs were left out
 
     @property
@@ -141,6 +142,7 @@ def record_within(model: Path, data: Mapping[str, Any]) -> TrainingRecord | None
             spaces=None if seen[0] is None or seen[1] is None else (seen[0], seen[1]),
             policy=_typed(said, "policy", dict),
             statistics=_statistics(_typed(said, "statistics", dict)),
+            subclass=_typed(said, "subclass", str),
             driver_only=bool(said.get("driver_only")),
         )
 

@@ -24,7 +24,7 @@ from stable_baselines3.common.save_util import data_to_json
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize, unwrap_vec_wrapper
 
 from sb3_torcs import __version__
-from sb3_torcs.agents.saved.algorithm import zoo_name
+from sb3_torcs.agents.saved.algorithm import known_parent, zoo_name
 from sb3_torcs.agents.saved.file import IDLE, VALUES, saved_data, saved_weights
 from sb3_torcs.agents.saved.policy import (
     plain,
@@ -105,12 +105,14 @@ def write_record(model: BaseAlgorithm, asked: Recipe) -> None:
     :param model: that learns
     :param asked: options of the training, of :func:`recipe`
     """
+    own = type(model)
     record = {
         "version": VERSION,
         **asked,
         "observation_space": plain_space(model.observation_space),
         "action_space": plain_space(model.action_space),
         "policy": plain_policy(model),
+        "subclass": None if known_parent(own) is own else f"{own.__module__}.{own.__qualname__}",
         "statistics": _statistics(model),
         "start_time": model.start_time,  # tells whether a record is of the last training
         "packages": {
@@ -226,8 +228,8 @@ def _record_in(model: Path, data: Mapping[str, Any]) -> Recipe:
 def _saved_as(model: str | Path) -> Path:
     """Return the file that ``model.save`` has written: it adds the ending."""
     path = Path(os.path.expanduser(model))
-    zipped = path.with_name(f"{path.name}.zip")
-    return zipped if not path.exists() and zipped.is_file() else path
+    zipped = Path(f"{path}.zip")
+    return zipped if not path.is_file() and zipped.is_file() else path
 
 
 def _recipe_of_environment(model: BaseAlgorithm) -> Recipe:
@@ -235,7 +237,7 @@ def _recipe_of_environment(model: BaseAlgorithm) -> Recipe:
     env = model.get_env()
     assert env is not None
     (spec,) = env.get_attr("spec", 0)
-    algo = zoo_name(type(model))
+    algo = zoo_name(known_parent(type(model)))
     seen = _frames_of(env)
     if spec is None:
         return recipe(algo, None, seen)
