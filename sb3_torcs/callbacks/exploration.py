@@ -70,7 +70,7 @@ class NoiseCallback(BaseCallback):
         self.seed = seed
 
     def _on_training_start(self) -> None:
-        model = _noisy(self)
+        model = _with_noise(self)
         saved = noises_of(model)
         if len(saved) != self.model.n_envs or type(saved[0]) is not KINDS[self.kind]:
             noise = self._continued(saved[0]) if saved else self._new()
@@ -99,7 +99,7 @@ class NoiseCallback(BaseCallback):
         return True
 
 
-def _noisy(callback: BaseCallback) -> OffPolicyAlgorithm:
+def _with_noise(callback: BaseCallback) -> OffPolicyAlgorithm:
     """Return the algorithm of a callback, which has to add a noise to its actions."""
     if not isinstance(callback.model, OffPolicyAlgorithm):
         raise InvalidOption(
@@ -115,7 +115,7 @@ class _NoiseUser(BaseCallback):
     noises: Sequence[ActuatorNoise] = ()
 
     def _on_training_start(self) -> None:
-        _noisy(self)
+        _with_noise(self)
         self.noises = ()
 
     def _on_rollout_start(self) -> None:
