@@ -111,7 +111,7 @@ def test_two_clients_race_against_a_robot(folder):
     assert f"UDP ports {port} to {port + 1}" in out
     assert "race on michigan" in out
     names = re.findall(r"^ +[123]  (\S+)(?: 3)? +(?:155-DTM|car1-trb1) ", out, re.MULTILINE)
-    assert sorted(names) == sorted([one.address, other.address, "inferno"])
+    assert sorted(names) == sorted([one.address, other.address, "inferno:3"])
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
