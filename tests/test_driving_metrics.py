@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from conftest import ScriptedBackend
 from stable_baselines3 import DDPG, PPO, SAC, TD3
-from stable_baselines3.common.callbacks import CallbackList, EvalCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputFormat
 from stable_baselines3.common.monitor import Monitor
@@ -244,6 +244,28 @@ def test_a_line_that_is_drawn_changes_no_later_evaluation(vec_env_cls, monkeypat
         return evaluation.last_mean_reward, evaluation.best_mean_reward
 
     assert races(DrivingMetricsCallback(line_timesteps=10)) == races()
+
+
+def test_it_measures_in_a_callback_that_is_no_list():
+    class Own(BaseCallback):
+        """Calls it by itself."""
+
+        metrics = DrivingMetricsCallback()
+
+        def _init_callback(self):
+            self.metrics.init_callback(self.model)
+
+        def _on_training_start(self):
+            self.metrics.on_training_start(self.locals, self.globals)
+
+        def _on_step(self):
+            self.metrics.update_locals(self.locals)
+            return self.metrics.on_step()
+
+    model = DDPG("MlpPolicy", lite(1, max_episode_steps=5), learning_starts=1000, **small())
+    model.learn(20, callback=Own())
+    assert Own.metrics.n_calls == 20
+    assert Own.metrics.listeners == []
 
 
 def test_q_is_the_critics_value_of_the_stored_transitions():

@@ -240,7 +240,8 @@ class DrivingMetricsCallback(BaseCallback):
         if self.model.num_timesteps == 0:  # not one that goes on
             self.best_lap_time = self.best_evaluation_lap_time = None
         others = list(callbacks_in(self.locals.get("callback")))
-        first = next(callback for callback in others if isinstance(callback, type(self)))
+        same = (callback for callback in others if isinstance(callback, DrivingMetricsCallback))
+        first = next(same, self)
         listening: list[LineListener] = [
             callback for callback in others if isinstance(callback, LineListener)
         ]
