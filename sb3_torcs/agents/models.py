@@ -20,6 +20,7 @@ from sb3_torcs.agents.saved.driver import ModelDriver
 from sb3_torcs.agents.saved.file import (
     as_mismatch,
     check_finite,
+    saved_as,
     saved_data,
     saved_weights,
 )
@@ -88,11 +89,9 @@ def find_model(path: str | Path, *, prefer_last: bool = False) -> Path:
     )
     if not isinstance(path, str | Path) or not str(path).strip():  # "" is the present folder
         raise InvalidOption(f"{path!r} names no model; {advice}")
-    given = Path(os.path.expanduser(path))
+    given = saved_as(path)
     if given.is_file():
         return given
-    if Path(f"{given}.zip").is_file():
-        return Path(f"{given}.zip")
     shipped = str(path) in shipped_agents()
     if not given.is_dir() and shipped:
         given = AGENTS / str(path)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import base64
 import io
 import json
+import os
 import pickletools
 import zipfile
 import zlib
@@ -30,6 +31,7 @@ __all__ = [
     "check_finite",
     "learned_weights",
     "referenced_class",
+    "saved_as",
     "saved_data",
     "saved_weights",
 ]
@@ -77,6 +79,18 @@ def as_mismatch(what: str, hint: str) -> Iterator[None]:
         raise ModelMismatch(
             f"{what} ({type(error).__name__}: {why}); {hint} a model that is whole"
         ) from error
+
+
+def saved_as(path: str | Path) -> Path:
+    """
+    Find the file that ``model.save(path)`` has written: it adds the ending.
+
+    :param path: with or without the ending
+    :return: the file, or the path as it is if there is none
+    """
+    given = Path(os.path.expanduser(path))
+    zipped = Path(f"{given}.zip")
+    return zipped if not given.is_file() and zipped.is_file() else given
 
 
 def saved_data(model: Path) -> dict[str, Any]:

@@ -25,7 +25,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize
 
 from sb3_torcs import __version__
 from sb3_torcs.agents.saved.algorithm import known_parent, zoo_name
-from sb3_torcs.agents.saved.file import IDLE, VALUES, saved_data, saved_weights
+from sb3_torcs.agents.saved.file import IDLE, VALUES, saved_as, saved_data, saved_weights
 from sb3_torcs.agents.saved.policy import (
     plain,
     plain_policy,
@@ -147,7 +147,7 @@ def write_driver(model: str | Path, driver: str | Path, *, value_function: bool 
             f"model is a {type(model).__name__}; write_driver takes the path of a saved one: "
             "model.save('model.zip'), then write_driver('model.zip', 'driver.zip')"
         )
-    model, driver = _saved_as(model), Path(os.path.expanduser(driver))
+    model, driver = saved_as(model), Path(os.path.expanduser(driver))
     data, weights = saved_data(model), saved_weights(model)
     data[RECORD] = {**_record_in(model, data), "driver_only": True}
     if not value_function:
@@ -223,13 +223,6 @@ def _record_in(model: Path, data: Mapping[str, Any]) -> Recipe:
         "statistics": None,
         "start_time": data.get("start_time"),
     }
-
-
-def _saved_as(model: str | Path) -> Path:
-    """Return the file that ``model.save`` has written: it adds the ending."""
-    path = Path(os.path.expanduser(model))
-    zipped = Path(f"{path}.zip")
-    return zipped if not path.is_file() and zipped.is_file() else path
 
 
 def _recipe_of_environment(model: BaseAlgorithm) -> Recipe:
