@@ -69,9 +69,15 @@ def test_algorithms_know_it_by_name(algorithm):
     assert type(algorithm("BoundedPolicy", ToyRace()).policy) is BoundedPolicy
 
 
-@pytest.mark.parametrize("net_arch", [[0, 8], [8.5], {"pi": [8], "vf": ["8"]}, 5])
+@pytest.mark.parametrize("net_arch", [[0, 8], [8.5], {"pi": [8], "vf": ["8"]}])
 def test_layers_have_whole_sizes(net_arch):
-    with pytest.raises(InvalidOption, match=r"is no (layer size; pass whole|list of layer sizes)"):
+    with pytest.raises(InvalidOption, match="is no layer size; pass whole numbers >= 1"):
+        make(net_arch=net_arch)
+
+
+@pytest.mark.parametrize("net_arch", [5, 0, {"pi": 5, "vf": [8]}])
+def test_layers_are_a_list(net_arch):
+    with pytest.raises(InvalidOption, match=r"is no list of layer sizes; pass e\.g\. net_arch="):
         make(net_arch=net_arch)
 
 
