@@ -93,7 +93,7 @@ class Fleet(Protocol):
 
     def put(self, index: int, world: Any) -> None:
         """
-        Let an environment go on in another world, or in the same.
+        Give an environment a world, in which it goes on: another one, or the same.
 
         :param index: which
         :param world: of the same kind

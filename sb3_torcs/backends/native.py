@@ -348,7 +348,7 @@ class NativeFleet:
         self._fleet = _extension().Fleet(engines, threads)
 
     def put(self, index: int, world: NativeBackend | SeatWorld) -> None:
-        """Let one go on in another world; see :class:`~sb3_torcs.backends.base.Fleet`."""
+        """Give an environment a world; see :class:`~sb3_torcs.backends.base.Fleet`."""
         if self._worlds[index] is world:
             return
         self._worlds[index], self._seats[index] = world, world.seat

@@ -72,10 +72,10 @@ class NoiseCallback(BaseCallback):
     def _on_training_start(self) -> None:
         model = _with_noise(self)
         saved = noises_of(model)
-        if len(saved) != self.model.n_envs or type(saved[0]) is not KINDS[self.kind]:
+        n_envs = model.n_envs
+        if len(saved) != n_envs or type(saved[0]) is not KINDS[self.kind]:
             noise = self._continued(saved[0]) if saved else self._new()
-            n_envs = self.model.n_envs
-            self.model.action_noise = noise if n_envs == 1 else VectorizedActionNoise(noise, n_envs)
+            model.action_noise = noise if n_envs == 1 else VectorizedActionNoise(noise, n_envs)
         for noise in bind(model):
             noise.parameters = self.parameters
             noise.stochastic_brake = None  # of a training that an error has ended

@@ -16,8 +16,9 @@ function draw(panel) {
   }));
   const axis = { gridcolor: "#e6e9ed", zeroline: false };
   const empty = !curves.some(({ y }) => y.some((value) => value !== null));
+  const middle = { showarrow: false, xref: "paper", yref: "paper", x: 0.5, y: 0.5 };
   const layout = {
-    annotations: empty ? [{ text: "no seed has one", showarrow: false, xref: "paper", yref: "paper", x: 0.5, y: 0.5 }] : [],
+    annotations: empty ? [{ ...middle, text: "no seed has one" }] : [],
     font: FONT, showlegend: false, hovermode: "closest", height: 340,
     margin: { l: 52, r: 12, t: 30, b: 44 }, title: { text: panel.title, font: { size: 13 }, x: 0.02 },
     xaxis: { ...axis, title: { text: "timesteps learned from" } },

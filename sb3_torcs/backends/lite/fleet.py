@@ -106,10 +106,10 @@ class LiteFleet:
         self._owner = os.getpid()
 
     def put(self, index: int, world: LiteBackend) -> None:
-        """Let one go on in another world; see :class:`~sb3_torcs.backends.base.Fleet`."""
+        """Give an environment a world; see :class:`~sb3_torcs.backends.base.Fleet`."""
         before, row = self._worlds[index], self._rows[index]
         if before is not world:
-            if before.keeps_state_in(row):  # not in that of another index, which took it over
+            if before.keeps_state_in(row):  # not in that of another environment, which took it over
                 before.keep_state_in(np.empty_like(row))
             self._worlds[index] = world
         if not world.keeps_state_in(row):
