@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import torch as th
 from stable_baselines3 import PPO, TD3
@@ -41,6 +41,7 @@ __all__ = [
 
 RATE_STEP = 1.5  # [-] by which the learning rate changes after an update
 LEAST_RATE, MOST_RATE = 0.01, 4.0  # [-] of the model's own
+REPLACED = ("train", "_excluded_save_params")  # methods of a model, between rollout and update
 
 
 class _Training:
@@ -48,7 +49,8 @@ class _Training:
     Replaces a model's ``train`` for one call, in which callbacks change the algorithm.
 
     Between the rollout and the call other callbacks may save the model, or Ctrl-C may end the
-    training. So saved files leave the replacement out.
+    training. So saved files leave the replacement out. A ``train`` that somebody else has given to
+    the model learns as before.
 
     :param model: that has just made a rollout
     """
@@ -56,11 +58,12 @@ class _Training:
     def __init__(self, model: Any) -> None:
         self._model = model
         self.callbacks: list[WhileLearning] = []
+        self._before = {name: own for name, own in vars(model).items() if name in REPLACED}
         model.train, model._excluded_save_params = self, self._left_out
 
     def __call__(self, *arguments: Any, **keywords: Any) -> None:
         self._remove()
-        train = self._model.train
+        train = self._earlier("train")
         try:
             for callback in self.callbacks:
                 train = callback._change() or train
@@ -73,14 +76,20 @@ class _Training:
         self._remove()
         self._undo()
 
+    def _earlier(self, name: str) -> Callable[..., Any]:
+        """Return the method that was replaced."""
+        own = getattr(type(self._model), name).__get__(self._model)
+        return cast(Callable[..., Any], self._before.get(name, own))
+
     def _left_out(self) -> list[str]:
         """Name what a saved file leaves out; see SB3's method of this name."""
-        own: list[str] = type(self._model)._excluded_save_params(self._model)
-        return [*own, "train", "_excluded_save_params"]
+        return [*self._earlier("_excluded_save_params")(), *REPLACED]
 
     def _remove(self) -> None:
-        for name in ("train", "_excluded_save_params"):
-            vars(self._model).pop(name, None)
+        if vars(self._model).get("train") is self:
+            for name in REPLACED:
+                delattr(self._model, name)
+            vars(self._model).update(self._before)
 
     def _undo(self) -> None:
         for callback in self.callbacks:
@@ -184,7 +193,8 @@ class LeanUpdatesCallback(WhileLearning):
 
     The updates are equal but for rounding, and take about half of the time. PPO decides in this
     way, too. If the policy is on a GPU, or has a part that the passes do not know (an optimizer, an
-    activation, a features extractor), then the algorithm's own methods go on.
+    activation, a features extractor, a hook), then the algorithm's own methods go on. This is
+    checked before each rollout and each update, so other callbacks may change the model.
 
     :param verbose: as in ``BaseCallback``
     """
@@ -194,12 +204,8 @@ class LeanUpdatesCallback(WhileLearning):
 
     def _on_training_start(self) -> None:
         model = self.model
-        self._updates: LeanUpdates | LeanPPO | None = None
-        if isinstance(model, PPO):
-            self._updates = LeanPPO(model) if ppo.is_for(model) else None
-        elif isinstance(model, TD3) and isinstance(model.policy, SplitHeadPolicy):
-            self._updates = LeanUpdates(model) if updates.is_for(model) else None
-        else:
+        split = isinstance(model, TD3) and isinstance(model.policy, SplitHeadPolicy)
+        if not split and not isinstance(model, PPO):
             raise InvalidOption(
                 f"{type(self).__name__} updates PPO, and DDPG and TD3 with SplitHeadPolicy, but "
                 f"the model learns by {type(model).__name__} with {type(model.policy).__name__}; "
@@ -208,16 +214,23 @@ class LeanUpdatesCallback(WhileLearning):
 
     def _on_rollout_start(self) -> None:
         super()._on_rollout_start()
-        if isinstance(self._updates, LeanPPO):
-            self._updates.read_parameters()  # `forward` overlooks a change of `parameter.data`
-            self.model.policy.forward = LeanForward(self._updates)
+        model = self.model
+        if isinstance(model, PPO) and ppo.is_for(model):
+            lean = LeanPPO(model)
+            lean.read_parameters()
+            vars(model.policy)["forward"] = LeanForward(lean)
 
     def _change(self) -> Callable[..., None] | None:
         self._undo()
-        return None if self._updates is None else self._updates.train
+        model = self.model
+        if isinstance(model, PPO):
+            return LeanPPO(model).train if ppo.is_for(model) else None
+        assert isinstance(model, TD3)
+        return LeanUpdates(model).train if updates.is_for(model) else None
 
     def _undo(self) -> None:
-        vars(self.model.policy).pop("forward", None)
+        if isinstance(vars(self.model.policy).get("forward"), LeanForward):
+            del vars(self.model.policy)["forward"]
 
 
 class AdaptiveLearningRateCallback(WhileLearning):

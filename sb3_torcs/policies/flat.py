@@ -40,6 +40,7 @@ class FlatParameters(nn.Module):
 
     flat: nn.Parameter
     slots: dict[str, Slot]
+    size: int  # number of parameters of the plain network
 
     def adopt(self, parameters: dict[str, th.Tensor]) -> None:
         """
@@ -51,7 +52,8 @@ class FlatParameters(nn.Module):
             name: Slot(tuple(parameter.shape), _is_product(name, parameter))
             for name, parameter in parameters.items()
         }
-        self.flat = nn.Parameter(th.empty(sum(map(th.numel, parameters.values()))))
+        self.size = sum(map(th.numel, parameters.values()))
+        self.flat = nn.Parameter(th.empty(self.size))
         for name, view in self.views(self.flat.detach()):
             view.copy_(parameters[name].detach())
 

@@ -29,6 +29,7 @@ from sb3_torcs.policies.inputs import SensorInputs
 from sb3_torcs.policies.networks import ActorAverage
 from sb3_torcs.policies.optimizers import adam_factors, adam_state, is_usual
 from sb3_torcs.policies.ppo_passes import decide, find_policy_gradient, find_value_gradient
+from sb3_torcs.policies.stock import has_hooks, has_module_hooks, has_own_methods
 from sb3_torcs.policies.threads import Helper, two_threads
 
 __all__ = ["LeanForward", "LeanPPO", "is_for"]
@@ -106,33 +107,43 @@ class LeanPPO:
         self.log_std = self.weights[:first]
         self.count = 0  # steps of Adam
         self.average: ActorAverage | None = getattr(policy, "average", None)
+        self._modules = [part for part in policy.modules() if part is not policy]
         averages = 0 if self.average is None else self.actor.part.stop - first
         self.averaged = np.zeros(averages, np.float32)
-        self._versions = -1  # of the policy's parameters that were taken over
 
     # ------------------------------------------------------------------------ rollouts
 
     def read_parameters(self) -> None:
         """Take over the parameters of the policy."""
-        self._versions = self._policy_versions()
+        self._pointers = self._find_pointers()
+        self._views = [array(own) for own in self.parameters]
+        self._taken = [view.copy() for view in self._views]
         _read(self.weights, self.slots, [own.detach() for own in self.parameters])
 
-    def _policy_versions(self) -> int:
-        """Return a number that grows whenever a parameter of the policy is changed in place."""
-        return sum(own._version for own in self.parameters)
+    def _find_pointers(self) -> list[int]:
+        return [own.data_ptr() for own in self.policy.parameters()]
+
+    def can_decide(self) -> bool:
+        """
+        Return whether the policy has the parameters that were read; if their values have changed,
+        read them again. PyTorch does not report changes within ``parameter.data``.
+        """
+        if self._find_pointers() != self._pointers or has_module_hooks(self._modules):
+            return False
+        if not all(map(np.array_equal, self._views, self._taken)):
+            self.read_parameters()
+        return True
 
     def forward(
         self, obs: th.Tensor, deterministic: bool = False
     ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         """
-        Decide as the policy does. Parameters that changed since the rollout began are taken over.
+        Decide as the policy does.
 
         :param obs: (batch, features)
         :param deterministic: as of the policy
         :return: actions, values of the observations, and logarithms of the actions' probabilities
         """
-        if self._policy_versions() != self._versions:
-            self.read_parameters()
         seen, actor, critic = self._seen(obs), self.actor, self.critic
         batch = len(obs)
         noise = np.zeros((batch, len(self.log_std)), np.float32)
@@ -286,7 +297,7 @@ class LeanForward:
     Replaces a policy's ``forward`` during a rollout; copies of the policy have their own.
 
     An error or Ctrl-C may leave it behind. So it lets the policy itself decide after another
-    update, and where PyTorch records operations.
+    update, where PyTorch records operations, and after somebody has moved the parameters.
 
     :param lean: that decides
     """
@@ -300,7 +311,8 @@ class LeanForward:
     ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         """Decide; see :meth:`LeanPPO.forward`."""
         lean = self._lean
-        if lean.model._n_updates != self._updates or th.is_grad_enabled():
+        is_old = lean.model._n_updates != self._updates
+        if is_old or th.is_grad_enabled() or not lean.can_decide():
             return type(lean.policy).forward(lean.policy, obs, deterministic)
         return lean.forward(obs, deterministic)
 
@@ -331,7 +343,9 @@ def is_for(model: PPO) -> bool:
     policy = model.policy
     return (
         type(model).train is PPO.train
+        and not has_own_methods(model)
         and type(policy) in (ActorCriticPolicy, BoundedPolicy)
+        and not has_own_methods(policy)
         and isinstance(model.observation_space, spaces.Box)
         and isinstance(model.action_space, spaces.Box)
         and len(model.observation_space.shape) == len(model.action_space.shape) == 1
@@ -342,11 +356,24 @@ def is_for(model: PPO) -> bool:
         and _is_known(policy.mlp_extractor.value_net)
         and model.clip_range_vf is None
         and model.target_kl is None
-        and is_usual(policy.optimizer)
-        and len(policy.optimizer.param_groups) == 1
-        and all(
-            own.dtype == th.float32 and (own.requires_grad or name.startswith("average."))
-            for name, own in policy.named_parameters()
+        and _learns_all(policy)
+    )
+
+
+def _learns_all(policy: Any) -> bool:
+    """Whether an optimizer of the usual kind, and nothing else, changes all parameters."""
+    optimizer = policy.optimizer
+    learns = {
+        name: own for name, own in policy.named_parameters() if not name.startswith("average.")
+    }
+    own_hooks = int(getattr(policy, "average", None) is not None)
+    return (
+        is_usual(optimizer)
+        and len(optimizer.param_groups) == 1
+        and {*map(id, optimizer.param_groups[0]["params"])} == {*map(id, learns.values())}
+        and all(own.dtype == th.float32 and own.requires_grad for own in learns.values())
+        and not has_hooks(
+            (part for part in policy.modules() if part is not policy), optimizer, own_hooks
         )
     )
 
@@ -358,5 +385,10 @@ def _plain(extractor: nn.Module) -> type[nn.Module]:
 
 def _is_known(hidden: nn.Module) -> bool:
     """Whether hidden layers are linear ones, each followed by ReLU."""
-    kinds = [type(each) for each in hidden.children() if not isinstance(each, MeanOfBoth)]
-    return bool(kinds) and kinds == [nn.Linear, nn.ReLU] * (len(kinds) // 2)
+    layers = [each for each in hidden.children() if not isinstance(each, MeanOfBoth)]
+    kinds = list(map(type, layers))
+    return (
+        bool(kinds)
+        and kinds == [nn.Linear, nn.ReLU] * (len(kinds) // 2)
+        and all(each.bias is not None for each in layers[::2])
+    )

@@ -14,14 +14,18 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_torcs.policies import kernels
-from sb3_torcs.policies.fused import FusedActor, FusedValues, array, empty, give, take
+from sb3_torcs.policies.flat import FlatParameters
+from sb3_torcs.policies.fused import FusedActor, FusedValues, array, give, take
 from sb3_torcs.policies.layers import compiled
 from sb3_torcs.policies.networks import ActorAverage
 from sb3_torcs.policies.optimizers import LeanAdam, is_usual
 from sb3_torcs.policies.split_head import SplitHeadPolicy
+from sb3_torcs.policies.stock import has_hooks, has_own_methods
 from sb3_torcs.policies.threads import Helper, two_threads
 
 __all__ = ["LeanUpdates", "is_for"]
+
+NETWORKS = ("actor", "actor_target", "critic", "critic_target")
 
 
 class LeanUpdates:
@@ -32,7 +36,16 @@ class LeanUpdates:
     """
 
     def __init__(self, model: TD3) -> None:
-        self.model, policy = model, cast(Any, model.policy)
+        self.model = model
+
+    def _look(self) -> None:
+        """
+        Look at the parameters of the networks.
+
+        The views hold for one call of ``train``. Between two calls PyTorch may move the parameters,
+        e.g. when they are sent to another process, and callbacks may replace their ``data``.
+        """
+        policy = cast(Any, self.model.policy)
         actor, critic = policy.actor.mu, policy.critic
         self.actor: th.Tensor = actor.flat
         self.critic: th.Tensor = critic.flat
@@ -40,14 +53,14 @@ class LeanUpdates:
         dtype = weights.dtype
         passes: FusedActor = actor.fused
         self.actor_shape = passes.sizes, passes.norm, passes.gain.astype(dtype)
-        self.actors = weights, target, empty(*weights.shape, dtype=dtype)
+        self.actors = weights, target, take(*weights.shape, dtype=dtype)
         weights, target = (
             array(flat).reshape(critic.n_critics, -1)
             for flat in (critic.flat, policy.critic_target.flat)
         )
         values: FusedValues = critic.fused
         self.critic_shape = values.sizes, values.norm
-        self.critics = weights, target, empty(*weights.shape, dtype=dtype)
+        self.critics = weights, target, take(*weights.shape, dtype=dtype)
         self.average: ActorAverage | None = policy.average
         if self.average is None:
             self.averages = np.empty(0, dtype), np.zeros((), np.int64)
@@ -62,6 +75,7 @@ class LeanUpdates:
         :param batch_size: transitions per update
         """
         model = self.model
+        self._look()
         model.policy.set_training_mode(True)
         model._update_learning_rate([model.actor.optimizer, model.critic.optimizer])
         actor_losses, critic_losses = [], []
@@ -77,8 +91,8 @@ class LeanUpdates:
                 critic_losses.append(self._update_critics(batch, rooms, tau, other))
                 if both:
                     actor_losses.append(self._update_actor(batch, rooms))
-        for room in rooms:
-            give(room)
+        for work in (*rooms, self.actors[2], self.critics[2]):
+            give(work)
         model.logger.record("train/n_updates", model._n_updates, exclude="tensorboard")
         if actor_losses:
             model.logger.record("train/actor_loss", np.mean(actor_losses))
@@ -276,15 +290,48 @@ def is_for(model: TD3) -> bool:
     :param model: DDPG or TD3 with a :class:`~sb3_torcs.policies.SplitHeadPolicy`
     :return: false on a GPU, or if a part is not the default
     """
-    policy = cast(SplitHeadPolicy, model.policy)
-    optimizers = policy.actor.optimizer, policy.critic.optimizer
+    policy: Any = model.policy
     return (
         type(model).train is TD3.train
+        and not has_own_methods(model)
+        and isinstance(policy, SplitHeadPolicy)
         and isinstance(model.observation_space, spaces.Box)
         and len(model.observation_space.shape) == 1
         and model.observation_space.dtype == np.float32
         and policy.fuses
-        and all(own.dtype == th.float32 for own in policy.parameters())
         and type(policy.actor.features_extractor) is FlattenExtractor
-        and all(isinstance(own, LeanAdam) and is_usual(own) for own in optimizers)
+        and all(getattr(model, name) is getattr(policy, name) for name in NETWORKS)
+        and all(map(_is_known, _vectors(policy)))
+        # Noises read the output of the actor as a whole by a hook.
+        and _learns_all(policy.actor.mu, policy.actor.optimizer, policy.average is not None)
+        and _learns_all(policy.critic, policy.critic.optimizer)
+    )
+
+
+def _vectors(policy: Any) -> list[FlatParameters]:
+    """Return the networks, each of whose parameters are one vector."""
+    average = [] if policy.average is None else [policy.average.module.mu]
+    return [policy.actor.mu, policy.actor_target.mu, policy.critic, policy.critic_target, *average]
+
+
+def _is_known(network: FlatParameters) -> bool:
+    """Whether the kernels can read and write the parameters: a callback may replace their data."""
+    vector = network.flat
+    return (
+        vector.dtype == th.float32
+        and vector.is_cpu
+        and vector.is_contiguous()
+        and vector.shape == (network.size,)
+    )
+
+
+def _learns_all(network: Any, optimizer: Any, is_averaged: bool = False) -> bool:
+    """Whether an optimizer of the usual kind, and nothing else, changes a network's vector."""
+    vector = network.flat
+    return (
+        isinstance(optimizer, LeanAdam)
+        and is_usual(optimizer)
+        and vector.requires_grad
+        and any(vector is own for group in optimizer.param_groups for own in group["params"])
+        and not has_hooks(network.modules(), optimizer, own_hooks=int(is_averaged))
     )
