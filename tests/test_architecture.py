@@ -63,7 +63,6 @@ STARTS_PROGRAMS = {
     "torcs/process.py",
 }
 STARTS_A_CHILD = {
-    "policies/fast_matmul.py",  # to try a kernel that may kill the process
     "rendering/encoder.py",  # to ask ffmpeg whether a video is whole
     "tracks/trial.py",  # to load a track that may crash the game's loader
 }

@@ -28,7 +28,7 @@ from sb3_torcs.bench.policy import PlainSplitHeadPolicy, measure, updater
 from sb3_torcs.callbacks import GradientStepsCallback, LeanUpdatesCallback
 from sb3_torcs.callbacks.learning import end_changes
 from sb3_torcs.errors import InvalidOption
-from sb3_torcs.policies import SplitHeadPolicy, fast_matmul
+from sb3_torcs.policies import SplitHeadPolicy
 from sb3_torcs.policies import updates as lean_updates
 from sb3_torcs.policies.fused import empty
 from sb3_torcs.policies.mirror import mirror_actions, mirror_image, mirror_observations
@@ -185,7 +185,6 @@ def test_other_numbers_of_actions_take_other_heads():
     ({"net_arch": {"pi": [8], "qf": [8, 8], "x": [1]}}, "the critic has two layer sizes"),
     ({"n_critics": 0}, "n_critics is 0; expected a whole number >= 1"),
     ({"layer_norm": "x"}, "layer_norm is 'x'; expected True or False"),
-    ({"fast_matmul": 1}, "fast_matmul is 1; expected True or False"),
     ({"ema_decay": "x"}, "pass a share in"),
     ({"init_std": "x"}, "pass a number above 0"),
     ({"net_arch": [300]}, "the critic has two layer sizes"),
@@ -838,85 +837,10 @@ def test_the_alias_belongs_to_ddpg_and_td3_only():
     assert "SplitHeadPolicy" not in PPO.policy_aliases
 
 
-# ------------------------------------------------------------------------- other kernels
-
-
-@pytest.fixture
-def kernel(monkeypatch):
-    """Give back the process's setting and forget what the probe has found."""
-    fast_matmul.probe.cache_clear()
-    yield monkeypatch
-    fast_matmul.probe.cache_clear()
-    fast_matmul.disable()
-
-
-def setting() -> str:
-    return th.backends.mkldnn.matmul.fp32_precision
-
-
-def test_the_probe_leaves_the_setting_as_it_was(kernel):
-    """Measuring is not choosing."""
-    before = setting()
-    found = fast_matmul.probe(8, (16, 16))
-    assert setting() == before
-    assert found.reason
-
-
-@pytest.mark.parametrize(("error", "speedup", "on"), [
-    (1e-7, 1.8, True), (1e-3, 1.8, False), (1e-7, 1.0, False),
-])  # fmt: skip
-def test_the_kernel_is_taken_only_if_accurate_and_faster(kernel, error, speedup, on):
-    """The reason says which of the two it was."""
-    kernel.setattr(fast_matmul, "_trial", lambda batch_size, units: None)
-    kernel.setattr(fast_matmul, "_relative_error", lambda tensors: error)
-    kernel.setattr(fast_matmul, "_speedup", lambda tensors: speedup)
-    found = make_model(fast_matmul=True).policy.fast_matmul_found
-    assert found.ok is on
-    assert setting() == ("bf16" if on else "none")
-    assert found.reason.startswith("on" if on else "left off")
-
-
-def test_a_kernel_that_kills_the_process_is_left_off(kernel, tmp_path):
-    """A virtual machine may list instructions that it does not allow."""
-    python = tmp_path / "python"
-    python.write_text("#!/bin/sh\nkill -ILL $$\n")
-    python.chmod(0o755)
-    kernel.setattr(sys, "executable", str(python))
-    found = fast_matmul.probe(8, (16, 16))
-    assert not found.ok
-    assert found.reason == "left off: the kernel kills the process here (SIGILL)"
-
-
-def test_the_trial_computes_in_another_process(kernel):
-    """It fails only where the kernel kills its process."""
-    failure = fast_matmul._trial(8, (16, 16))
-    assert failure is None or "kills the process" in failure
-
-
-def test_a_trial_that_cannot_run_leaves_the_kernel_off(kernel):
-    kernel.setattr(sys, "executable", "/nowhere/python")
-    found = fast_matmul.probe(8, (16, 16))
-    assert found.reason == ("left off: the trial in another process failed (FileNotFoundError)")
-
-
-def test_the_error_of_the_default_kernel_is_that_of_single_precision(kernel):
-    """The probe's own yardstick: about 1e-6 here, about 1e-3 for 16 bit."""
-    tensors = [th.rand(8, 16), th.rand(24, 16), th.rand(8, 24)]
-    assert 0 < fast_matmul._relative_error(tensors) < fast_matmul.TOLERANCE
-
-
-def test_a_policy_does_not_touch_the_kernel_unasked(kernel):
-    """The setting belongs to the whole process."""
-    kernel.setattr(fast_matmul, "enable", lambda: pytest.fail("not asked for"))
-    assert make_model().policy.fast_matmul_found is None
-
-
-def test_the_measurement_gives_three_rates(kernel):
-    """The fast one is None where the probe says no; threads and setting are given back."""
-    kernel.setattr(fast_matmul, "_speedup", lambda tensors: 1.0)
+def test_the_measurement_gives_two_rates():
+    """The number of threads is given back."""
     threads = th.get_num_threads()
     rates = measure(batch_size=8, seconds=0.2)
-    assert rates["policy_fast_updates_per_s"] is None
     assert rates["policy_updates_per_s"] > 0
     assert rates["policy_plain_updates_per_s"] > 0
-    assert (th.get_num_threads(), setting()) == (threads, "none")
+    assert th.get_num_threads() == threads

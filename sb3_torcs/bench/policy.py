@@ -16,7 +16,6 @@ from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.td3.policies import Actor, TD3Policy
 
-from sb3_torcs.policies import fast_matmul
 from sb3_torcs.policies.networks import LateActionQ
 from sb3_torcs.policies.split_head import SplitHeadPolicy
 from sb3_torcs.policies.threads import one_thread
@@ -173,44 +172,25 @@ def measure(batch_size: int = 64, seconds: float = 10.0) -> dict[str, float | No
 
     :param batch_size: transitions per update
     :param seconds: [s] processor time to spend in all, at least
-    :return: ``policy_updates_per_s``, ``policy_plain_updates_per_s`` and
-        ``policy_fast_updates_per_s`` (``fast_matmul=True``; ``None`` where it is not supported)
+    :return: ``policy_updates_per_s`` and ``policy_plain_updates_per_s``
     """
-    try:
-        with one_thread():
-            return _measure(batch_size, seconds)
-    finally:
-        fast_matmul.disable()
+    with one_thread():
+        models = {
+            "policy_updates_per_s": updater(SplitHeadPolicy, batch_size),
+            "policy_plain_updates_per_s": updater(PlainSplitHeadPolicy, batch_size),
+        }
+        spent = dict.fromkeys(models, 0.0)
+        for model in models.values():
+            _turn(model)
+        turns = 0
+        while sum(spent.values()) < seconds:
+            for name, model in models.items():
+                spent[name] += _turn(model)
+            turns += 1
+    return {name: turns * UPDATES_PER_TURN / time_spent for name, time_spent in spent.items()}
 
 
-def _measure(batch_size: int, seconds: float) -> dict[str, float | None]:
-    fast_matmul.disable()
-    models = {
-        "policy_updates_per_s": updater(SplitHeadPolicy, batch_size),
-        "policy_plain_updates_per_s": updater(PlainSplitHeadPolicy, batch_size),
-    }
-    if fast_matmul.probe(batch_size).ok:
-        models["policy_fast_updates_per_s"] = updater(SplitHeadPolicy, batch_size, fast_matmul=True)
-    spent = dict.fromkeys(models, 0.0)
-    for model in models.values():
-        _turn(model, fast=False)
-    turns = 0
-    while sum(spent.values()) < seconds:
-        for name, model in models.items():
-            spent[name] += _turn(model, fast=name == "policy_fast_updates_per_s")
-        turns += 1
-    rates: dict[str, float | None] = {"policy_fast_updates_per_s": None}
-    for name, time_spent in spent.items():
-        rates[name] = turns * UPDATES_PER_TURN / time_spent
-    return rates
-
-
-def _turn(model: TD3, fast: bool) -> float:
-    if fast:
-        fast_matmul.enable(model.batch_size)
+def _turn(model: TD3) -> float:
     begin = time.process_time()
     model.train(gradient_steps=UPDATES_PER_TURN, batch_size=model.batch_size)
-    spent = time.process_time() - begin
-    if fast:
-        fast_matmul.disable()
-    return spent
+    return time.process_time() - begin

@@ -36,7 +36,6 @@ KEYS = (
     "game_frames_per_s",
     "policy_updates_per_s",
     "policy_plain_updates_per_s",
-    "policy_fast_updates_per_s",
     "core_gflops",
     "ddpg_updates_per_s",
     "ddpg_update_gflop",

@@ -21,7 +21,6 @@ from torch import nn
 
 from sb3_torcs.car import check_count, checked_flag, is_number
 from sb3_torcs.errors import InvalidOption
-from sb3_torcs.policies import fast_matmul as matmul
 from sb3_torcs.policies.exact import ExactDriver, ExactPolicy, check_sizes, checked_decay
 from sb3_torcs.policies.export import export_actor
 from sb3_torcs.policies.flat import FlatParameters, keep_plain_state
@@ -70,8 +69,6 @@ class SplitHeadPolicy(ExactPolicy, TD3Policy):
         action and the mirror image of its action in the mirrored drive, so that left and right
         bends are driven alike. It needs observations whose middle is 0 (no ``VecNormalize``), and
         range finders with the same angles on both sides. Training is the same to the bit without it
-    :param fast_matmul: allow another kernel for speed, see
-        :mod:`sb3_torcs.policies.fast_matmul`; ``policy.fast_matmul_found`` says what was found
     :param kwargs: the other arguments of ``TD3Policy``
     :raises InvalidOption: if an argument has no such value, or the algorithm is neither DDPG nor
         TD3
@@ -90,7 +87,6 @@ class SplitHeadPolicy(ExactPolicy, TD3Policy):
         critic_lr_scale: float = 1.0,
         ema_decay: float | None = None,
         symmetric: bool = False,
-        fast_matmul: bool = False,
         **kwargs: Any,
     ) -> None:
         if "use_sde" in kwargs:  # all algorithms but DDPG and TD3 pass it
@@ -105,7 +101,6 @@ class SplitHeadPolicy(ExactPolicy, TD3Policy):
         bias = _bias(head_bias, len(heads))
         _check_net_arch(net_arch)
         layer_norm = checked_flag("layer_norm", layer_norm)
-        fast_matmul = checked_flag("fast_matmul", fast_matmul)
         symmetric = checked_flag("symmetric", symmetric)
         check_count("n_critics", kwargs.get("n_critics", 2))
         check_symmetric(symmetric, observation_space, action_space)
@@ -117,9 +112,7 @@ class SplitHeadPolicy(ExactPolicy, TD3Policy):
             "critic_lr_scale": _positive("critic_lr_scale", critic_lr_scale),
             "ema_decay": checked_decay(ema_decay),
             "symmetric": symmetric,
-            "fast_matmul": fast_matmul,
         }
-        self.fast_matmul_found = matmul.enable() if fast_matmul else None
         super().__init__(
             observation_space,
             action_space,
