@@ -57,10 +57,9 @@ struct Additions {
 
 // ---- Sine and cosine ----------------------------------------------------------------------------
 
-constexpr double S1 = -0x1.555545995a603p-3, S2 = 0x1.1107605230bc4p-7,
-                 S3 = -0x1.994eb3774cf24p-13;
-constexpr double C1 = -0x1.ffffffd0c621cp-2, C2 = 0x1.55553e1068f19p-5,
-                 C3 = -0x1.6c087e89a359dp-10, C4 = 0x1.99343027bf8c3p-16;
+constexpr double S1 = -0x1.555545995a603p-3, S2 = 0x1.1107605230bc4p-7, S3 = -0x1.994eb3774cf24p-13;
+constexpr double C1 = -0x1.ffffffd0c621cp-2, C2 = 0x1.55553e1068f19p-5, C3 = -0x1.6c087e89a359dp-10,
+                 C4 = 0x1.99343027bf8c3p-16;
 constexpr double TWO_OVER_PI = 0x1.45f306dc9c883p-1, HALF_PI = 0x1.921fb54442d18p0;
 
 // The sine of small angles, from the angle and its square.
@@ -100,8 +99,8 @@ EITHER Quarters reduce(float x) {
     std::uint64_t turned = mantissa * high + (mantissa * low >> 32);
     const std::uint64_t number = (turned + (std::uint64_t{1} << 61)) >> 62;
     turned -= number << 62;
-    const double rest = static_cast<double>(static_cast<std::int64_t>(turned)) *
-                        0x1.921fb54442d18p-62;
+    const double rest =
+        static_cast<double>(static_cast<std::int64_t>(turned)) * 0x1.921fb54442d18p-62;
     return {x < 0.0f ? -rest : rest, static_cast<unsigned>(x < 0.0f ? -number : number)};
 }
 

@@ -41,7 +41,8 @@ inline std::uint64_t digits_of_two_over_pi(int place) {
         0xfe5163abdebbc561,
         0xb7246e3a424dd2e0,
     };
-    const int first = place + 63;  // from the beginning of the table, whose last 0 is before digit 1
+    const int first =
+        place + 63;  // from the beginning of the table, whose last 0 is before digit 1
     const std::uint64_t* word = DIGITS + first / 64;
     const int shift = first % 64;
     return shift == 0 ? word[0] : word[0] << shift | word[1] >> (64 - shift);

@@ -13,14 +13,12 @@ SineCosine sine_cosine(double angle) {
     const double shifted = angle * TWO_OVER_PI + ROUNDER, number = shifted - ROUNDER;
     const double x = ((angle - number * PARTS[0]) - number * PARTS[1]) - number * PARTS[2];
     const double x2 = x * x, x4 = x2 * x2;
-    const double odd =
-        (-0x1.5555555555555p-3 + x2 * 0x1.1111111110babp-7) +
-        x4 * ((-0x1.a01a019e820aep-13 + x2 * 0x1.71de37946ed6dp-19) +
-              x4 * (-0x1.ae6008d114485p-26 + x2 * 0x1.5e0a4fc16be59p-33));
-    const double even =
-        (0x1.5555555555555p-5 + x2 * -0x1.6c16c16c16963p-10) +
-        x4 * ((0x1.a01a019f4ddfdp-16 + x2 * -0x1.27e4fa16cc2d1p-22) +
-              x4 * (0x1.1eeb67d026ec6p-29 + x2 * -0x1.907cd8ff5ede7p-37));
+    const double odd = (-0x1.5555555555555p-3 + x2 * 0x1.1111111110babp-7) +
+                       x4 * ((-0x1.a01a019e820aep-13 + x2 * 0x1.71de37946ed6dp-19) +
+                             x4 * (-0x1.ae6008d114485p-26 + x2 * 0x1.5e0a4fc16be59p-33));
+    const double even = (0x1.5555555555555p-5 + x2 * -0x1.6c16c16c16963p-10) +
+                        x4 * ((0x1.a01a019f4ddfdp-16 + x2 * -0x1.27e4fa16cc2d1p-22) +
+                              x4 * (0x1.1eeb67d026ec6p-29 + x2 * -0x1.907cd8ff5ede7p-37));
     const double sine = x + x * (x2 * odd), cosine = 1.0 - (0.5 * x2 - x4 * even);
     switch (bits(shifted) & 3) {
         case 0:
@@ -42,11 +40,11 @@ double log(double x) {
     const double exponent = static_cast<double>(static_cast<std::int64_t>(scale) >> 52);
     // The logarithm is twice the inverse hyperbolic tangent of this.
     const double s = (mantissa - 1.0) / (mantissa + 1.0), s2 = s * s, s4 = s2 * s2;
-    const double series =
-        ((0x1.5555555555555p-2 + s2 * 0x1.9999999999a39p-3) +
-         s4 * (0x1.2492492476a1ap-3 + s2 * 0x1.c71c7201a55d7p-4)) +
-        s4 * s4 * ((0x1.745cf8e4bba1bp-4 + s2 * 0x1.3b1c3c1c81c8fp-4) +
-                   s4 * (0x1.0fbde0f4ad17bp-4 + s2 * 0x1.0c0aff044a970p-4));
+    const double series = ((0x1.5555555555555p-2 + s2 * 0x1.9999999999a39p-3) +
+                           s4 * (0x1.2492492476a1ap-3 + s2 * 0x1.c71c7201a55d7p-4)) +
+                          s4 * s4 *
+                              ((0x1.745cf8e4bba1bp-4 + s2 * 0x1.3b1c3c1c81c8fp-4) +
+                               s4 * (0x1.0fbde0f4ad17bp-4 + s2 * 0x1.0c0aff044a970p-4));
     return exponent * LN2 + 2.0 * (s + s * (s2 * series));
 }
 

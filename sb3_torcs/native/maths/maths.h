@@ -7,7 +7,8 @@
 
 namespace torcs::maths {
 
-// ---- As in the C library's libm, for the game's modules and our own code -------------------------
+// ---- As in the C library's libm, for the game's modules and our own code
+// -------------------------
 
 // Correctly rounded, as in glibc from 2.41 on.
 float tanf(float x);

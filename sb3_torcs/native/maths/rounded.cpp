@@ -1,5 +1,6 @@
-// Six functions that are rounded correctly, each in two ways: in doubles, and in quadruple precision
-// where the former is too near to the middle between two floats, which is once in millions of calls.
+// Six functions that are rounded correctly, each in two ways: in doubles, and in quadruple
+// precision where the former is too near to the middle between two floats, which is once in
+// millions of calls.
 #include <cmath>
 #include <limits>
 
@@ -218,7 +219,7 @@ Quad hyperbolic_tangent_exactly(float x) {
 }
 
 // Everything in quadruple precision is kept out of the way of the usual case.
-#define RARELY [=]() __attribute__((noinline, cold)) -> Quad
+#define RARELY [=]() __attribute__((noinline, cold))->Quad
 
 }  // namespace
 
@@ -238,8 +239,8 @@ float tanhf(float x) {
     if (size < TINY || std::isnan(x)) return x + 0.0f * x;
     if (size >= ONE) return std::copysign(1.0f, x);
     const Fraction found = tangent(size, 1, HYPERBOLIC.of);
-    return rounded(std::copysign(found.num / found.den, x),
-                   RARELY { return hyperbolic_tangent_exactly(x); });
+    return rounded(
+        std::copysign(found.num / found.den, x), RARELY { return hyperbolic_tangent_exactly(x); });
 }
 
 float atanf(float x) {
@@ -251,14 +252,16 @@ float atanf(float x) {
 float asinf(float x) {
     if (std::fabs(x) < TINY) return x;
     if (!(std::fabs(x) <= 1.0f)) return (x - x) / (x - x);
-    return rounded(direction(double{x}, other_leg(double{x})),
-                   RARELY { return direction(Quad(x), other_leg(Quad(x))); });
+    return rounded(
+        direction(double{x}, other_leg(double{x})),
+        RARELY { return direction(Quad(x), other_leg(Quad(x))); });
 }
 
 float acosf(float x) {
     if (!(std::fabs(x) <= 1.0f)) return (x - x) / (x - x);
-    return rounded(direction(other_leg(double{x}), double{x}),
-                   RARELY { return direction(other_leg(Quad(x)), Quad(x)); });
+    return rounded(
+        direction(other_leg(double{x}), double{x}),
+        RARELY { return direction(other_leg(Quad(x)), Quad(x)); });
 }
 
 float atan2f(float y, float x) {
@@ -269,12 +272,13 @@ float atan2f(float y, float x) {
         return std::copysign(static_cast<float>(angle), y);
     }
     if (std::isinf(x)) return std::copysign(x < 0.0f ? static_cast<float>(PI) : 0.0f, y);
-    return rounded(direction<double>(y, x), RARELY {
-        // An angle is less than its tangent. Where it is too small for that to show in a Quad, a
-        // quotient in the middle between two subnormal floats has to be rounded down.
-        const Quad angle = direction<Quad>(y, x);
-        return absolute(angle) < 0x1p-50 ? angle * (1 - Quad(0x1p-110)) : angle;
-    });
+    return rounded(
+        direction<double>(y, x), RARELY {
+            // An angle is less than its tangent. Where it is too small for that to show in a Quad,
+            // a quotient in the middle between two subnormal floats has to be rounded down.
+            const Quad angle = direction<Quad>(y, x);
+            return absolute(angle) < 0x1p-50 ? angle * (1 - Quad(0x1p-110)) : angle;
+        });
 }
 
 double atan2(double y, double x) {
