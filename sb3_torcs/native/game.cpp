@@ -1,6 +1,7 @@
 #include "game.h"
 
 #include <dlfcn.h>
+#include <link.h>
 #include <pthread.h>
 
 #include "errors.h"
@@ -16,6 +17,8 @@ constexpr int READ_PRIVATE = 0x8;
 constexpr int MERGE_BOTH = 0x1 | 0x2;
 constexpr int MERGE_RELEASES = 0x4 | 0x8;
 
+constexpr const char* VECTORS = "libplibsg.so.1";
+
 std::mutex opening;
 std::unique_ptr<Game>* const opened = new std::unique_ptr<Game>;  // threads outlive statics
 
@@ -28,6 +31,14 @@ void preload(const std::string& path) {
     // The loader then finds this library when later ones need it by name.
     if (!dlopen(path.c_str(), RTLD_NOW | RTLD_LOCAL))
         throw Error("BackendUnavailable", path + " will not load: " + dlerror());
+}
+
+// Where the loader finds a library by its name; empty if it does not.
+std::string file_of(const char* name) {
+    void* handle = dlopen(name, RTLD_NOW | RTLD_LOCAL);
+    link_map* map = nullptr;
+    if (!handle || dlinfo(handle, RTLD_DI_LINKMAP, &map) != 0) return "";
+    return map->l_name;
 }
 
 }  // namespace
@@ -61,8 +72,11 @@ Game::Game(const std::string& data, const std::string& libraries, const std::str
     : data(data), libraries(libraries) {
     if (!plib.empty()) {
         preload(with_slash(plib) + "libplibul.so.1");
-        preload(with_slash(plib) + "libplibsg.so.1");
+        preload(with_slash(plib) + VECTORS);
     }
+    // The vectors of the physics. Some builds of the game have them inside.
+    const std::string vectors = file_of(VECTORS);
+    if (!vectors.empty()) Library::share_copy(vectors);
     // The order matters: none of these libraries names those that it needs.
     Library::shared(libraries + "lib/libtxml.so", false);
     Library& params = Library::shared(libraries + "lib/libtgf.so", false);

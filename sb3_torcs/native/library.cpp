@@ -20,6 +20,7 @@
 
 #include "arena.h"
 #include "errors.h"
+#include "maths/maths.h"
 
 namespace torcs {
 
@@ -245,6 +246,17 @@ const std::unordered_map<std::string, void*>& replacements() {
         {"exit", address(leave)},
         {"abort", address(leave_by_abort)},
         {"__assert_fail", address(fail_assertion)},
+        {"sinf", address(maths::sinf)},
+        {"cosf", address(maths::cosf)},
+        {"sincosf", address(maths::sincosf)},
+        {"expf", address(maths::expf)},
+        {"logf", address(maths::logf)},
+        {"tanf", address(maths::tanf)},
+        {"atanf", address(maths::atanf)},
+        {"asinf", address(maths::asinf)},
+        {"acosf", address(maths::acosf)},
+        {"tanhf", address(maths::tanhf)},
+        {"atan2f", address(maths::atan2f)},
     };
     return *table;
 }
@@ -474,6 +486,13 @@ Library& Library::shared(const std::string& path, bool race_memory) {
         library->keep_own_calls();
     }
     return *library;
+}
+
+void Library::share_copy(const std::string& path) {
+    auto& library = shared_libraries()[path];
+    if (library) return;
+    library.reset(new Library(path, open_copy(path, "", "GameIncomplete"), false));
+    library->keep_own_calls();
 }
 
 void* Library::find(const char* symbol) const { return dlsym(handle_, symbol); }

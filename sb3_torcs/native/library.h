@@ -3,7 +3,9 @@
 // The game's modules keep their world in global variables, so every race needs its own copy: the
 // file's bytes in an anonymous file, opened with local symbols. The copy's imports from the C
 // library are then pointed at ours: memory comes from the race's arena, `rand` from the race's
-// generator, `exit` becomes an error, nothing is printed, and no file is written.
+// generator, `exit` becomes an error, nothing is printed, and no file is written. Mathematics of
+// floats is ours, which is the same on every machine; robots' few functions of doubles stay the
+// system's.
 #pragma once
 
 #include <memory>
@@ -29,6 +31,10 @@ public:
     // The one instance that all races share, with global symbols. What it allocates lives in the
     // race's arena only if `race_memory` says so.
     static Library& shared(const std::string& path, bool race_memory);
+
+    // The same for a library that others in this process may use: of a copy, since its imports are
+    // redirected, too.
+    static void share_copy(const std::string& path);
 
     void* find(const char* symbol) const;  // null if there is none
     template <typename T>
