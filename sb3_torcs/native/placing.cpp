@@ -4,6 +4,7 @@
 #include <cmath>
 
 #include "gearbox.h"
+#include "maths/maths.h"
 #include "sensors.h"
 
 namespace torcs {
@@ -139,10 +140,10 @@ void give_speed(const Field& field, CarElement& car, double speed) {
     SimulatedCar& simulated = (*field.simulated)[car.index];
     simulated.damage = car.priv.damage = 0;  // of being put down level on a slope
     if (speed == 0.0) return;
-    const double yaw = simulated.global.pos.az;
+    const maths::SineCosine yaw = maths::sine_cosine(simulated.global.pos.az);
     simulated.local.vel.x = static_cast<float>(speed);
-    simulated.global.vel.x = static_cast<float>(speed * std::cos(yaw));
-    simulated.global.vel.y = static_cast<float>(speed * std::sin(yaw));
+    simulated.global.vel.x = static_cast<float>(speed * yaw.cosine);
+    simulated.global.vel.y = static_cast<float>(speed * yaw.sine);
     for (int i = 0; i < 4; i++) {
         SimulatedWheel& wheel = simulated.wheel[i];
         wheel.spin = wheel.previous_spin = wheel.axle_spin =

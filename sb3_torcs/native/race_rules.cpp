@@ -3,6 +3,7 @@
 #include <cmath>
 #include <cstring>
 
+#include "maths/maths.h"
 #include "race.h"
 
 namespace torcs {
@@ -28,20 +29,20 @@ bool is_touching(const CarElement& car) {
 }
 
 double diagonal(const CarElement& car) {
-    return std::hypot(car.info.dimension.x, car.info.dimension.y);
+    return maths::hypot(car.info.dimension.x, car.info.dimension.y);
 }
 
 bool near(const CarElement& a, const CarElement& b) {
     constexpr double SLACK = 0.5;  // [m] that cars are moved apart in a step
     const Pose &here = a.pub.local.pos, &there = b.pub.local.pos;
-    const double apart = std::hypot(there.x - here.x, there.y - here.y);
+    const double apart = maths::hypot(there.x - here.x, there.y - here.y);
     return apart < 0.5 * (diagonal(a) + diagonal(b)) + SLACK;
 }
 
 bool lies_before(const CarElement& car, const CarElement& other) {
     constexpr double FRONT = 0.25 * M_PI;  // [rad] to either side
     const Pose &here = car.pub.local.pos, &there = other.pub.local.pos;
-    const double direction = std::atan2(there.y - here.y, there.x - here.x);
+    const double direction = maths::atan2f(there.y - here.y, there.x - here.x);
     return std::fabs(std::remainder(direction - here.az, 2.0 * M_PI)) < FRONT;
 }
 

@@ -3,6 +3,8 @@
 #include <algorithm>
 #include <cmath>
 
+#include "maths/maths.h"
+
 namespace torcs {
 namespace {
 
@@ -18,6 +20,11 @@ struct Vector {
 Vector operator-(Vector a, Vector b) { return {a.x - b.x, a.y - b.y}; }
 double dot(Vector a, Vector b) { return a.x * b.x + a.y * b.y; }
 double cross(Vector a, Vector b) { return a.x * b.y - a.y * b.x; }  // positive if b is left of a
+
+Vector towards(double angle) {
+    const maths::SineCosine at = maths::sine_cosine(angle);
+    return {at.cosine, at.sine};
+}
 
 Vector ground(const Point& point) { return {point.x, point.y}; }
 
@@ -177,12 +184,11 @@ void range_finders(const CarElement& car, const double* angles, double* distance
         std::fill_n(distances, RANGE_FINDERS, OFF_TRACK);
         return;
     }
-    const double heading = road_heading(track);
-    const Vector along = {std::cos(heading), std::sin(heading)};
+    const Vector along = towards(road_heading(track));
     const Vector origin = place(track, {-along.y, along.x});
     const double yaw = car.pub.local.pos.az;
     for (int i = 0; i < RANGE_FINDERS; ++i) {
-        const Vector direction = {std::cos(yaw - angles[i]), std::sin(yaw - angles[i])};
+        const Vector direction = towards(yaw - angles[i]);
         distances[i] = Ray(origin, direction, dot(direction, along) >= 0.0).cast(*track.segment);
     }
 }
@@ -205,8 +211,8 @@ void opponents(const CarElement& car, CarElement* const* cars, int number, doubl
         if (&other == &car || (other.pub.status & NOT_SIMULATED & ~IN_PIT) != 0) continue;
         const double x = double(other.pub.local.pos.x) - own.x;
         const double y = double(other.pub.local.pos.y) - own.y;
-        const double distance = std::hypot(x, y);
-        const double clockwise = M_PI + std::remainder(own.az - std::atan2(y, x), 2.0 * M_PI);
+        const double distance = maths::hypot(x, y);
+        const double clockwise = M_PI + std::remainder(own.az - maths::atan2(y, x), 2.0 * M_PI);
         if (!(distance < SENSOR_RANGE && clockwise >= 0.0)) continue;  // nor what is no number
         // Half a turn to either side is the same direction: straight behind is sector 0.
         double& nearest = distances[int(clockwise / SECTOR) % OPPONENT_SECTORS];
@@ -220,8 +226,7 @@ namespace {
 
 // A car's velocity along the road and to its left, [m/s].
 Vector road_velocity(const CarElement& car) {
-    const double heading = road_heading(car.pub.track);
-    const Vector along = {std::cos(heading), std::sin(heading)};
+    const Vector along = towards(road_heading(car.pub.track));
     const Vector velocity = {car.pub.global.vel.x, car.pub.global.vel.y};
     return {dot(velocity, along), cross(along, velocity)};
 }
@@ -277,8 +282,8 @@ std::uint64_t Generator::next() {
 // Box and Muller 1958 (doi 10.1214/aoms/1177706645), of whose two numbers one is kept.
 double Generator::normal() {
     constexpr double UNIT = 0x1p-53;
-    const double radius = std::sqrt(-2.0 * std::log(double((next() >> 11) + 1) * UNIT));
-    return radius * std::cos(2.0 * M_PI * (double(next() >> 11) * UNIT));
+    const double radius = std::sqrt(-2.0 * maths::log(double((next() >> 11) + 1) * UNIT));
+    return radius * maths::sine_cosine(2.0 * M_PI * (double(next() >> 11) * UNIT)).cosine;
 }
 
 void add_noise(Generator& generator, double* range_finders, double* opponents) {
