@@ -16,9 +16,10 @@ sanitize = os.environ.get("SB3_TORCS_SANITIZE") == "1"
 # No contraction into fused multiply-adds: the same numbers on every machine.
 flags = ["-Wall", "-Wextra", "-ffp-contract=off"]
 headers = sorted(glob("sb3_torcs/native/**/*.h", recursive=True))
+maths = [f"sb3_torcs/native/maths/{name}.cpp" for name in ("as_glibc", "doubles", "rounded")]
 engine = Pybind11Extension(
     "sb3_torcs._engine",
-    [*sorted(glob("sb3_torcs/native/*.cpp")), "sb3_torcs/native/scr/messages.cpp"],
+    [*sorted(glob("sb3_torcs/native/*.cpp")), *maths, "sb3_torcs/native/scr/messages.cpp"],
     depends=headers,
     cxx_std=17,
     extra_compile_args=[*flags, *(SANITIZERS if sanitize else ["-O2"])],
@@ -70,8 +71,10 @@ game_libraries = [
         "_scr_server",
         "sb3_torcs/native/placing.cpp",
         "sb3_torcs/native/sensors.cpp",
+        *maths,
         *sorted(glob("sb3_torcs/native/scr/*.cpp")),
     ),
+    game_library("_game_maths", *maths, "sb3_torcs/native/maths/exports.cpp"),
     game_library("_game_window", *sorted(glob("sb3_torcs/native/window/*.cpp"))),
 ]
 

@@ -61,7 +61,7 @@ class GameProcess:
     :raises UnknownRobot: if the game has no such robot
     :raises UnknownCar: if the game does not have the car of a driver
     :raises GameIncomplete: if the game lacks its program, or a file that a race needs
-    :raises BackendUnavailable: if our driver module is needed and was not built
+    :raises BackendUnavailable: if a library of ours that the game needs was not built
     :raises GameFailed: if the program does not run
     """
 
@@ -107,10 +107,11 @@ class GameProcess:
                 "SB3_TORCS_FOLDER": str(self.folder),
                 **(environment or {}),
             }
+            first = [] if preload is None else [preload]
+            variables["LD_PRELOAD"] = ":".join(str(library) for library in [*first, *mathematics()])
             if preload is None:
                 call += ["-r", str(self.folder / RACE_FILE)]
             else:
-                variables["LD_PRELOAD"] = str(preload)
                 variables["SB3_TORCS_RACE"] = str(self.folder / RACE_FILE)
             self._process = _start(call, data, variables, descriptors, self.folder / "words")
         except BaseException:
@@ -243,6 +244,15 @@ def compiled_library(name: str) -> Path:
     if not file.is_file():
         raise BackendUnavailable(f"there is no {file}; build it: {build_command()}")
     return file
+
+
+def mathematics() -> list[Path]:
+    """
+    Find the libraries that give the game mathematics with the same results on every machine.
+
+    :raises BackendUnavailable: if ours was not built
+    """
+    return [compiled_library("_game_maths")]
 
 
 def game_environment(game: Game, folder: Path) -> dict[str, str]:
