@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Literal
 
+from sb3_torcs import maths
 from sb3_torcs.car import CAR_WIDTH, FIRST_RIVAL, RIVALS, CarState, Controls, is_number
 from sb3_torcs.errors import InvalidOption, UnknownRewardTerm, near_miss
 from sb3_torcs.rivals import clarity, rival
@@ -37,12 +38,12 @@ Term = Callable[[CarState, CarState, Controls], float]
 
 def speed_along(before: CarState, after: CarState, controls: Controls) -> float:
     """Vx cos θ [m/s]: speed along the road (Lillicrap et al., arXiv:1509.02971, section 4)."""
-    return after.speed_x * math.cos(after.heading_error)
+    return after.speed_x * maths.cos(after.heading_error)
 
 
 def speed_across(before: CarState, after: CarState, controls: Controls) -> float:
     """Vx sin θ, without its sign [m/s]: speed across the road, of the post's reward."""
-    return abs(after.speed_x * math.sin(after.heading_error))
+    return abs(after.speed_x * maths.sin(after.heading_error))
 
 
 def speed_off_axis(before: CarState, after: CarState, controls: Controls) -> float:

@@ -23,7 +23,7 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 
 OLDER_PLACES = {PACKAGE / name for name in ("agents/model_writing.py", "progress.py", "zoo.py")}
 
-MAX_MODULES = 15  # at the top of the package
+MAX_MODULES = 16  # at the top of the package
 MAX_FOLDERS = 17  # of Python there; beside them native/, the C++
 MAX_CODE_LINES = 300
 LONGER_FILES = {
@@ -32,7 +32,7 @@ LONGER_FILES = {
 
 # From the ground up. `sb3_torcs/__init__.py` registers the environments and loads nothing.
 FLOORS = (
-    {"_engine", "cores", "errors", "signals"},
+    {"_engine", "cores", "errors", "maths", "signals"},
     {"car", "files"},
     {"torcs"},
     {"rivals", "tracks"},

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from sb3_torcs import maths
 from sb3_torcs.car import KMH, MAX_DAMAGE, CarState
 
 __all__ = [
@@ -57,7 +58,7 @@ def stands(car: CarState) -> bool:
 
     :param car: at the end of a timestep
     """
-    along = math.cos(car.heading_error)
+    along = maths.cos(car.heading_error)
     return along < 0.0 or car.speed_x * along < STUCK_SPEED
 
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-
+from sb3_torcs import maths
 from sb3_torcs.car import STEER_LOCK, CarState
 
 __all__ = ["caught_steering", "sideslip", "slides"]
@@ -20,7 +19,7 @@ def sideslip(car: CarState) -> float:
 
     :param car: at the beginning of a timestep
     """
-    return math.atan2(car.speed_y, car.speed_x)
+    return maths.atan2(car.speed_y, car.speed_x)
 
 
 def slides(car: CarState) -> bool:
@@ -31,7 +30,7 @@ def slides(car: CarState) -> bool:
 
     :param car: at the beginning of a timestep
     """
-    if car.gear < 0 or car.speed_x <= 0.0 or math.hypot(car.speed_x, car.speed_y) < SLOWEST:
+    if car.gear < 0 or car.speed_x <= 0.0 or maths.hypot(car.speed_x, car.speed_y) < SLOWEST:
         return False
     return abs(sideslip(car)) > SIDESLIP
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from sb3_torcs import maths
 from sb3_torcs.car import CarState
 
 __all__ = ["freeing_controls", "needs_freeing"]
@@ -29,7 +30,7 @@ def needs_freeing(car: CarState) -> bool:
     """
     if abs(car.heading_error) < TURNED and abs(car.track_position) <= 1.0:
         return False
-    return car.gear < 0 or math.hypot(car.speed_x, car.speed_y) < SLOW
+    return car.gear < 0 or maths.hypot(car.speed_x, car.speed_y) < SLOW
 
 
 def freeing_controls(car: CarState) -> tuple[float, float, float, int]:

@@ -11,6 +11,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
+from sb3_torcs import maths
 from sb3_torcs.errors import CarFileError
 from sb3_torcs.torcs.params import Node
 
@@ -83,7 +84,7 @@ def car_facts(path: Path) -> CarFacts:
         if mass <= 0.0:
             raise ValueError(f"the mass is {mass:g} kg")
         wing = 1.23 * car.number("Rear Wing", name="area", default=0.0)
-        wing *= math.sin(car.number("Rear Wing", name="angle", default=0.0))
+        wing *= maths.sin(car.number("Rear Wing", name="angle", default=0.0))
         return CarFacts(
             grip=min(car.number(wheel, name="mu", default=1.0) for wheel in WHEELS),
             downforce=(_ground_effect(car) + 4.0 * wing) / mass,
@@ -108,7 +109,9 @@ def _ground_effect(car: _Merged) -> float:
     heights = [car.number(wheel, name="ride height", default=0.2) for wheel in WHEELS]
     lift = [car.number("Aerodynamics", name=f"{end} Clift", default=0.0)
             for end in ("front", "rear")]  # fmt: skip
-    return 2.0 * math.exp(-3.0 * (1.5 * sum(heights)) ** 4) * sum(lift)
+    height = 1.5 * math.fsum(heights)
+    square = height * height
+    return 2.0 * maths.exp(-3.0 * square * square) * math.fsum(lift)
 
 
 def _body_drag(car: _Merged) -> float:

@@ -8,11 +8,11 @@ itself, or has no room for a drivable bend, is drawn again.
 
 from __future__ import annotations
 
-import cmath
 import math
 
 import numpy as np
 
+from sb3_torcs import maths
 from sb3_torcs.car import FloatArray
 from sb3_torcs.tracks.track import Grid, Segment, Surface, Track, closed, closing_gap
 
@@ -83,10 +83,10 @@ def _polygon(rng: np.random.Generator) -> FloatArray:
     angles = math.tau * np.cumsum(gaps) / gaps.sum()
     radii = rng.uniform(NEAREST_CORNER, 1.0, n)
     stretch = rng.uniform(0.6, 1.0)
-    corners = np.stack([radii * np.cos(angles), stretch * radii * np.sin(angles)], axis=1)
+    corners = maths.directions(angles) * radii[:, None] * [1.0, stretch]
     if rng.random() < 0.5:
         corners = corners[::-1]
-    perimeter = np.hypot(*(np.roll(corners, -1, axis=0) - corners).T).sum()
+    perimeter = maths.lengths(np.roll(corners, -1, axis=0) - corners).sum()
     return np.asarray(corners * rng.uniform(*LENGTHS) / perimeter)
 
 
@@ -98,21 +98,26 @@ def _rounded(corners: FloatArray, rng: np.random.Generator) -> list[tuple[float,
     :param rng: source of chance
     :return: lengths [m] and curvatures [1/m] from the start line on; nothing if it cannot be done
     """
-    points = [complex(x, y) for x, y in corners]
-    n = len(points)
-    edges = [points[(i + 1) % n] - points[i] for i in range(n)]
-    turns = [cmath.phase(edges[i] / edges[i - 1]) for i in range(n)]
+    n = len(corners)
+    edges = np.roll(corners, -1, axis=0) - corners
+    before = np.roll(edges, 1, axis=0)
+    ahead, aside = (
+        (edges * before).sum(axis=1),
+        before[:, 0] * edges[:, 1] - before[:, 1] * edges[:, 0],
+    )
+    turns = maths.headings(np.stack([ahead, aside], axis=1)).tolist()
+    sides = maths.lengths(edges).tolist()
     radii, tangents = [], []
     for i, turn in enumerate(turns):
-        room = CORNER_SHARE * min(abs(edges[i - 1]), abs(edges[i]))
-        steepness = math.tan(0.5 * abs(turn))
+        room = CORNER_SHARE * min(sides[i - 1], sides[i])
+        steepness = maths.tan(0.5 * abs(turn))
         widest = min(room / steepness, MAX_RADIUS)
         if widest < MIN_RADIUS:
             return None
         tightest = max(MIN_RADIUS, TIGHTEST_SHARE * widest)
         radii.append(float(rng.uniform(tightest, widest)))
         tangents.append(radii[-1] * steepness)
-    straights = [abs(edges[i]) - tangents[i] - tangents[(i + 1) % n] for i in range(n)]
+    straights = [sides[i] - tangents[i] - tangents[(i + 1) % n] for i in range(n)]
     first = max(range(n), key=straights.__getitem__)
     if straights[first] < MIN_START_STRAIGHT:
         return None
@@ -151,32 +156,33 @@ def _apart(segments: list[Segment], clearance: float) -> bool:
     track = Track("candidate", "road", tuple(segments))
     n = math.ceil(track.length / SAMPLE)
     places: FloatArray = np.arange(n, dtype=np.float64) * (track.length / n)
-    axis = _axis(track, places)
+    x, y = _axis(track, places)
     # Points close to each other along the road may be near; beyond half a turn they may not.
     apart = np.abs(places[:, None] - places[None, :])
     apart = np.minimum(apart, track.length - apart)
+    gaps_x, gaps_y = x[:, None] - x[None, :], y[:, None] - y[None, :]
     return not bool(
         np.any(
-            (np.abs(axis[:, None] - axis[None, :]) < clearance)
+            (gaps_x * gaps_x + gaps_y * gaps_y < clearance * clearance)
             & (apart > 0.5 * math.pi * clearance)
         )
     )
 
 
-def _axis(track: Track, places: FloatArray) -> np.ndarray[tuple[int], np.dtype[np.complex128]]:
+def _axis(track: Track, places: FloatArray) -> tuple[FloatArray, FloatArray]:
     """
     Locate many places of the axis at once.
 
     :param track: to look at
     :param places: distances from the start line [m], (n,)
-    :return: x + iy [m], (n,)
+    :return: x and y [m], (n,) each
     """
     start, _, curvature, x, y, heading = track.table[:, :6].T
     index = np.searchsorted(start, places, side="right") - 1
     along = places - start[index]
     half_turn = 0.5 * curvature[index] * along
-    chord = along * np.sinc(half_turn / np.pi)
-    located: np.ndarray[tuple[int], np.dtype[np.complex128]] = (
-        x[index] + 1j * y[index] + chord * np.exp(1j * (heading[index] + half_turn))
-    )
-    return located
+    bent = half_turn != 0.0
+    chord = along.copy()
+    chord[bent] *= maths.directions(half_turn[bent])[:, 1] / half_turn[bent]
+    ahead = maths.directions(heading[index] + half_turn)
+    return x[index] + chord * ahead[:, 0], y[index] + chord * ahead[:, 1]

@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from sb3_torcs import maths
 from sb3_torcs.car import FloatArray
 from sb3_torcs.tracks.profile import FASTEST, RoadProfile, place_at
 from sb3_torcs.tracks.track import Track
@@ -120,7 +121,7 @@ def _relax(
             for k in range(1, 4):
                 across_x = x[k - 1] - 2.0 * x[k] + x[k + 1]
                 across_y = y[k - 1] - 2.0 * y[k] + y[k + 1]
-                along = 0.5 * math.hypot(x[k + 1] - x[k - 1], y[k + 1] - y[k - 1])
+                along = 0.5 * maths.hypot(x[k + 1] - x[k - 1], y[k + 1] - y[k - 1])
                 part = -2.0 if k == 2 else 1.0  # of this place in the second difference
                 weight = part / max(along, 1e-3) ** 3
                 slope += weight * (across_x * normals[i, 0] + across_y * normals[i, 1])
@@ -198,7 +199,8 @@ def _path(road: RoadProfile) -> _Path:
     )
     lap = 2.0 * math.pi * round(turn[-1] / (2.0 * math.pi))
     axis, heading = _closed(turn, lap, step)
-    normals = np.stack([-np.sin(heading), np.cos(heading)], axis=1)
+    ahead = maths.directions(heading)
+    normals = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
     widths = np.diff(area) / step
     half_widths = 0.5 * np.minimum(widths, np.roll(widths, 1))
 
@@ -228,7 +230,7 @@ def _closed(turn: FloatArray, lap: float, step: float) -> tuple[FloatArray, Floa
     share = np.linspace(0.0, 1.0, len(turn))
     heading = turn - (turn[-1] - lap) * share
     middle = 0.5 * (heading[:-1] + heading[1:])
-    chain = np.cumsum(step * np.stack([np.cos(middle), np.sin(middle)], axis=1), axis=0)
+    chain = np.cumsum(step * maths.directions(middle), axis=0)
     places = np.vstack([np.zeros(2), chain])
     return (places - places[-1] * share[:, None])[:-1], heading[:-1]
 
@@ -243,10 +245,10 @@ def _turn(line: FloatArray, heading: float, lap: float) -> tuple[FloatArray, Flo
     :return: (n,) the turn since the start line [rad], and (n,) the curvature [1/m]
     """
     chords = np.roll(line, -1, axis=0) - line
-    after = np.unwrap(np.arctan2(chords[:, 1], chords[:, 0]))
+    after = np.unwrap(maths.headings(chords))
     after += 2.0 * math.pi * round((heading - after[0]) / (2.0 * math.pi))
     before = np.append(after[-1] - lap, after[:-1])
-    lengths = np.hypot(*chords.T)
+    lengths = maths.lengths(chords)
     return 0.5 * (before + after), 2.0 * (after - before) / (lengths + np.roll(lengths, 1))
 
 
@@ -283,7 +285,8 @@ def _rounding(level: FloatArray, reach: float, step: float) -> FloatArray:
     :return: (n,) the change of its slope [1/m], negative on crests
     """
     n = max(round(reach / step), 1)
-    return (np.roll(level, n) - 2.0 * level + np.roll(level, -n)) / (n * step) ** 2
+    apart = n * step
+    return (np.roll(level, n) - 2.0 * level + np.roll(level, -n)) / (apart * apart)
 
 
 def driven(track: Track) -> tuple[FloatArray, FloatArray]:

@@ -22,6 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sb3_torcs import maths
 from sb3_torcs.errors import TrackFileError
 from sb3_torcs.torcs.installation import torcs_folders
 from sb3_torcs.torcs.params import Keys, Section, read_params
@@ -340,12 +341,13 @@ def _corner(segments: Iterable[Segment]) -> tuple[float, float]:
         left_most = 0.5 * s.width_end + left
         right_most = -0.5 * s.width_end - right
         turn = s.curvature * s.length / samples
-        chord = s.length / samples * (math.sin(0.5 * turn) / (0.5 * turn) if turn else 1.0)
+        chord = s.length / samples * (maths.sin(0.5 * turn) / (0.5 * turn) if turn else 1.0)
         for _ in range(samples):
-            x += chord * math.cos(heading + 0.5 * turn)
-            y += chord * math.sin(heading + 0.5 * turn)
+            cosine, sine = maths.cos_sin(heading + 0.5 * turn)
+            x += chord * cosine
+            y += chord * sine
             heading += turn
-            sine, cosine = math.sin(heading), math.cos(heading)
+            cosine, sine = maths.cos_sin(heading)
             for offset in (left_most, right_most):
                 if x - offset * sine < low_x:  # min() takes most of the time to read a track
                     low_x = x - offset * sine

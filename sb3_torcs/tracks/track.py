@@ -17,6 +17,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from sb3_torcs import maths
 from sb3_torcs.car import FloatArray
 from sb3_torcs.tracks.profile import RoadProfile, road_profile
 
@@ -63,6 +64,7 @@ RIGHT_WALL_DAMAGE = 23  # [-]
 COLUMNS = 24
 
 CLOSED_WITHIN = 1e-9  # [m] and [rad] what counts as no gap at the start line
+NO_PIVOT = 1e-12  # [-] of the largest: what is no more than rounding
 MAX_GAP = 0.005  # [-] of the length: a chain that misses its start by more is no circuit
 
 
@@ -247,12 +249,9 @@ class Track:
         :return: x [m], y [m] and the axis' heading there [rad]
         """
         curvature, *begin = self.table[index, CURVATURE:WIDTH_START].tolist()
-        on_axis = _advance(Pose(*begin), along, curvature)
-        return Pose(
-            on_axis.x - offset * math.sin(on_axis.heading),
-            on_axis.y + offset * math.cos(on_axis.heading),
-            on_axis.heading,
-        )
+        x, y, heading = _advance(Pose(*begin), along, curvature)
+        cosine, sine = maths.cos_sin(heading)
+        return Pose(x - offset * sine, y + offset * cosine, heading)
 
     def summary(self) -> TrackSummary:
         """Return the figures that a list of tracks shows."""
@@ -271,13 +270,10 @@ def _advance(pose: Pose, length: float, curvature: float) -> Pose:
     :return: the pose there
     """
     half_turn = 0.5 * curvature * length
-    chord = length * (math.sin(half_turn) / half_turn if half_turn else 1.0)
+    chord = length * (maths.sin(half_turn) / half_turn if half_turn else 1.0)
     direction = pose.heading + half_turn
-    return Pose(
-        pose.x + chord * math.cos(direction),
-        pose.y + chord * math.sin(direction),
-        direction + half_turn,
-    )
+    cosine, sine = maths.cos_sin(direction)
+    return Pose(pose.x + chord * cosine, pose.y + chord * sine, direction + half_turn)
 
 
 def closing_gap(segments: Sequence[Segment]) -> Pose:
@@ -340,18 +336,41 @@ def _closing_step(segments: Sequence[Segment], gap: Pose) -> tuple[Segment, ...]
     lengths = np.array([segment.length for segment in segments])
     curvatures = np.array([segment.curvature for segment in segments])
     x, y, heading = np.array(ends).T
+    cosines, sines = maths.directions(heading).T
     # One metre more of a segment moves the rest along its end and turns it about its end.
-    effect = np.stack(
-        [
-            np.cos(heading) - curvatures * (pose.y - y),
-            np.sin(heading) + curvatures * (pose.x - x),
-            curvatures,
-        ]
-    )
+    effect = np.stack([
+        cosines - curvatures * (pose.y - y), sines + curvatures * (pose.x - x), curvatures
+    ])  # fmt: skip
     weighted = effect * lengths
-    change = weighted.T @ np.linalg.lstsq(weighted @ effect.T, -np.array(gap), rcond=None)[0]
+    sums = [[math.fsum(row * column) for column in effect] for row in weighted]
+    shares = _solved(sums, [-value for value in gap])
+    change = sum(share * row for share, row in zip(shares, weighted, strict=True))
     # No segment may shrink to nothing; what is left over is for the next step.
     change = np.maximum(change, -0.5 * lengths)
     return tuple(
         s._replace(length=float(s.length + d)) for s, d in zip(segments, change, strict=True)
     )
+
+
+def _solved(matrix: list[list[float]], wanted: list[float]) -> list[float]:
+    """
+    Solve a symmetric system by elimination, in one order on every machine.
+
+    :param matrix: (n, n) of no negative eigenvalue
+    :param wanted: (n,)
+    :return: (n,) 0 for what the rest decides already
+    """
+    left, found = list(range(len(wanted))), [0.0] * len(wanted)
+    rows = [[*row, value] for row, value in zip(matrix, wanted, strict=True)]
+    least = NO_PIVOT * max(rows[i][i] for i in left)
+    order = []
+    while left and rows[best := max(left, key=lambda i: rows[i][i])][best] > least:
+        left.remove(best)
+        order.append(best)
+        for i in left:
+            factor = rows[i][best] / rows[best][best]
+            rows[i] = [a - factor * b for a, b in zip(rows[i], rows[best], strict=True)]
+    for i in reversed(order):
+        known = math.fsum(rows[i][j] * found[j] for j in range(len(found)) if j != i)
+        found[i] = (rows[i][-1] - known) / rows[i][i]
+    return found

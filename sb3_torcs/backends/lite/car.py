@@ -1,7 +1,8 @@
 """``car1-trb1`` in figures, its motor and its tyres, for the fallback world.
 
 The figures are those of ``cars/car1-trb1/car1-trb1.xml`` of torcs-data 1.3.7; the formulas follow
-TORCS's simulation, ``simuv2``.
+TORCS's simulation, ``simuv2``. Sines and logarithms stand as numbers, since those of the C library
+differ between machines.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import math
 import numpy as np
 from numba import njit
 
+from sb3_torcs import maths
 from sb3_torcs.actions import SHIFT_UP, automatic_gear, launch_clutch
 from sb3_torcs.car import CAR_LENGTH, CAR_WIDTH, LIMITER_RPM, REST_HEIGHT, RPM
 
@@ -22,7 +24,8 @@ MASS = 1150.0 + FUEL  # [kg]
 CG_HEIGHT = 0.25  # [m] in the car file's frame, which weight shifts by
 SEEN_HEIGHT = REST_HEIGHT  # [m] over the road, as the game tells it, before the springs give
 FRONT_WEIGHT = 0.52  # share of the weight on the front axle
-INERTIA_ARM = 0.62**2 * CAR_LENGTH**2 + CAR_WIDTH**2  # [m²] "mass repartition coefficient" 0.62
+SPREAD = 0.62 * CAR_LENGTH  # [m] "mass repartition coefficient" 0.62
+INERTIA_ARM = SPREAD * SPREAD + CAR_WIDTH * CAR_WIDTH  # [m²]
 YAW_INERTIA = MASS * INERTIA_ARM / 12.0  # [kg m²]
 MAX_YAW_RATE = 9.0  # [rad/s] the limit of simuv2
 AXLE_FRONT, AXLE_REAR = 1.22, -1.42  # [m] in the car file's frame
@@ -36,7 +39,7 @@ _RATED_FRONT = 1.2 * 0.5 * FRONT_WEIGHT * MASS * GRAVITY  # simuv2's "operating 
 _RATED_REAR = 1.2 * 0.5 * (1.0 - FRONT_WEIGHT) * MASS * GRAVITY
 RATED_LOAD = np.array([_RATED_FRONT, _RATED_FRONT, _RATED_REAR, _RATED_REAR])  # [N]
 LOAD_LAG = 0.05  # [s] stands for the suspension: how late loads follow accelerations
-HEAVE_STIFFNESS = 4 * 5500.0 * 175.127 * 1.1**2  # [N/m] four springs of 5500 lbs/in, bellcrank 1.1
+HEAVE_STIFFNESS = 4 * 5500.0 * 175.127 * 1.21  # [N/m] four springs of 5500 lbs/in, bellcrank 1.1
 
 # Steering
 STEER_RATE = math.radians(360.0)  # [rad/s]
@@ -44,16 +47,16 @@ STEER_RATE = math.radians(360.0)  # [rad/s]
 # Tyres
 RADIUS = np.array([0.3306, 0.3306, 0.3276, 0.3276])  # [m] per wheel
 TYRE_MU = 1.6  # [-] "mu"
-TYRE_C = 2.0 - math.asin(0.8) * 2.0 / math.pi  # "dynamic friction" 80 %
+TYRE_C = 2.0 - 0.9272952180016123 * 2.0 / math.pi  # asin(0.8) for "dynamic friction" 80 %
 TYRE_B = 20.0 / TYRE_C  # "stiffness" 20
 TYRE_E = 0.7  # "elasticity factor", the default
 LOAD_FACTOR_MIN, LOAD_FACTOR_MAX = 0.8, 1.6
-LOAD_FACTOR_K = math.log((1.0 - LOAD_FACTOR_MIN) / (LOAD_FACTOR_MAX - LOAD_FACTOR_MIN))
+LOAD_FACTOR_K = -1.3862943611198908  # log((1 - min) / (max - min))
 SKID_FACTOR = 0.3  # extra grip of a sliding tyre for a driver of the level "semi-pro"
 MAX_SLIP = 1.5
 SLIP_SPEED = 3.0  # [m/s] below it slip is measured against this speed, so that a stop is stable
-_CAMBER_FRONT = 1.0 + 0.05 * math.sin(18.0 * math.radians(4.0))
-_CAMBER_REAR = 1.0 + 0.05 * math.sin(18.0 * math.radians(3.0))
+_CAMBER_FRONT = 1.0 + 0.05 * 0.9510565162951535  # sin(18 · 4°)
+_CAMBER_REAR = 1.0 + 0.05 * 0.8090169943749475  # sin(18 · 3°)
 CAMBER = np.array([_CAMBER_FRONT, _CAMBER_FRONT, _CAMBER_REAR, _CAMBER_REAR])  # grip factor
 WHEEL_INERTIA_FRONT = 1.22 + 0.1241  # [kg m²] wheel and brake disk
 WHEEL_INERTIA_REAR = 1.22 + 0.0714
@@ -84,11 +87,26 @@ DIFFERENTIAL_MAX = 1500.0  # [N m]
 
 # Air
 DRAG = 0.645 * 0.35 * 1.92  # [N s²/m²] Cx 0.35, front area 1.92 m²
-WING_FRONT = 1.23 * 0.25 * math.sin(math.radians(6.0))
-WING_REAR = 1.23 * 0.70 * math.sin(math.radians(14.0))
+WING_FRONT = 1.23 * 0.25 * 0.10452846326765347  # sin(6°)
+WING_REAR = 1.23 * 0.70 * 0.24192189559966773  # sin(14°)
 WING_LIFT = 4.0  # downforce per drag of a wing
 GROUND_EFFECT = 1.5  # simuv2's 2 exp(-3 h⁴) at the car's usual ride height
 LIFT_FRONT, LIFT_REAR = 0.69 * GROUND_EFFECT, 0.70 * GROUND_EFFECT
+
+
+@njit(cache=True)
+def front_wheels(angle: float) -> tuple[tuple[float, float], tuple[float, float]]:
+    """
+    Return cosine and sine of the angles of the right and the left front wheel.
+
+    :param angle: of the inner one, left positive [rad]
+    """
+    ahead, aside = maths.cos_sin(angle)
+    outer_ahead = WHEELBASE * ahead + 0.5 * (TRACK_FRONT + TRACK_REAR) * abs(aside)
+    outer_aside = WHEELBASE * aside
+    size = maths.hypot(outer_ahead, outer_aside)
+    inner, outer = (ahead, aside), (outer_ahead / size, outer_aside / size)
+    return (outer, inner) if angle > 0.0 else (inner, outer)
 
 
 @njit(cache=True)
@@ -133,8 +151,8 @@ def tyre_grip(slip: float, load: float, rated_load: float) -> float:
     """
     slip = min(slip, MAX_SLIP)
     bx = TYRE_B * slip
-    shape = math.sin(TYRE_C * math.atan(bx * (1.0 - TYRE_E) + TYRE_E * math.atan(bx)))
-    load_factor = LOAD_FACTOR_MIN + (LOAD_FACTOR_MAX - LOAD_FACTOR_MIN) * math.exp(
+    shape = maths.sin(TYRE_C * maths.atan(bx * (1.0 - TYRE_E) + TYRE_E * maths.atan(bx)))
+    load_factor = LOAD_FACTOR_MIN + (LOAD_FACTOR_MAX - LOAD_FACTOR_MIN) * maths.exp(
         LOAD_FACTOR_K * load / rated_load
     )
     return shape * (1.0 + SKID_FACTOR * slip) * TYRE_MU * load_factor * load

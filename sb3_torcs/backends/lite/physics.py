@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from sb3_torcs import maths
 from sb3_torcs.actions import automatic_gear
 from sb3_torcs.backends.lite import car
 from sb3_torcs.backends.lite.rays import cast
@@ -117,8 +118,9 @@ def _hit_walls(state: Floats, track: Floats) -> None:
     offset = state[OFFSET]
     if abs(offset) + CAR_LENGTH < min(left, right):  # nowhere near
         return
-    cos_yaw, sin_yaw = math.cos(state[YAW]), math.sin(state[YAW])
-    to_left_x, to_left_y = -math.sin(state[TANGENT]), math.cos(state[TANGENT])
+    cos_yaw, sin_yaw = maths.cos_sin(state[YAW])
+    to_left_y, sin_tangent = maths.cos_sin(state[TANGENT])
+    to_left_x = -sin_tangent
     for corner in range(4):
         ahead = (0.5 if corner < 2 else -0.5) * CAR_LENGTH
         aside = (0.5 if corner % 2 else -0.5) * CAR_WIDTH
@@ -135,7 +137,7 @@ def _hit_walls(state: Floats, track: Floats) -> None:
         state[Y] += ny * depth
         offset += depth * (1.0 if wall == column.RIGHT_WALL_FRICTION else -1.0)
         impact = nx * (state[VX] - state[YAW_RATE] * dy) + ny * (state[VY] + state[YAW_RATE] * dx)
-        speed = max(1.0, math.hypot(state[VX], state[VY]))
+        speed = max(1.0, maths.hypot(state[VX], state[VY]))
         normal_speed = nx * state[VX] + ny * state[VY]
         cosine = normal_speed / speed
         friction, rebound = track[segment, wall], track[segment, wall + REBOUND]
@@ -152,16 +154,11 @@ def _hit_walls(state: Floats, track: Floats) -> None:
 
 
 @njit(cache=True)
-def _steer(state: Floats, command: float) -> tuple[float, float]:
-    """Turn the steering at its limited rate; return the angles of the right and left wheel."""
+def _steer(state: Floats, command: float) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Turn the steering at its limited rate; return where the right and left wheel point."""
     step = car.STEER_RATE * DT
     state[STEER] += min(max(command * STEER_LOCK - state[STEER], -step), step)
-    angle = state[STEER]
-    tangent = math.tan(abs(angle))
-    outer = math.atan2(
-        car.WHEELBASE * tangent, car.WHEELBASE + tangent * 0.5 * (car.TRACK_FRONT + car.TRACK_REAR)
-    )
-    return (outer, angle) if angle > 0.0 else (angle, -outer)
+    return car.front_wheels(state[STEER])
 
 
 @njit(cache=True)
@@ -170,7 +167,7 @@ def _air(vx: float, vy: float, damage: float) -> tuple[float, float, float]:
     pressure = vx * vx
     # Wings work forwards only; the ground effect fades when the car slides sideways.
     wings = pressure if vx > 0.0 else 0.0
-    straight = max(vx, 0.0) / max(math.hypot(vx, vy), 1.0)
+    straight = max(vx, 0.0) / max(maths.hypot(vx, vy), 1.0)
     front = car.LIFT_FRONT * pressure * straight + car.WING_LIFT * car.WING_FRONT * wings
     rear = car.LIFT_REAR * pressure * straight + car.WING_LIFT * car.WING_REAR * wings
     wing_drag = (car.WING_FRONT + car.WING_REAR) * wings
@@ -199,7 +196,7 @@ def _roll(
     state: Floats,
     wheel: int,
     velocity: tuple[float, float],
-    angle: float,
+    heading: tuple[float, float],
     grip_limit: tuple[float, float],
     drive: tuple[float, float, float],
 ) -> tuple[float, float]:
@@ -209,7 +206,7 @@ def _roll(
     :param state: the state vector; the wheel's spin changes
     :param wheel: its index
     :param velocity: of the wheel in the car's frame [m/s]
-    :param angle: of its steering [rad]
+    :param heading: cosine and sine of its angle to the car
     :param grip_limit: load [N] and friction of the ground [-]
     :param drive: driving torque [N m], braking torque [N m], inertia [kg m²]
     :return: force along and across the car [N]
@@ -218,12 +215,12 @@ def _roll(
     load, friction = grip_limit
     torque, brake, inertia = drive
     radius, spin = car.RADIUS[wheel], state[SPIN_FR + wheel]
-    cos_angle, sin_angle = math.cos(angle), math.sin(angle)
+    cos_angle, sin_angle = heading
     rolling_speed = vx * cos_angle + vy * sin_angle
     sliding_speed = vy * cos_angle - vx * sin_angle
     reference = max(abs(rolling_speed), car.SLIP_SPEED)
     slip_x = (rolling_speed - spin * radius) / reference
-    slip_y = sliding_speed / max(math.hypot(vx, vy), car.SLIP_SPEED)
+    slip_y = sliding_speed / max(maths.hypot(vx, vy), car.SLIP_SPEED)
     slip = math.sqrt(slip_x * slip_x + slip_y * slip_y)
     grip = 0.0  # [N] per slip
     if slip > 1e-9:
@@ -243,11 +240,11 @@ def _substep(
 ) -> None:
     """Advance the car by one physics step."""
     yaw, yaw_rate = state[YAW], state[YAW_RATE]
-    cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
+    cos_yaw, sin_yaw = maths.cos_sin(yaw)
     vx = state[VX] * cos_yaw + state[VY] * sin_yaw
     vy = state[VY] * cos_yaw - state[VX] * sin_yaw
     right, left = _steer(state, steering)
-    angles = (right, left, 0.0, 0.0)
+    headings = (right, left, (1.0, 0.0), (1.0, 0.0))
     torque, inertia = _drive(state, throttle, clutch)
     lock = car.DIFFERENTIAL * (state[SPIN_RR] - state[SPIN_RL])
     lock = min(max(lock, -car.DIFFERENTIAL_MAX), car.DIFFERENTIAL_MAX)
@@ -259,7 +256,7 @@ def _substep(
     state[SINK] += state[SINK_RATE] * DT
     segment, along, offset = int(state[SEGMENT]), state[ALONG], state[OFFSET]
     skew = yaw - state[TANGENT]
-    cos_skew, sin_skew = math.cos(skew), math.sin(skew)
+    cos_skew, sin_skew = maths.cos_sin(skew)
 
     force_x, force_y, moment, rolling = -drag, 0.0, 0.0, 0.0
     for wheel in range(4):
@@ -269,7 +266,7 @@ def _substep(
             state,
             wheel,
             (vx - yaw_rate * y, vy + yaw_rate * x),
-            angles[wheel],
+            headings[wheel],
             (loads[wheel], friction),
             (torques[wheel], brake * car.BRAKE[wheel], inertias[wheel]),
         )
@@ -278,7 +275,7 @@ def _substep(
         moment += fy * x - fx * y
         rolling += loads[wheel] * resistance
 
-    speed = math.hypot(vx, vy)
+    speed = maths.hypot(vx, vy)
     rolling = min(rolling, car.MASS * speed / DT) / max(speed, 1e-6)
     acc_x, acc_y = (force_x - rolling * vx) / car.MASS, (force_y - rolling * vy) / car.MASS
     state[ACC_X] += (acc_x - state[ACC_X]) * (DT / car.LOAD_LAG)
@@ -314,7 +311,8 @@ def advance(
         if gear == AUTOMATIC:
             wanted = automatic_gear(int(state[GEAR]), state[MOTOR], car.RATIOS)
         elif gear == BY_ROAD_SPEED:
-            speed = state[VX] * math.cos(state[YAW]) + state[VY] * math.sin(state[YAW])
+            cos_yaw, sin_yaw = maths.cos_sin(state[YAW])
+            speed = state[VX] * cos_yaw + state[VY] * sin_yaw
             wanted, launch = car.road_speed_gear(int(state[GEAR]), speed)
             clutch = max(pressed, launch)
         if wanted != int(state[GEAR]) and state[SHIFT] <= 0.0:
@@ -343,7 +341,8 @@ def place(x: float, y: float, yaw: float, speed: float, segment: int, track: Flo
     """
     state = np.zeros(STATE_SIZE)
     state[X], state[Y], state[YAW] = x, y, wrap(yaw)
-    state[VX], state[VY] = speed * math.cos(yaw), speed * math.sin(yaw)
+    cos_yaw, sin_yaw = maths.cos_sin(yaw)
+    state[VX], state[VY] = speed * cos_yaw, speed * sin_yaw
     state[SPIN_FR] = state[SPIN_FL] = speed / car.RADIUS[0]
     state[SPIN_RR] = state[SPIN_RL] = speed / car.RADIUS[2]
     gear = 1
@@ -394,7 +393,7 @@ def read(
     """
     segment, along = int(state[SEGMENT]), state[ALONG]
     yaw = state[YAW]
-    cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
+    cos_yaw, sin_yaw = maths.cos_sin(yaw)
     width = road_width(track, segment, along)
     scalars[0] = state[STEPS] / STEPS_PER_SECOND
     scalars[1], scalars[2], scalars[3] = state[X], state[Y], yaw

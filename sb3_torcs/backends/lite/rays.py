@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from sb3_torcs import maths
 from sb3_torcs.car import FloatArray
 from sb3_torcs.tracks.track import Track
 
@@ -50,13 +51,15 @@ def _arc(track: Track, index: int, offset: float) -> list[float]:
     x, y, heading = track.pose_on(index, 0.0)
     middle = heading + 0.5 * curvature * length
     side = math.copysign(1.0, curvature)
-    centre = (x - math.sin(heading) / curvature, y + math.cos(heading) / curvature)
+    cosine, sine = maths.cos_sin(heading)
+    centre = (x - sine / curvature, y + cosine / curvature)
+    along, across = maths.cos_sin(middle)
     return [
         *centre,
-        side * math.sin(middle),
-        -side * math.cos(middle),
+        side * across,
+        -side * along,
         abs(1.0 / curvature - offset),
-        math.cos(0.5 * abs(curvature) * length),
+        maths.cos(0.5 * abs(curvature) * length),
     ]
 
 
@@ -163,7 +166,7 @@ def cast(
     x, y, yaw = pose
     n = reach.shape[0]
     rays = angles.shape[0]
-    dx, dy = np.cos(yaw - angles), np.sin(yaw - angles)
+    ahead = maths.directions(yaw - angles)
     out[:] = RANGE
     for step in range(-reach[segment, 0], reach[segment, 1] + 1):
         at = (segment + step) % n
@@ -171,7 +174,7 @@ def cast(
             shape = shapes[index]
             for ray in range(rays):
                 if shape[RADIUS] == 0.0:
-                    distance = _hit_line(shape, x, y, dx[ray], dy[ray])
+                    distance = _hit_line(shape, x, y, ahead[ray, 0], ahead[ray, 1])
                 else:
-                    distance = _hit_arc(shape, x, y, dx[ray], dy[ray])
+                    distance = _hit_arc(shape, x, y, ahead[ray, 0], ahead[ray, 1])
                 out[ray] = min(out[ray], distance)

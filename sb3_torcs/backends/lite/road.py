@@ -6,6 +6,7 @@ import math
 
 from numba import njit
 
+from sb3_torcs import maths
 from sb3_torcs.car import FloatArray as Floats
 from sb3_torcs.tracks import track as column
 
@@ -71,8 +72,9 @@ def project(track: Floats, segment: int, x: float, y: float) -> tuple[int, float
     for _ in range(n):
         dx, dy = x - track[segment, column.X], y - track[segment, column.Y]
         heading, curvature = track[segment, column.HEADING], track[segment, column.CURVATURE]
-        ahead = dx * math.cos(heading) + dy * math.sin(heading)
-        left = dy * math.cos(heading) - dx * math.sin(heading)
+        cosine, sine = maths.cos_sin(heading)
+        ahead = dx * cosine + dy * sine
+        left = dy * cosine - dx * sine
         if curvature == 0.0:
             along, offset = ahead, left
         else:
@@ -81,7 +83,7 @@ def project(track: Floats, segment: int, x: float, y: float) -> tuple[int, float
             inward = radius - side * left  # from the centre of the arc towards the start
             # Measured from the middle of the arc, so that one of more than half a turn works too.
             half = 0.5 * abs(curvature) * track[segment, column.LENGTH]
-            along = (wrap(math.atan2(ahead, inward) - half) + half) * radius
+            along = (wrap(maths.atan2(ahead, inward) - half) + half) * radius
             offset = side * (radius - math.sqrt(ahead * ahead + inward * inward))
         if along < 0.0:
             segment = (segment - 1) % n

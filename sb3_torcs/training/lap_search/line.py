@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from sb3_torcs import maths
 from sb3_torcs.car import CarState, Controls, FloatArray
 
 __all__ = ["PEDAL", "STEERING", "Line", "blended", "lap_of", "repeated", "waypoint"]
@@ -98,7 +99,7 @@ def _speed_worth(rows: FloatArray) -> FloatArray:
     for index in range(len(rows) - 2, -1, -1):
         if accelerates[index]:
             left[index] = left[index + 1] + rows[index + 1, TIME] - rows[index, TIME]
-    lasts = FADING * (1.0 - np.exp(-left / FADING)) + LEAST_FADING
+    lasts = FADING * (1.0 - maths.exps(-left / FADING)) + LEAST_FADING
     worth: FloatArray = lasts / np.maximum(rows[:, SPEED], SLOWEST)
     return worth
 

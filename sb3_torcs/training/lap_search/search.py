@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from sb3_torcs import maths
 from sb3_torcs.agents.ghosts import Ghost
 from sb3_torcs.backends.native import make_engine, make_rollouts
 from sb3_torcs.car import CONTROL_TICK, DEFAULT_CAR, RESTING, FloatArray
@@ -48,8 +49,9 @@ BACK = 4  # strides to go back from a dead end
 CAREFUL = 8  # strides that are then driven with caution
 MOST_DEAD_ENDS = 30  # per race
 SPREAD = np.array([0.15, 0.8, 1.5])  # of steering [-], pedal [-] and place [m]
-SHORTEST, LONGEST = 0.2, 2.0  # [s] of one change
-SMALLEST = 0.1  # of the spread: how small changes can be
+SHORTEST = 0.2  # [s] of one change
+LONGEST = 2.302585092994046  # logarithm of how much longer the longest is: ten times
+SMALLEST = -2.302585092994046  # logarithm of how small changes can be: a tenth of the spread
 FAILED = -100.0  # [s] that a candidate has won that leaves the road
 
 
@@ -246,10 +248,11 @@ class LapSearch:
         for change in changes:
             for _ in range(draw.integers(1, 4)):
                 kind = draw.integers(3)
-                lasts = math.exp(draw.uniform(math.log(SHORTEST), math.log(LONGEST)))
+                lasts = SHORTEST * maths.exp(draw.uniform(0.0, LONGEST))
                 share = (seconds - draw.uniform(-0.3 * lasts, WINDOW)) / lasts
-                height = SPREAD[kind] * draw.normal() * SMALLEST ** draw.uniform()
-                change[:, kind] += height * np.sin(np.pi * np.clip(share, 0.0, 1.0))
+                height = SPREAD[kind] * draw.normal() * maths.exp(draw.uniform(SMALLEST, 0.0))
+                rise = maths.directions(np.pi * np.clip(share, 0.0, 1.0))[:, 1]
+                change[:, kind] += height * rise
         return changes
 
     # ---- What was found ---------------------------------------------------------------------
