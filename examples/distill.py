@@ -121,9 +121,9 @@ def _policy(name: str) -> ActorCriticPolicy:
     """Load the policy of a teacher."""
     file = find_model(name)
     if told_algorithm(saved_data(file)) != "ppo":
-        raise SystemExit(f"{name} is no model of PPO; give one, e.g. ppo-roads")
+        raise SystemExit(f"{name} is no model of PPO; give one, e.g. ppo-any-road")
     if driver_record(name).env_kwargs.get("action") != "pedal":
-        raise SystemExit(f'{name} does not drive with action="pedal"; give one, e.g. ppo-roads')
+        raise SystemExit(f'{name} does not drive with action="pedal"; give one, e.g. ppo-any-road')
     refuse_frames(name)
     return PPO.load(file, device="cpu").policy
 
@@ -132,7 +132,7 @@ def refuse_frames(name: str) -> None:
     """Refuse an agent that sees several timesteps at once, which a school does not show."""
     frames = frames_of(driver_record(name).hyperparameters) or 1
     if frames > 1:
-        raise SystemExit(f"{name} sees {frames} timesteps at once; give another, e.g. ppo-roads")
+        raise SystemExit(f"{name} sees {frames} timesteps at once; give another, e.g. ppo-any-road")
 
 
 def teach(model: PPO, school: School, args: argparse.Namespace) -> None:

@@ -62,7 +62,7 @@ TOGETHER = Settings(
 )  # fmt: skip
 
 parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-parser.add_argument("driver", help="a model of PPO to go on from, such as ppo-roads")
+parser.add_argument("driver", help="a model of PPO to go on from, such as ppo-any-road")
 parser.add_argument("--track", nargs="+", required=True, help="one, or several")
 parser.add_argument(
     "--together", action="store_true", help="learn all tracks at once, and save one model"
@@ -119,16 +119,16 @@ def go_on(args: argparse.Namespace, tracks: list[str], settings: Settings) -> Pa
     """Go on learning, and return the model's file."""
     file = find_model(args.driver)
     if told_algorithm(saved_data(file)) != "ppo":
-        raise SystemExit(f"{args.driver} is no model of PPO; give one, e.g. ppo-roads")
+        raise SystemExit(f"{args.driver} is no model of PPO; give one, e.g. ppo-any-road")
     trained = driver_record(args.driver).env_kwargs
     if trained.get("action") != "pedal":
         raise SystemExit(
-            f'{args.driver} does not drive with action="pedal"; give one, e.g. ppo-roads'
+            f'{args.driver} does not drive with action="pedal"; give one, e.g. ppo-any-road'
         )
     frames = frames_of(driver_record(args.driver).hyperparameters) or 1
     if frames > 1:
         raise SystemExit(
-            f"{args.driver} sees {frames} timesteps at once; give another, e.g. ppo-roads"
+            f"{args.driver} sees {frames} timesteps at once; give another, e.g. ppo-any-road"
         )
     env_kwargs = {name: value for name, value in trained.items() if name not in NOT_DRIVING}
     env_kwargs["track"] = tracks if len(tracks) > 1 else tracks[0]

@@ -149,7 +149,7 @@ parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
 parser.add_argument("--track", nargs="+", default=["aalborg"], help="one, or several")
 parser.add_argument("--alone", type=int, help="timesteps without other cars")
 parser.add_argument("--robots", type=int, default=6_000_000, help="timesteps in races")
-parser.add_argument("--driver", help="model that drives alone, to go on from, such as ppo-roads")
+parser.add_argument("--driver", help="model that drives alone, to go on from, such as ppo-any-road")
 parser.add_argument("--racer", help="model that races, to go on from, such as ppo-racer")
 parser.add_argument("--ancestor", help="model to go on from, and to race against")
 parser.add_argument(

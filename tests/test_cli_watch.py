@@ -95,9 +95,9 @@ def test_two_side_by_side_are_on_one_track(monkeypatch):
     recorded = []
     monkeypatch.setattr(watching, "record_shows", lambda shows, *_, **__: recorded.extend(shows))
     words = ["--beside", "ddpg-aalborg", "--video", "both.mp4"]
-    assert main(["watch", "ddpg-league", *words]) == 0
+    assert main(["watch", "ppo-league", *words]) == 0
     assert main(["watch", "inferno", *words, "--track", "forza"]) == 0
-    assert main(["watch", "bt", "--beside", "ddpg-league", "--video", "both.mp4"]) == 0
+    assert main(["watch", "bt", "--beside", "ppo-league", "--video", "both.mp4"]) == 0
     tracks = [show.track for show in recorded]
     assert tracks == ["corkscrew"] * 2 + ["forza"] * 2 + ["corkscrew"] * 2
     assert [show.race.car for show in recorded[:2]] == ["car1-ow1", "car1-trb1"]

@@ -12,9 +12,10 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+from made_agents import copied_agent
 from stable_baselines3 import PPO
 
-from sb3_torcs.agents.models import AGENTS, driver_record, find_model, shipped_agents
+from sb3_torcs.agents.models import AGENTS, driver_record, find_model
 from sb3_torcs.agents.saved.file import learned_weights, saved_weights
 from sb3_torcs.agents.saved.writing import RecordCallback
 from sb3_torcs.callbacks.lines import DrivenLap, driven_laps
@@ -101,7 +102,7 @@ def test_a_careful_racer_goes_on_without_the_decay(monkeypatch, tmp_path, game):
         assert policy.optimizer.param_groups[0]["weight_decay"] == expected
 
 
-@pytest.mark.parametrize("driver", ["ppo-roads", "ppo-any-road", "ppo-post"])
+@pytest.mark.parametrize("driver", ["ppo-aalborg", "ppo-any-road", "ppo-post"])
 def test_a_racer_goes_on_from_a_driver_that_never_saw_a_car(
     driver, monkeypatch, capsys, tmp_path, game
 ):
@@ -131,13 +132,15 @@ def test_a_racer_races_against_its_ancestor(ancestor, monkeypatch, tmp_path, gam
 
 
 def test_a_racer_needs_a_driver_with_one_pedal(monkeypatch, tmp_path, game):
-    with pytest.raises(SystemExit, match="'ddpg-roads' drives with action=\"pedals\"; take a"):
-        run(monkeypatch, "train_racer.py", "--driver=ddpg-roads", "--folder", str(tmp_path))
+    with pytest.raises(SystemExit, match="'ddpg-aalborg' drives with action=\"pedals\"; take a"):
+        run(monkeypatch, "train_racer.py", "--driver=ddpg-aalborg", "--folder", str(tmp_path))
 
 
 def test_a_racer_needs_a_driver_that_sees_one_timestep(monkeypatch, tmp_path, game):
+    """Or the sensors that its record says."""
+    agent = copied_agent("ppo-any-road", tmp_path / "agent.zip", sensors=["base"])
     with pytest.raises(SystemExit, match="sees several timesteps at once, or"):
-        run(monkeypatch, "train_racer.py", "--driver=ppo-robust", "--folder", str(tmp_path))
+        run(monkeypatch, "train_racer.py", "--driver", agent, "--folder", str(tmp_path))
 
 
 def test_a_racer_needs_a_driver_with_its_policy(monkeypatch, tmp_path, game):
@@ -150,12 +153,12 @@ def test_a_racer_needs_a_driver_with_its_policy(monkeypatch, tmp_path, game):
 
 
 def test_specialists_teach_one_student(monkeypatch, capsys, tmp_path, game):
-    words = ["ppo-roads", "--track", "forza", "--timesteps=1", "--folder", str(tmp_path)]
+    words = ["ppo-any-road", "--track", "forza", "--timesteps=1", "--folder", str(tmp_path)]
     run(monkeypatch, "specialize.py", *words)
     specialist = str(tmp_path / "forza.zip")
     assert f"sb3-torcs evaluate {specialist}" in capsys.readouterr().out
-    both = f"{specialist},ppo-roads"
-    teaching = ["--teach", both, "forza", "--teach", "ppo-roads", "aalborg", "eroad"]
+    both = f"{specialist},ppo-any-road"
+    teaching = ["--teach", both, "forza", "--teach", "ppo-any-road", "aalborg", "eroad"]
     budget = ["--rounds=1", "--lessons=1", "--cars=1", "--folder", str(tmp_path / "student")]
     run(monkeypatch, "distill.py", *teaching, "--mirror", "--grip=0.85", *budget)
     student = tmp_path / "student" / "model.zip"
@@ -164,18 +167,20 @@ def test_specialists_teach_one_student(monkeypatch, capsys, tmp_path, game):
 
 
 @pytest.mark.parametrize("words", [
-    ["specialize.py", "ppo-robust", "--track", "forza"],
-    ["distill.py", "--teach", "ppo-robust", "forza"],
-    ["distill.py", "--teach", "ppo-roads", "forza", "--student", "ppo-robust"],
+    ["specialize.py", "agent.zip", "--track", "forza"],
+    ["distill.py", "--teach", "agent.zip", "forza"],
+    ["distill.py", "--teach", "ppo-any-road", "forza", "--student", "agent.zip"],
 ])  # fmt: skip
 def test_an_agent_that_sees_several_timesteps_is_refused(words, monkeypatch, tmp_path, game):
-    with pytest.raises(SystemExit, match="ppo-robust sees 4 timesteps at once; give another"):
+    monkeypatch.chdir(tmp_path)
+    copied_agent("ppo-any-road", "agent.zip", frame_stack=4)
+    with pytest.raises(SystemExit, match=r"agent\.zip sees 4 timesteps at once; give another"):
         run(monkeypatch, *words, "--folder", str(tmp_path))
 
 
 def test_teachers_of_different_cars_are_refused(monkeypatch, tmp_path, game):
-    words = ["--teach", "ppo-league", "corkscrew", "--teach", "ppo-roads", "forza"]
-    with pytest.raises(SystemExit, match=r"ppo-roads drives with .*'car1-trb1'.*'car1-ow1'"):
+    words = ["--teach", "ppo-league", "corkscrew", "--teach", "ppo-everywhere", "forza"]
+    with pytest.raises(SystemExit, match=r"ppo-everywhere drives with .*'car1-trb1'.*'car1-ow1'"):
         run(monkeypatch, "distill.py", *words, "--folder", str(tmp_path))
 
 
@@ -208,8 +213,9 @@ def test_a_student_that_sees_less_goes_on_learning_on_its_tracks_together(
 @pytest.fixture
 def asked(tmp_path, monkeypatch):
     """What the scripts ask of commands that only write it down."""
+    monkeypatch.chdir(tmp_path)
     asked = tmp_path / "asked"
-    for name in ("python", "sb3-torcs"):
+    for name in ("python", "sb3-torcs", "git", "tar"):
         command = tmp_path / name
         command.write_text(f'#!/bin/sh\necho "$@" >> {asked}\n')
         command.chmod(0o755)
@@ -219,12 +225,18 @@ def asked(tmp_path, monkeypatch):
 
 def test_everywhere_teaches_by_models_that_are_there_or_were_made_before(asked):
     subprocess.run(["sh", EXAMPLES / "everywhere.sh"], check=True)
-    made = set()
-    for call in asked.read_text().splitlines():
+    first, second, *calls = asked.read_text().splitlines()
+    assert {first, second} == {
+        "archive 70f23c0 sb3_torcs/agents", "-x -C logs/retired --strip-components 2"
+    }  # fmt: skip
+    retired = ("ppo-dirt", "ppo-dirt-2", "ppo-ole-road-1", "ppo-roads")
+    made = {f"logs/retired/{name}/best_model.zip" for name in retired}
+    for call in calls:
         options = [option.split() for option in call.split(" --")]
         given = {name: values for name, *values in options}
         needed = {values[0] for name, *values in options if name in ("teach", "student")}
-        assert needed <= made | set(shipped_agents())
+        needed |= {words[1] for words in options if words[0].endswith("specialize.py")}
+        assert needed <= made
         (folder,) = given["folder"]
         made |= {f"{folder}/{track}.zip" for track in given.get("track", ["model"])}
     assert sum("specialists" in model for model in made) == 22
@@ -258,11 +270,11 @@ def test_students_for_any_road_learn_from_the_models_of_the_study(asked):
 
 
 def test_tracks_are_driven_and_compared_with_robots(tmp_path, game):
-    program = [sys.executable, EXAMPLES / "evaluate_tracks.py", "ppo-roads", "--jobs=1"]
+    program = [sys.executable, EXAMPLES / "evaluate_tracks.py", "ppo-everywhere", "--jobs=1"]
     words = ["--track", "michigan", "g-track-1", "aalborg", "--without", "aalborg"]
     done = subprocess.run([*program, *words], capture_output=True, text=True, check=True)
     assert re.search(r"^michigan +3 ", done.stdout, re.MULTILINE)
-    assert "ppo-roads: completes 2 of 2, 2 without damage; median gap" in done.stdout
+    assert "ppo-everywhere: completes 2 of 2, 2 without damage; median gap" in done.stdout
 
 
 def test_on_a_random_road_the_robots_drive_first(monkeypatch, tmp_path, game):
@@ -277,9 +289,9 @@ def test_on_a_random_road_the_robots_drive_first(monkeypatch, tmp_path, game):
 
 
 @pytest.mark.parametrize(("name", "words", "message"), [
-    ("specialize.py", ["ddpg-roads", "--track", "forza"], "ddpg-roads is no model of PPO"),
-    ("distill.py", ["--teach", "ddpg-roads", "forza"], "ddpg-roads is no model of PPO"),
-    ("distill.py", ["--teach", "ppo-roads"], "ppo-roads teaches nowhere"),
+    ("specialize.py", ["ddpg-aalborg", "--track", "forza"], "ddpg-aalborg is no model of PPO"),
+    ("distill.py", ["--teach", "ddpg-aalborg", "forza"], "ddpg-aalborg is no model of PPO"),
+    ("distill.py", ["--teach", "ppo-any-road"], "ppo-any-road teaches nowhere"),
 ])  # fmt: skip
 def test_who_cannot_teach_is_told_so(name, words, message, monkeypatch, tmp_path, game):
     with pytest.raises(SystemExit, match=message):
@@ -319,7 +331,7 @@ def test_a_wrong_name_ends_a_script_in_a_line(script, words, monkeypatch, tmp_pa
 
 
 def test_teachers_who_drive_differently_are_refused(monkeypatch, tmp_path):
-    teaching = ["--teach", "ppo-roads", "forza", "--teach", "ppo-racer", "aalborg"]
+    teaching = ["--teach", "ppo-everywhere", "forza", "--teach", "ppo-racer", "aalborg"]
     with pytest.raises(SystemExit, match="ppo-racer drives with "):
         run(monkeypatch, "distill.py", *teaching, "--folder", str(tmp_path))
 

@@ -182,7 +182,7 @@ def test_a_missing_model_is_told_the_near_miss(saved):
         models.find_model(path.parent / "TorcsLite-v00.zip")
 
 
-@pytest.mark.parametrize("name", [None, 3, b"ddpg-roads", ["ddpg-roads"]])
+@pytest.mark.parametrize("name", [None, 3, b"ddpg-aalborg", ["ddpg-aalborg"]])
 def test_what_is_no_name_of_a_model(name):
     for find in (
         models.find_model,

@@ -118,9 +118,9 @@ def test_a_driver_that_does_not_finish_alone_is_refused():
 
 
 def test_a_ghost_drives_in_the_environment_of_the_agent():
-    kwargs = ghost_environment("ddpg-roads", "forza", "155-DTM")
+    kwargs = ghost_environment("ddpg-aalborg", "forza", "155-DTM")
     assert (kwargs["track"], kwargs["car"], kwargs["laps"]) == ("forza", "155-DTM", 3)
-    kept = driver_record("ddpg-roads").env_kwargs
+    kept = driver_record("ddpg-aalborg").env_kwargs
     assert all(kwargs[name] == kept[name] for name in ("reward", "action_repeat") if name in kept)
 
 

@@ -13,12 +13,12 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import torch as th
+from made_agents import copied_agent
 from stable_baselines3 import PPO
 
 from sb3_torcs.agents.models import find_model
 from sb3_torcs.agents.pilots import Crew
 from sb3_torcs.agents.robots import race as robots_race
-from sb3_torcs.agents.saved.record import RECORD
 from sb3_torcs.agents.scripted import ScriptedDriver
 from sb3_torcs.cli import main
 from sb3_torcs.envs.aids import AIDS, aids_named
@@ -156,7 +156,7 @@ class TestGrid:
     ("drivers", "message"),
     [
         (["bt", "bt:2"], "driver 'bt' is named twice"),
-        (["ddpg-roads", "ddpg-roads"], "driver 'ddpg-roads' is named twice"),
+        (["ddpg-aalborg", "ddpg-aalborg"], "driver 'ddpg-aalborg' is named twice"),
         (["infermo"], "infermo.*and there is no robot 'infermo'; did you mean 'inferno'"),
         (["lap.npz"], "is a ghost, which looks at nobody"),
     ],
@@ -190,16 +190,16 @@ def test_races_that_cannot_be_held_are_refused_at_once(game):
 
 def test_models_of_one_file_name_are_told_apart_by_their_folders(game, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    shipped = find_model("ddpg-roads").read_bytes()
+    shipped = find_model("ddpg-aalborg").read_bytes()
     paths = ["r1/model.zip", "a/r2/model.zip", "b/r2/model.zip", "bt.zip", "r1/other.zip"]
-    paths += ["c/run/best_model.zip", "d/run/best_model.zip", "r1/ddpg-roads.zip"]
+    paths += ["c/run/best_model.zip", "d/run/best_model.zip", "r1/ddpg-aalborg.zip"]
     for path in paths:
         (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / path).write_bytes(shipped)
-    entrants = find_entrants([*paths, "bt", "ddpg-roads"], game)
+    entrants = find_entrants([*paths, "bt", "ddpg-aalborg"], game)
     assert [entrant.name for entrant in entrants] == [
         "r1/model", "a/r2/model", "b/r2/model", f"{tmp_path.name}/bt", "other",
-        "c/run", "d/run", "r1/ddpg-roads", "bt", "ddpg-roads",
+        "c/run", "d/run", "r1/ddpg-aalborg", "bt", "ddpg-aalborg",
     ]  # fmt: skip
     with pytest.raises(InvalidOption, match=r"driver 'r1/model\.zip' is named twice"):
         find_entrants(["r1/model.zip", "a/../r1/model", "bt"], game)
@@ -281,10 +281,8 @@ def test_a_policy_that_refuses_to_draw_from_no_numbers_is_out_too(game, tmp_path
 @pytest.mark.slow
 def test_a_robot_whose_car_the_physics_loses_is_out_and_the_others_race_on(game, tmp_path):
     """In this race a contact puts the robot's car nowhere, if two aids of the agent are off."""
-    model = PPO.load(find_model("ppo-racer"), device="cpu")
-    getattr(model, RECORD)["env_kwargs"].update(keep_clear=False, catch_slides=False)
-    model.save(tmp_path / "racer")
-    entrants = find_entrants(["inferno", str(tmp_path / "racer.zip")], game)
+    racer = copied_agent("ppo-racer", tmp_path / "racer.zip", keep_clear=False, catch_slides=False)
+    entrants = find_entrants(["inferno", racer], game)
     race = run_race(entrants, "aalborg", laps=3)
     assert [(one.driver, one.out) for one in race.standings] == [
         ("racer", False), ("inferno", True),
@@ -313,11 +311,13 @@ def test_no_report_is_made_of_a_race_without_a_whole_lap(capsys, game, monkeypat
     assert "report:" not in printed.out
 
 
-def test_an_agent_that_learned_alone_may_get_aids(game):
-    """``ppo-racer-roads`` is ``ppo-self-play`` with all aids: the same race to the bit."""
+def test_an_agent_that_learned_alone_may_get_aids(tmp_path, game):
+    """It races as one whose record has them, to the bit."""
+    alone = "ppo-any-road"
+    with_aids = copied_agent(alone, tmp_path / "agent.zip", **dict.fromkeys(AIDS, True))
     races = [
         run_race(find_entrants(["bt", "inferno", agent], game, aids), SHORT, laps=1)
-        for agent, aids in (("ppo-self-play", AIDS), ("ppo-racer-roads", ()), ("ppo-self-play", ()))
+        for agent, aids in ((alone, AIDS), (with_aids, ()), (alone, ()))
     ]
     aided, shipped, alone = (
         [{**standing.as_dict(), "driver": None} for standing in race.standings] for race in races

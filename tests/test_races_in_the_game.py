@@ -39,7 +39,7 @@ def told(race):
 
 
 @pytest.mark.parametrize("drivers", [
-    ["bt", "inferno", "tita"], ["inferno", "ddpg-roads", "bt", "scripted"],
+    ["bt", "inferno", "tita"], ["inferno", "ddpg-aalborg", "bt", "scripted"],
 ])  # fmt: skip
 def test_engine_and_game_come_to_the_same_standings(drivers, game, alone):
     """Cars touch in the second one, and the agents are the game's clients."""
@@ -50,7 +50,7 @@ def test_engine_and_game_come_to_the_same_standings(drivers, game, alone):
 
 
 def test_each_agent_has_the_car_of_its_training(game):
-    order = find_entrants(["scripted", "bt", "ddpg-roads"], game)
+    order = find_entrants(["scripted", "bt", "ddpg-aalborg"], game)
     order[2].agent.car = "car1-ow1"
     assert told(run_game_race(order, TRACK, laps=1)) == as_the_game_tells(
         run_race(order, TRACK, laps=1)
@@ -134,7 +134,7 @@ def after_a_while(monkeypatch):
 def test_an_agent_that_answers_no_number_ends_the_race(after_a_while, game, alone):
     after_a_while(lambda action: action * float("nan"))
     with pytest.raises(InvalidAction, match="steering is nan"):
-        run_game_race(find_entrants(["scripted", "bt", "ddpg-roads"], game), TRACK, laps=1)
+        run_game_race(find_entrants(["scripted", "bt", "ddpg-aalborg"], game), TRACK, laps=1)
     assert list(alone.iterdir()) == []
 
 

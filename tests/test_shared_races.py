@@ -689,7 +689,7 @@ def speed_on(car):
 class TestAgentsAsOpponents:
     def test_they_drive_as_they_were_trained(self, make):
         """Off the grid in the first seconds, while the other agent stands on its brake."""
-        envs = make(1, 1, opponents=["ddpg-roads"], grid_place=2, track="aalborg")
+        envs = make(1, 1, opponents=["ddpg-aalborg"], grid_place=2, track="aalborg")
         (backend,) = envs.get_attr("seat")
         engine = backend.world.engine
         envs.seed(0)
@@ -718,7 +718,7 @@ class TestAgentsAsOpponents:
 
     def test_they_need_the_same_timestep(self):
         with pytest.raises(InvalidOption, match=r"action_repeat is 3, .* were trained with 5"):
-            make_race(2, opponents=["ddpg-roads"], action_repeat=3)
+            make_race(2, opponents=["ddpg-aalborg"], action_repeat=3)
 
     def test_one_environment_against_them_is_a_vector_of_one(self, make):
         """To the bit; also as one of a vector, and where each control tick is noted."""
