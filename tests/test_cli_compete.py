@@ -84,7 +84,9 @@ def test_an_agent_of_whose_sensors_the_server_tells_too_little_is_told_what_else
     assert main(words) == 2
     err = capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
-    assert re.search(r"'(ppo-[\w-]+)' drives with '\w+'.* tells too little; `sb3-torcs race \1 ", err)
+    assert re.search(
+        r"'(ppo-[\w-]+)' drives with '\w+'.* tells too little; `sb3-torcs race \1 ", err
+    )
 
 
 def test_a_server_that_is_not_there_is_told(monkeypatch, capsys):

@@ -360,10 +360,10 @@ def test_the_zoo_may_search_hyperparameters(capsys, tmp_path):
 
 
 def test_a_search_that_the_zoo_cannot_make_is_told(capsys, tmp_path):
-    words = ["train", "--algo", "crossq", "--folder", str(tmp_path), "--timesteps", "30"]
-    assert main([*words, "--no-progress", "--", "-optimize"]) == 2
+    words = [*words_of(tmp_path, n_timesteps=30), "--algo", "crossq", "--", "-optimize"]
+    assert main(words) == 2
     assert "cannot search hyperparameters of crossq; it can of: a2c" in capsys.readouterr().err
-    assert list((tmp_path / "crossq").iterdir()) == []
+    assert list((tmp_path / "logs" / "crossq").iterdir()) == []
 
 
 def test_a_search_that_was_ended_before_its_first_trial_is_told(monkeypatch, tmp_path):

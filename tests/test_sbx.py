@@ -1,11 +1,11 @@
-"""Algorithms of SBX. A module in its place serves sb3-contrib's, which take the same arguments."""
+"""Algorithms of SBX. A module in its place serves SB3's, which take the same arguments."""
 
 import sys
 import types
 
 import pytest
-import sb3_contrib
 from rl_zoo3.utils import ALGOS
+from stable_baselines3 import SAC
 
 from sb3_torcs.agents import models
 from sb3_torcs.agents.saved.algorithm import algorithm_class
@@ -17,33 +17,33 @@ from sb3_torcs.training import zoo
 
 @pytest.fixture
 def sbx(monkeypatch):
-    """A policy of this SBX is one of sb3-contrib's TQC; all other policies are not."""
-    base = types.SimpleNamespace(BaseJaxPolicy=sb3_contrib.TQC.policy_aliases["MlpPolicy"])
-    monkeypatch.setitem(sys.modules, "sbx", types.SimpleNamespace(TQC=sb3_contrib.TQC))
+    """A policy of this SBX is one of SB3's SAC; all other policies are not."""
+    base = types.SimpleNamespace(BaseJaxPolicy=SAC.policy_aliases["MlpPolicy"])
+    monkeypatch.setitem(sys.modules, "sbx", types.SimpleNamespace(SAC=SAC))
     monkeypatch.setitem(sys.modules, "sbx.common.policies", base)
     yield
-    ALGOS.pop("sbx_tqc", None)
+    ALGOS.pop("sbx_sac", None)
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("sbx")
 def test_it_trains_by_the_shipped_entry(capsys, tmp_path):
-    words = ["train", "--algo", "sbx_tqc", "--timesteps", "40", "--no-progress"]
+    words = ["train", "--algo", "sbx_sac", "--timesteps", "40", "--no-progress"]
     assert (
         main([*words, "--folder", str(tmp_path), "--", "--hyperparams", "learning_starts:20"]) == 0
     )
     out = capsys.readouterr().out
     assert out.rstrip().endswith("--env TorcsLite-v0 --track aalborg --trust")
-    record = models.training_record(tmp_path / "sbx_tqc" / "TorcsLite-v0_1" / "TorcsLite-v0.zip")
-    assert record.algo == "sbx_tqc"
+    record = models.training_record(tmp_path / "sbx_sac" / "TorcsLite-v0_1" / "TorcsLite-v0.zip")
+    assert record.algo == "sbx_sac"
 
 
 @pytest.mark.usefixtures("sbx")
 def test_an_unknown_algorithm_of_it_is_told():
     with pytest.raises(
-        InvalidOption, match="SBX has no algorithm 'sbx_tq'; did you mean 'sbx_tqc'"
+        InvalidOption, match="SBX has no algorithm 'sbx_sa'; did you mean 'sbx_sac'"
     ):
-        algorithm_class("sbx_tq")
+        algorithm_class("sbx_sa")
 
 
 def test_without_it_the_package_is_named(monkeypatch):
@@ -61,14 +61,14 @@ def test_without_it_the_package_is_named(monkeypatch):
     ],
 )
 def test_what_is_of_pytorch_is_refused(change, named):
-    path = zoo.config_file("sbx_tqc")
+    path = zoo.config_file("sbx_sac")
     entry = {**zoo.read_entry(path, "Torcs-v0"), **change}
     with pytest.raises(ZooConfigError, match=f"{named} is of PyTorch, and SBX computes with JAX"):
-        zoo.check_entry(entry, "sbx_tqc", "Torcs-v0", zoo.Place(path, "Torcs-v0"))
+        zoo.check_entry(entry, "sbx_sac", "Torcs-v0", zoo.Place(path, "Torcs-v0"))
 
 
 def test_a_study_refuses_it(tmp_path):
     file = tmp_path / "study.yml"
-    file.write_text("name: s\nseeds: 1\neval_interval: 100\nalgo: sbx_tqc\n")
-    with pytest.raises(StudyError, match="give tqc, or type: sb3-torcs train --algo sbx_tqc"):
+    file.write_text("name: s\nseeds: 1\neval_interval: 100\nalgo: sbx_sac\n")
+    with pytest.raises(StudyError, match="give sac, or type: sb3-torcs train --algo sbx_sac"):
         read_study(file)

@@ -45,16 +45,21 @@ def test_a_file_is_shipped_for_ddpg():
 @pytest.mark.parametrize(("path", "name"), ENTRIES, ids=lambda part: getattr(part, "stem", part))
 def test_everything_in_the_shipped_files_is_read_by_something(path, name):
     """A key that nothing reads, a class that does not import, an argument that is not there."""
-    env_id = name if name in gym.registry else "Torcs-v0"
-    zoo.check_entry(zoo.read_entry(path, name), path.stem, env_id, zoo.Place(path, name))
+    for env_id in zoo.OURS if name == "default" else [name if name in zoo.OURS else "Torcs-v0"]:
+        zoo.check_entry(zoo.read_entry(path, name), path.stem, env_id, zoo.Place(path, name))
+
+
+def test_the_entries_are_few():
+    """Each is one more recipe that has to be kept true."""
+    assert len(ENTRIES) <= 12
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
 def test_each_shipped_file_has_an_entry_for_both_environments(path):
     """Other entries are named in words, so that they cannot be taken for an id."""
+    assert all(zoo.read_entry(path, env_id) for env_id in zoo.OURS)
     names = set(zoo.read_config(path))
-    assert names >= {"TorcsLite-v0", "Torcs-v0"}
-    assert [name for name in names - {"TorcsLite-v0", "Torcs-v0"} if "-v" in name] == []
+    assert [name for name in names - set(zoo.OURS) if "-v" in name] == []
 
 
 @pytest.mark.parametrize(("path", "name"), ENTRIES, ids=lambda part: getattr(part, "stem", part))
@@ -84,11 +89,15 @@ def test_the_entry_called_default_is_for_every_environment(tmp_path):
     path = tmp_path / "own.yml"
     path.write_text(yaml.safe_dump({"default": MINIMAL}))
     assert zoo.read_entry(path, "TorcsLite-v0") == MINIMAL
+    with pytest.raises(ZooConfigError, match="has no entry 'open'; it has: default"):
+        zoo.read_entry(path, "open")
 
 
 def test_an_algorithm_without_a_file_is_told_what_to_do():
     with pytest.raises(ZooConfigError, match=r"'dddpg'; did you mean 'ddpg'\? .*--conf-file"):
         zoo.config_file("dddpg")
+    with pytest.raises(ZooConfigError, match=r"changed copy of .*sac\.yml: --conf-file FILE\.yml$"):
+        zoo.config_file("tqc")
 
 
 def test_a_missing_file_is_named(tmp_path):

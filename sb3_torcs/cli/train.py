@@ -39,8 +39,8 @@ def add_parser(subparsers: Any) -> None:
     add = parser.add_argument
     add(
         "--algo",
-        help="ddpg (default), td3, sac, tqc, crossq or ppo; with SBX also sbx_sac, sbx_tqc, "
-        "sbx_crossq; others of the zoo with a --conf-file",
+        help="ddpg (default), td3, sac, a2c or ppo; with SBX also sbx_sac; others of the zoo with "
+        "a --conf-file",
     )
     add("--env", metavar="ID", help="Torcs-v0, or by default TorcsLite-v0")
     add("--entry", metavar="NAME", help='block of the hyperparameter file, e.g. "as the post"; '

@@ -135,7 +135,10 @@ def config_file(
         from rl_zoo3 import ALGOS
 
         known = sorted(file.stem for file in shipped_folder().glob("*.yml"))
-        advice = f"shipped: {', '.join(known)}; for another one give a file: {option}"
+        advice = (
+            f"shipped: {', '.join(known)}; for another one give a file of your own, such as a "
+            f"changed copy of {shipped_folder() / 'sac.yml'}: {option}"
+        )
         raise ZooConfigError(
             f"no hyperparameters are shipped for the algorithm '{algo}'"
             f"{near_miss(algo, () if algo in ALGOS else known, advice)}"
@@ -174,11 +177,11 @@ def read_entry(path: Path, name: str) -> Entry:
 
     :param path: of a YAML file
     :param name: of the entry: an environment's id, or what the file calls it
-    :return: the entry
+    :return: the entry; that called ``default`` is of every environment without one of its own
     :raises ZooConfigError: if the file has no such entry
     """
     entries = read_config(path)
-    if name not in entries and "default" in entries:
+    if name in gym.registry and name not in entries and "default" in entries:
         name = "default"
     if name not in entries:
         raise ZooConfigError(f"{path} has no entry '{name}'{told_entries(name, entries, path)}")

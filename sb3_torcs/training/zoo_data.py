@@ -115,8 +115,8 @@ def check_jax(policy: Any, policy_kwargs: Any, place: str) -> None:
     named = "policy" if not issubclass(policy, base) else "policy_kwargs"
     if named == "policy" or isinstance(policy_kwargs, str):
         raise ZooConfigError(
-            f"{place}: {named} is of PyTorch, and SBX computes with JAX; the shipped entries for "
-            "it are those of sac, tqc and crossq; for others give a file of your own: --conf-file"
+            f"{place}: {named} is of PyTorch, and SBX computes with JAX; the shipped entry for "
+            "it is that of sac; for others give a file of your own: --conf-file"
         )
 
 
