@@ -365,7 +365,7 @@ def test_a_command_in_the_docs_parses_and_names_what_exists(page, line, parsed, 
         case ["make", target, *_]:
             assert target in TARGETS
         case ["python" | "sh", script, *_]:
-            assert (ROOT / script).is_relative_to(ROOT / "examples")
+            assert (ROOT / script).parent in (ROOT / "examples", ROOT / "tools")
             assert (ROOT / script).is_file()
         case ["pip", "install", what] | ["SB3_TORCS_WITHOUT_ENGINE=1", "pip", "install", what]:
             assert what in (".", *(f".[{extra}]" for extra in EXTRAS))
@@ -441,7 +441,10 @@ NOT_IN_THE_PACKAGE = {  # Python's, Gymnasium's, SB3's, PyTorch's, the game's
     "learn", "predict", "render", "reset", "env_method", "make", "load", "set_num_threads",
     "parameters",
 }  # fmt: skip
-FILE = r"[\w./-]+\.(?:py|h|cpp|md|yml|csv|sha256|webp)|(?:sb3_torcs|native|examples|tests)/[\w/]*"
+FILE = (
+    r"[\w./-]+\.(?:py|h|cpp|md|yml|csv|sha256|webp)"
+    r"|(?:sb3_torcs|native|examples|tools|tests)/[\w/]*"
+)
 DOTTED = r"(sb3_torcs(?:\.\w+)+)\b(?!/).*"
 NAME = r"(?:[a-z]\w*\.)*(?:([A-Z]\w*[a-z]\w*)(?:\.\w+)?(?:\(.*\))?|([a-z]\w*)\(.*\))"
 
@@ -481,7 +484,8 @@ def known_flags():
     for verb in verbs.choices.values():
         known |= {option for action in verb._actions for option in action.option_strings}
     zoo_train = Path(importlib.util.find_spec("rl_zoo3.train").origin)
-    for path in [zoo_train, *(ROOT / "examples").glob("*.py")]:
+    scripts = [path for folder in ("examples", "tools") for path in (ROOT / folder).glob("*.py")]
+    for path in [zoo_train, *scripts]:
         known |= set(re.findall(r"\"(--[\w-]+)\"", path.read_text("utf-8")))
     return known
 

@@ -1,4 +1,4 @@
-"""Every example runs as it stands, with a budget of seconds; the demo keeps its promises."""
+"""Every example and tool runs as it stands, in seconds; the demo keeps its promises."""
 
 import importlib.util
 import json
@@ -26,12 +26,14 @@ from sb3_torcs.races.entrants import find_entrants
 from sb3_torcs.studies.config import read_study
 from sb3_torcs.training import zoo
 
-EXAMPLES = Path(__file__).parent.parent / "examples"
+ROOT = Path(__file__).parent.parent
+EXAMPLES, TOOLS = ROOT / "examples", ROOT / "tools"
 
 
 def run(monkeypatch, name, *words):
     monkeypatch.setattr(sys, "argv", [name, *words])
-    return runpy.run_path(str(EXAMPLES / name), run_name="__main__")
+    folder = EXAMPLES if (EXAMPLES / name).exists() else TOOLS
+    return runpy.run_path(str(folder / name), run_name="__main__")
 
 
 def test_the_growth_is_drawn_from_what_was_measured(monkeypatch, capsys, tmp_path):
@@ -224,7 +226,7 @@ def asked(tmp_path, monkeypatch):
 
 
 def test_everywhere_teaches_by_models_that_are_there_or_were_made_before(asked):
-    subprocess.run(["sh", EXAMPLES / "everywhere.sh"], check=True)
+    subprocess.run(["sh", TOOLS / "everywhere.sh"], check=True)
     first, second, *calls = asked.read_text().splitlines()
     assert {first, second} == {
         "archive 70f23c0 sb3_torcs/agents", "-x -C logs/retired --strip-components 2"
@@ -245,7 +247,7 @@ def test_everywhere_teaches_by_models_that_are_there_or_were_made_before(asked):
 
 def test_agents_of_the_29_numbers_go_on_from_a_student(asked):
     """Three of them, two at a time, which then drive all roads and ovals."""
-    subprocess.run(["sh", EXAMPLES / "post_roads.sh"], check=True)
+    subprocess.run(["sh", TOOLS / "post_roads.sh"], check=True)
     first, *going_on, learned, unseen, ovals = asked.read_text().splitlines()
     assert "distill.py --teach ppo-any-road aalborg " in first
     assert first.endswith("--folder logs/post-roads/student")
@@ -258,7 +260,7 @@ def test_agents_of_the_29_numbers_go_on_from_a_student(asked):
 
 
 def test_students_for_any_road_learn_from_the_models_of_the_study(asked):
-    subprocess.run(["sh", EXAMPLES / "any_road.sh"], check=True)
+    subprocess.run(["sh", TOOLS / "any_road.sh"], check=True)
     study, *calls = asked.read_text().splitlines()
     folder = study.rpartition(" ")[2]
     trials = read_study(EXAMPLES / "studies" / "open_roads.yml").trials
@@ -356,7 +358,7 @@ def test_the_scripted_driver_laps_a_track(monkeypatch, capsys):
 
 def test_the_soak_of_robots_finds_nothing():
     words = "--robots inferno,bt --tracks alpine-1,dirt-1 --starts 3 --seconds 2 --together"
-    program = [sys.executable, EXAMPLES / "soak_robots.py", *words.split(), "--processes", "1"]
+    program = [sys.executable, TOOLS / "soak_robots.py", *words.split(), "--processes", "1"]
     soaked = subprocess.run(program, capture_output=True, text=True, check=False)
     assert soaked.returncode == 0, soaked.stdout
     assert soaked.stdout.startswith("6 starts: 0 crashed")

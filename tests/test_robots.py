@@ -1,6 +1,6 @@
 """The engine drives as the game does: every time to the millisecond, every damage.
 
-This is a choice that takes seconds; ``examples/compare_with_game.py`` compares them all.
+This is a choice that takes seconds; ``tools/compare_with_game.py`` compares them all.
 """
 
 from __future__ import annotations

@@ -51,7 +51,7 @@ from sb3_torcs.tracks.catalogue import load_track
 pytestmark = pytest.mark.usefixtures("game")
 
 STRAIGHT_ON = Controls(0.0, 0.5, 0.0)
-COMPARE = runpy.run_path(str(Path(__file__).parent.parent / "examples" / "compare_scr.py"))
+COMPARE = runpy.run_path(str(Path(__file__).parent.parent / "tools" / "compare_scr.py"))
 
 
 def rng():

@@ -29,7 +29,7 @@ from sb3_torcs.scr.protocol import (
     plain_name,
 )
 
-FUZZ = runpy.run_path(str(Path(__file__).parent.parent / "examples" / "fuzz_scr.py"))
+FUZZ = runpy.run_path(str(Path(__file__).parent.parent / "tools" / "fuzz_scr.py"))
 
 # As a server of the championship sends it.
 LITERAL = (
@@ -271,7 +271,7 @@ def test_no_bytes_do_harm(text):
 
 
 def test_no_broken_message_gives_a_wrong_number():
-    """The same as ``examples/fuzz_scr.py``, which does more of it."""
+    """The same as ``tools/fuzz_scr.py``, which does more of it."""
     for state, action in FUZZ["mutations"](seed=1, number=3000):
         FUZZ["check_state"](state)
         FUZZ["check_action"](action)

@@ -11,7 +11,7 @@ from sb3_torcs.evaluation.ladder import REFERENCE_FILE, ROBOTS, reference_laps, 
 from sb3_torcs.evaluation.protocol import Episode, merit
 from sb3_torcs.tracks.catalogue import available_tracks
 
-EXAMPLES = Path(__file__).parent.parent / "examples"
+TOOLS = Path(__file__).parent.parent / "tools"
 
 
 def race(*laps, end="laps", distance=7000.0):
@@ -67,7 +67,7 @@ def test_the_shipped_laps_are_what_the_engine_drives(monkeypatch, tmp_path, caps
     out = tmp_path / "laps.csv"
     words = ["reference_laps.py", "--tracks", "dirt/dirt-1", "--out", str(out)]
     monkeypatch.setattr(sys, "argv", words)
-    runpy.run_path(str(EXAMPLES / words[0]), run_name="__main__")
+    runpy.run_path(str(TOOLS / words[0]), run_name="__main__")
     shipped = REFERENCE_FILE.read_text().splitlines()
     measured = out.read_text().splitlines()
     assert measured[:2] == shipped[:2]

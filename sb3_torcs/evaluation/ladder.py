@@ -1,6 +1,6 @@
 """The ladder: rank a driver on a track against the scripted driver and the game's robots.
 
-Their laps were measured by the engine (``examples/reference_laps.py``) and are shipped.
+Their laps were measured by the engine (``tools/reference_laps.py``) and are shipped.
 """
 
 from __future__ import annotations

@@ -37,7 +37,7 @@ def robot(name, track):
 
 
 with whole_file(args.out) as aside, aside.open("w", newline="", encoding="utf-8") as file:
-    file.write(f"# python examples/reference_laps.py, sb3_torcs {sb3_torcs.__version__}\n")
+    file.write(f"# python tools/reference_laps.py, sb3_torcs {sb3_torcs.__version__}\n")
     writer = csv.writer(file, lineterminator="\n")
     writer.writerow(REFERENCE_FIELDS)
     for track in args.tracks or [f"{s.category}/{s.name}" for s in available_tracks()]:

@@ -1,6 +1,6 @@
 """Draw how drivers take a lap: speed, pedals and place on the road, and their lines in the bends.
 
-python examples/compare_laps.py ddpg-aalborg inferno --track aalborg
+python tools/compare_laps.py ddpg-aalborg inferno --track aalborg
 """
 
 import argparse
