@@ -5,67 +5,87 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 BUILT := $(VENV)/.built
 NATIVE := $(wildcard sb3_torcs/native/*.* sb3_torcs/native/*/*)
-SOURCES := setup.py $(NATIVE)
+SCRIPTS := .ci/run $(filter-out %.py,$(wildcard tools/*))
 SHELL := /bin/bash
-SUDO := $(if $(filter 0,$(shell id -u)),,sudo)
-BROWSER := $(SUDO) apt-get install --yes --no-install-recommends chromium chromium-driver
+CORES := $(shell env -u OMP_NUM_THREADS nproc)
+# One more than cores: some tests wait for the game or the browser.
+WORKERS ?= $(shell echo $$(($(CORES) < 8 ? $(CORES) + 1 : 8)))
 
+export PYTHON
 # One thread per process: on few cores torch's own threads get in each other's way.
 export OMP_NUM_THREADS ?= 1
 export PYTHONHASHSEED = 0
+MAKEFLAGS += --no-print-directory
 
 .DEFAULT_GOAL := help
 
 help: ## show the verbs
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 18
 
-install: $(STAMP) ## put everything into .venv/
-
-$(STAMP): setup.cfg pyproject.toml setup.py
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
-	  { echo "Python is $$($(PYTHON) --version 2>&1), 3.11 or newer is needed; try: make PYTHON=python3.12 $(MAKECMDGOALS)"; exit 1; }
-	@test -x $(BIN)/pip || $(PYTHON) -m venv $(VENV) || \
-	  { rm -rf $(VENV); echo "Python cannot make a virtual environment; type: sudo apt install python3-venv"; exit 1; }
-	$(BIN)/python -m pip install --quiet --upgrade pip
-	@if ! $${CXX:-c++} --version >/dev/null 2>&1; then export SB3_TORCS_WITHOUT_ENGINE=1; fi; \
-	  set -x; $(BIN)/python -m pip install --progress-bar on --editable '.[tests]'
-	@$${CXX:-c++} --version >/dev/null 2>&1 || \
-	  echo "There is no C++ compiler: the engine of Torcs-v0 is missing. For it type: sudo apt install g++ python3-dev; make native"
-	@touch $@
-
-demo: install ## watch a car learn to lap, and record its best lap (three minutes; Ctrl-C keeps what was learned)
+# What the game needs may be missing where nothing can be installed.
+demo: ## get all it takes, and watch a car learn to lap (three minutes; Ctrl-C keeps what was learned)
+	@tools/get-packages python engine video || echo "== going on with what is here"
+	@$(MAKE) install
+	@$(MAKE) native game || echo "== without the engine or the game; make native game shows why"
 	$(BIN)/python examples/demo.py $(DEMO_ARGS)
 
-native: $(BUILT) ## build the engine in place, and fail if that cannot be done
+test: ## get all it takes, check format, lint and types, and run every test
+	@tools/get-packages python engine video browser
+	@$(MAKE) install native game
+	@tools/run-beside "$(MAKE) check-codestyle" "$(MAKE) lint" "$(MAKE) type" -- \
+	  $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal --durations=10
 
-# A machine that has no compiler installs everything but the engine.
-$(BUILT): $(STAMP) $(SOURCES)
-	$(BIN)/python -m pip install --verbose --no-deps --editable .
+install: $(STAMP) ## put everything but the engine into .venv/
+
+$(STAMP): setup.cfg pyproject.toml constraints.txt
+	@tools/get-packages python
+	@tools/make-environment $(VENV)
+	@touch $@
+
+native: $(BUILT) ## build the engine in place
+
+# Removed first: a process that has loaded a library keeps the one that it has.
+$(BUILT): $(STAMP) setup.py $(NATIVE)
+	@tools/get-packages engine
+	rm -f sb3_torcs/*.so
+	$(BIN)/python setup.py build_ext --inplace
 	@touch $@
 
 game: install ## get TORCS and Xvfb, if they are not here
+	@tools/get-packages video
 	$(BIN)/sb3-torcs install-torcs --video
 
-# Debian's packages; elsewhere a test says what it needs.
 browser: ## get Chromium, in which tests open the pages, if it is not here
-	@command -v chromium >/dev/null && command -v chromedriver >/dev/null || { set -x; \
-	  $(BROWSER) || { $(SUDO) apt-get update && $(BROWSER); }; }
-
-test: native game browser check-codestyle lint type ## check format, lint and types, and run every test
-	$(BIN)/python -m pytest -n 2 --dist worksteal --durations=10
+	@tools/get-packages browser
 
 pytest: native game browser ## run the tests that do not train
-	$(BIN)/python -m pytest -n 2 -m 'not slow'
+	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m 'not slow'
+
+lock: install ## choose the newest versions that go together, for constraints.txt
+	@{ echo "# Made by make lock: the versions that make and CI take, for Python 3.11 to 3.14"; \
+	  echo uv | $(BIN)/python -m uv pip compile --quiet --universal --python-version 3.11 --all-extras \
+	    --no-header --no-annotate --no-emit-package tfp-nightly setup.cfg -; } > constraints.new
+	mv constraints.new constraints.txt
+
+test-newest test-oldest: test-%: ## run every test with the newest versions, or the oldest allowed
+	@VERSIONS=$* $(MAKE) VENV=build/$* test
+
+check-machines: ## check what make test cannot: other Debians, sanitizers, other versions (hours; root)
+	@tools/check-machines
+
+wheels: install ## build wheels into dist/: with the engine for each Python here, and without it
+	$(BIN)/python tools/build_wheels.py
 
 # Python itself leaks by design and is built without the sanitizers and without C++: they are loaded
 # before it.
 sanitize: install game ## run the engine's tests under AddressSanitizer and UBSan
-	@rm -f $(BUILT)
-	SB3_TORCS_SANITIZE=1 $(BIN)/python -m pip install --verbose --no-deps --editable .
+	@rm -f $(BUILT) sb3_torcs/*.so
+	SB3_TORCS_SANITIZE=1 $(BIN)/python setup.py build_ext --inplace \
+	  --build-lib build/sanitized --build-temp build/sanitized
 	LD_PRELOAD="$$($${CXX:-c++} -print-file-name=libasan.so) $$($${CXX:-c++} -print-file-name=libstdc++.so)" \
 	  ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=halt_on_error=1:print_stacktrace=1 \
 	  $(BIN)/python -m pytest -p no:xdist tests/test_native*.py
-	@echo "the engine is built with the sanitizers now; type: make native"
+	@$(MAKE) native
 
 bench: install ## measure speeds
 	$(BIN)/sb3-torcs bench
@@ -80,13 +100,15 @@ check-codestyle: install ## check the format only
 	$(BIN)/ruff format --check .
 	$(BIN)/clang-format --dry-run --Werror $(NATIVE)
 
-lint: install ## lint code and hyperparameter files
+lint: install ## lint code, scripts, workflows and hyperparameter files
 	$(BIN)/ruff check .
 	$(BIN)/yamllint --strict zoo_configs examples/studies
+	$(BIN)/shellcheck $(SCRIPTS)
+	$(BIN)/actionlint -shellcheck $(BIN)/shellcheck
 	@includes="$$($(BIN)/python -c 'import pybind11, sysconfig; \
 	  print("-isystem", pybind11.get_include(), "-isystem", sysconfig.get_path("include"))')"; set -x; \
 	  printf '%s\n' $(filter %.cpp,$(NATIVE)) | \
-	  xargs -P "$$(env -u OMP_NUM_THREADS nproc)" -I FILE $(BIN)/clang-tidy --quiet FILE -- -std=c++17 $$includes
+	  xargs -P $(CORES) -I FILE $(BIN)/clang-tidy --quiet FILE -- -std=c++17 $$includes
 
 type: install ## check types
 	$(BIN)/mypy
@@ -94,6 +116,7 @@ type: install ## check types
 commit-checks: format lint type ## what to run before a commit
 
 clean: ## remove .venv/ and what was built; trainings stay
-	rm -rf build dist *.egg-info $(VENV)
+	rm -rf build dist *.egg-info sb3_torcs/*.so $(VENV)
 
-.PHONY: help install native game browser demo test pytest sanitize bench format check-codestyle lint type commit-checks clean
+.PHONY: help demo test install native game browser pytest lock test-newest test-oldest \
+  check-machines wheels sanitize bench format check-codestyle lint type commit-checks clean

@@ -3,7 +3,7 @@
 import os
 from glob import glob
 
-from pybind11.setup_helpers import Pybind11Extension, build_ext
+from pybind11.setup_helpers import ParallelCompile, Pybind11Extension, build_ext
 from setuptools import Extension, setup
 from setuptools.errors import BaseError, CCompilerError
 
@@ -78,5 +78,8 @@ game_libraries = [
     game_library("_game_window", *sorted(glob("sb3_torcs/native/window/*.cpp"))),
 ]
 
+ParallelCompile(default=0).install()  # one compiler for each core
+
+# Without any extension setuptools names a wheel py3-none-any.
 extensions = [] if without_engine else [engine, *game_libraries]
 setup(ext_modules=extensions, cmdclass={"build_ext": BuildEngine})
