@@ -102,9 +102,8 @@ check-codestyle: install ## check the format only
 
 lint: install ## lint code, scripts, workflows and hyperparameter files
 	$(BIN)/ruff check .
-	$(BIN)/yamllint --strict zoo_configs examples/studies
+	$(BIN)/yamllint --strict zoo_configs examples/studies .github
 	$(BIN)/shellcheck $(SCRIPTS)
-	$(BIN)/actionlint -shellcheck $(BIN)/shellcheck
 	@includes="$$($(BIN)/python -c 'import pybind11, sysconfig; \
 	  print("-isystem", pybind11.get_include(), "-isystem", sysconfig.get_path("include"))')"; set -x; \
 	  printf '%s\n' $(filter %.cpp,$(NATIVE)) | \
