@@ -103,7 +103,7 @@ check-codestyle: install ## check the format only
 lint: install ## lint code, scripts, workflows and hyperparameter files
 	$(BIN)/ruff check .
 	$(BIN)/yamllint --strict zoo_configs examples/studies .github
-	$(BIN)/shellcheck $(SCRIPTS)
+	$(BIN)/shellcheck --severity warning $(SCRIPTS)
 	@includes="$$($(BIN)/python -c 'import pybind11, sysconfig; \
 	  print("-isystem", pybind11.get_include(), "-isystem", sysconfig.get_path("include"))')"; set -x; \
 	  printf '%s\n' $(filter %.cpp,$(NATIVE)) | \
