@@ -76,15 +76,15 @@ def build(python: str, source: Path, folder: Path, *, engine: bool) -> Path:
     :return: the wheel
     """
     before = set(folder.glob("*.whl"))
-    locked = str(ROOT / "constraints.txt")
-    environment = {**os.environ, "PIP_CONSTRAINT": locked, "PIP_BUILD_CONSTRAINT": locked}
-    environment["SB3_TORCS_WITHOUT_ENGINE"] = "0" if engine else "1"
+    environment = {**os.environ, "SB3_TORCS_WITHOUT_ENGINE": "0" if engine else "1"}
     words = ["wheel", "--no-deps", "--no-cache-dir", "--verbose", "--wheel-dir", str(folder)]
-    subprocess.run(
-        [sys.executable, "-m", "pip", "--python", python, *words, str(source)],
-        env=environment,
-        check=True,
-    )
+    if python == sys.executable:
+        words.append("--no-build-isolation")  # all that a build needs is here
+    else:
+        locked = str(ROOT / "constraints.txt")
+        environment |= {"PIP_CONSTRAINT": locked, "PIP_BUILD_CONSTRAINT": locked}
+    pip = [sys.executable, "-m", "pip", "--python", python]
+    subprocess.run([*pip, *words, str(source)], env=environment, check=True)
     (wheel,) = set(folder.glob("*.whl")) - before
     return wheel
 
