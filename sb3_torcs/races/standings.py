@@ -45,7 +45,7 @@ def mean_interval(places: Sequence[int]) -> list[float] | None:
         return None
     interval = bootstrap(
         (places,), np.mean, n_resamples=RESAMPLES, method="percentile",
-        random_state=np.random.default_rng(0),
+        rng=np.random.default_rng(0),
     ).confidence_interval  # fmt: skip
     return [float(interval.low), float(interval.high)]
 

@@ -1,13 +1,12 @@
-"""Figures over seeds: interquartile means with 95 % stratified bootstrap intervals.
+"""Figures over seeds: interquartile means, shares, and their 95 % bootstrap intervals.
 
-As Agarwal et al. 2021 (arXiv:2108.13264), by rliable; the bootstrap is seeded, so the same results
+As Agarwal et al. 2021 (arXiv:2108.13264), by SciPy; the bootstrap is seeded, so the same results
 give the same figures.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +17,7 @@ Array = npt.NDArray[np.float64]
 
 REPETITIONS = 2000  # of the bootstrap
 LEVEL = 0.95
+CUT = 0.25  # of the seeds, at either end
 
 
 class Estimate(NamedTuple):
@@ -28,50 +28,61 @@ class Estimate(NamedTuple):
     high: Array  # (points,)
 
 
-def iqm(scores: Array) -> Array:
+class Statistic(Protocol):
+    """A figure over one axis of an array."""
+
+    def __call__(self, scores: Array, /, axis: int) -> Array:
+        """
+        :param scores: any shape
+        :param axis: of the seeds
+        :return: the same shape without this axis
+        """
+
+
+def iqm(scores: Array, axis: int = 0) -> Array:
     """
-    Average the middle half of the seeds: rliable's ``aggregate_iqm`` for all points at once.
+    Average the middle half of the seeds.
 
-    It is called thousands of times, and SciPy's ``trim_mean`` would take a millisecond each.
-
-    :param scores: (seeds, 1, points)
-    :return: (points,)
+    :param scores: any shape
+    :param axis: of the seeds
+    :return: the same shape without this axis
     """
-    cut = len(scores) // 4
-    middle = np.sort(scores[:, 0], axis=0)[cut : len(scores) - cut]
-    return np.asarray(middle.mean(axis=0))
+    from scipy.stats import trim_mean
+
+    return np.asarray(trim_mean(scores, CUT, axis=axis))
 
 
-def share(scores: Array) -> Array:
+def share(scores: Array, axis: int = 0) -> Array:
     """
     Average all seeds: the share of ones.
 
-    :param scores: (seeds, 1, points)
-    :return: (points,)
+    :param scores: any shape
+    :param axis: of the seeds
+    :return: the same shape without this axis
     """
-    return np.asarray(scores.mean(axis=0)[0])
+    return np.asarray(scores.mean(axis=axis))
 
 
-def estimate(scores: Array, function: Callable[[Array], Array] = iqm) -> Estimate:
+def estimate(scores: Array, function: Statistic = iqm) -> Estimate:
     """
-    Estimate a figure over seeds, with a stratified bootstrap.
+    Estimate a figure over seeds. The bootstrap draws whole seeds, with all their points.
 
     :param scores: (seeds, points)
-    :param function: of (seeds, 1, points)
+    :param function: of the seeds
     :return: value and interval
     """
-    from rliable.library import StratifiedBootstrap
+    from scipy.stats import bootstrap
 
-    class Seeded(StratifiedBootstrap):
-        """Uses a generator of its own; rliable's uses the global one."""
-
-        def update_indices(self) -> tuple[Any, ...]:
-            drawn = self.generator.choice(self._num_items, self._args_shape, replace=True)
-            return (drawn, *self._strata_indices)
-
-    stacked = scores[:, None, :]
-    drawn = Seeded(stacked, seed=0).apply(function, reps=REPETITIONS)
+    value = function(scores, axis=0)
+    if len(scores) < 2:  # which SciPy refuses, and which has no spread
+        return Estimate(value, value, value)
+    # SciPy's own interval, which is not used, interpolates between laps that were never driven.
+    with np.errstate(invalid="ignore"):
+        drawn = bootstrap(
+            (scores,), function, n_resamples=REPETITIONS, axis=0, vectorized=True,
+            method="percentile", rng=np.random.default_rng(0),
+        ).bootstrap_distribution  # fmt: skip
     tail = 0.5 * (1.0 - LEVEL)
     # Without interpolation, which is undefined for laps that were never driven (infinity).
-    low, high = np.quantile(drawn, [tail, 1.0 - tail], axis=0, method="inverted_cdf")
-    return Estimate(function(stacked), low, high)
+    low, high = np.quantile(drawn, [tail, 1.0 - tail], axis=-1, method="inverted_cdf")
+    return Estimate(value, low, high)
