@@ -28,7 +28,7 @@ from numba.extending import overload
 from sb3_torcs.car import FIRST_RIVAL, KMH, REST_HEIGHT, RIVALS, CarState, FloatArray
 from sb3_torcs.errors import InvalidOption, near_miss
 from sb3_torcs.rivals import see_rivals
-from sb3_torcs.tracks.profile import INTERVALS, QUANTITIES, RoadProfile, look_ahead, speed_margins
+from sb3_torcs.tracks.profile import RoadProfile
 from sb3_torcs.tracks.racing_line import (
     LINE_PLACES,
     USUAL_PACE,
@@ -36,6 +36,7 @@ from sb3_torcs.tracks.racing_line import (
     pace_of,
     racing_line,
 )
+from sb3_torcs.tracks.view_ahead import INTERVALS, QUANTITIES, look_ahead, speed_margins
 
 __all__ = [
     "GROUPS",

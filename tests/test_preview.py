@@ -23,8 +23,9 @@ from sb3_torcs.errors import InvalidOption
 from sb3_torcs.evaluation.protocol import race_environment
 from sb3_torcs.policies.mirror import mirror_image, mirror_observations, sensors_of
 from sb3_torcs.sensors import GROUPS, View, choices_of_size, feature_slices
-from sb3_torcs.tracks.profile import DISTANCES, INTERVALS, look_ahead, road_profile, speed_margins
+from sb3_torcs.tracks.profile import road_profile
 from sb3_torcs.tracks.track import Segment, Track
+from sb3_torcs.tracks.view_ahead import DISTANCES, INTERVALS, look_ahead, speed_margins
 
 BOTH = ("base", "preview")
 BENDS, WIDTHS, SLOPES = list(feature_slices(BOTH).values())[-3:]

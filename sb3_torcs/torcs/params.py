@@ -55,6 +55,10 @@ UNREAD_ENTITIES = ("objects.xml",)  # trees and houses
 UNREAD_NAMES = ("default-objects",)  # the names in the game's tracks
 
 
+_LAST_SURFACES: dict[tuple[Path, bytes, int], dict[str, Section]] = {}
+"""The sections of the shared surfaces that were read last, by file, content and depth."""
+
+
 @dataclass
 class Section:
     """A section of a file, with its contents."""
@@ -210,9 +214,32 @@ class _Parser:
                 f"includes '{system_id}'; only {SHARED_SURFACES} and "
                 f"{', '.join(UNREAD_ENTITIES)} can be included"
             )
-        _, parser = self._parsing[-1]
-        self._feed(self._shared_surfaces(), parser.ExternalEntityParserCreate(context))
+        self._include_surfaces(self._shared_surfaces(), context)
         return 1
+
+    def _include_surfaces(self, path: Path, context: str | None) -> None:
+        """
+        Read the shared surfaces, or take those that the last track has read from the same file.
+
+        They are most of what the files of all tracks hold. A file that uses entities means what the
+        track declares, and one with values outside of sections belongs to where it is included.
+
+        :param path: of the file
+        :param context: for the parser
+        """
+        inside, content = self._open[-1], read_bounded(path)
+        key = path, content, self._depth
+        known = _LAST_SURFACES.get(key, {})
+        if known and known.keys().isdisjoint(inside.children):
+            inside.children.update(known)
+            return
+        names, before = set(inside.names), set(inside.children)
+        _, parser = self._parsing[-1]
+        self._feed(path, parser.ExternalEntityParserCreate(context))
+        if inside.names == names and b"&" not in content:
+            read = inside.children.items()
+            _LAST_SURFACES.clear()
+            _LAST_SURFACES[key] = {name: each for name, each in read if name not in before}
 
     def _shared_surfaces(self) -> Path:
         """Find the file of surfaces that all tracks of an installation share."""
@@ -301,10 +328,10 @@ class _Parser:
             raise self._fail(f"unknown unit '{unit}'; known are {', '.join(UNITS)}")
         value = math.nan
         if len(text) <= MAX_NAME:
-            if HEX.fullmatch(text):
-                value = float(int(text, 16))
-            elif NUMBER.fullmatch(text):
+            if NUMBER.fullmatch(text):
                 value = float(text)
+            elif HEX.fullmatch(text):
+                value = float(int(text, 16))
         value *= UNITS.get(unit, 1.0)
         if math.isnan(value):
             raise self._fail(f"'{text[:MAX_NAME]}' is not a finite number")

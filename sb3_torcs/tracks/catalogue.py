@@ -48,13 +48,14 @@ def load_track(
                 "rng=numpy.random.default_rng(seed)"
             )
         return random_track(rng)
-    return _read(find_track(track))
+    return _read(find_track(track), tuple(torcs_folders()))
 
 
 def available_tracks() -> list[TrackSummary]:
     """List the bundled tracks and those of the installed TORCS, by category and name."""
+    folders = tuple(torcs_folders())
     return sorted(
-        (_read(file).summary() for file in known_tracks().values()),
+        (_read(file, folders).summary() for file in known_tracks().values()),
         key=lambda entry: (
             (CATEGORIES.index(entry.category), entry.name)
             if entry.category in CATEGORIES
@@ -89,27 +90,37 @@ def lasting_name(track: Track) -> str:
     return track.name if known else str(track.file)
 
 
-def _read(file: TrackFile) -> Track:
-    """Read a track file of either kind, once per content."""
-    content = digests(file.path, torcs_folders())
-    return _read_once(file.path.resolve(), file.source, content)
+def _read(file: TrackFile, folders: tuple[Path, ...]) -> Track:
+    """
+    Read a track file of either kind, once per content.
+
+    :param file: of the track
+    :param folders: of TORCS's data, in which to look for the surfaces of all tracks
+    """
+    content = digests(file.path, folders)
+    return _read_once(file.path.resolve(), file.source, folders, content)
 
 
 @functools.lru_cache(maxsize=128)
 def _read_once(
-    path: Path, source: Literal["bundled", "torcs", "file"], content: tuple[str, ...]
+    path: Path,
+    source: Literal["bundled", "torcs", "file"],
+    folders: tuple[Path, ...],
+    content: tuple[str, ...],
 ) -> Track:
     """
     Read a track file of either kind.
 
     :param path: of the file
     :param source: where it came from
+    :param folders: of TORCS's data
     :param content: from :func:`~sb3_torcs.torcs.params.digests`; only a key of the cache
     :return: the track
     """
     del content
-    read = read_track_xml if path.suffix.lower() == ".xml" else read_track_file
-    track = replace(read(path), source=source, file=path)
+    is_xml = path.suffix.lower() == ".xml"
+    track = read_track_xml(path, folders) if is_xml else read_track_file(path)
+    track = replace(track, source=source, file=path)
     try:
         return replace(track, segments=closed(track.segments))
     except ValueError as error:

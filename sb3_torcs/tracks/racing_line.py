@@ -19,8 +19,9 @@ from numba import njit
 
 from sb3_torcs import maths
 from sb3_torcs.car import FloatArray
-from sb3_torcs.tracks.profile import FASTEST, RoadProfile, place_at
+from sb3_torcs.tracks.profile import RoadProfile
 from sb3_torcs.tracks.track import Track
+from sb3_torcs.tracks.view_ahead import FASTEST, place_at
 
 __all__ = [
     "LINE_DISTANCES",

@@ -15,7 +15,7 @@ its outer edge.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -37,6 +37,7 @@ MAX_WIDTH = 1000.0  # [m] of road or ground; the game's tracks have 101
 MAX_LENGTH = 100_000.0  # [m] of one segment; the game computes in single precision
 LEAST = 1e-6  # [m] or [rad] of a length, a radius or an arc: less is lost in rounding
 SAMPLES_PER_ARC = 36  # as TORCS does when it looks for the corner of its map
+ROUNDING = 1.0  # [m] more than what rounding moves a road by
 
 
 @dataclass
@@ -342,14 +343,20 @@ def _corner(segments: Iterable[Segment]) -> tuple[float, float]:
         right_most = -0.5 * s.width_end - right
         turn = s.curvature * s.length / samples
         chord = s.length / samples * (maths.sin(0.5 * turn) / (0.5 * turn) if turn else 1.0)
+        # Most segments lie far from the corner: looking at each of their samples would take most
+        # of the time to read a track.
+        reach = s.length + max(left_most, -right_most) + ROUNDING
+        far = x - reach > low_x and y - reach > low_y
         for _ in range(samples):
             cosine, sine = maths.cos_sin(heading + 0.5 * turn)
             x += chord * cosine
             y += chord * sine
             heading += turn
+            if far:
+                continue
             cosine, sine = maths.cos_sin(heading)
             for offset in (left_most, right_most):
-                if x - offset * sine < low_x:  # min() takes most of the time to read a track
+                if x - offset * sine < low_x:  # quicker than min()
                     low_x = x - offset * sine
                 if y + offset * cosine < low_y:
                     low_y = y + offset * cosine
@@ -378,15 +385,16 @@ def _grid(root: Section, segments: list[Segment], width: float) -> Grid:
     return Grid(section.numbers.get("distance to start", 10.0), offset if side == LEFT else -offset)
 
 
-def read_track_xml(path: Path) -> Track:
+def read_track_xml(path: Path, folders: Sequence[Path] | None = None) -> Track:
     """
     Read a track file of TORCS.
 
     :param path: of the file
+    :param folders: of TORCS's data, with the surfaces of all tracks; ``None`` looks for them
     :return: the track as the game lays it, its gap at the start line included
     :raises TrackFileError: naming file and line
     """
-    root = read_params(path, torcs_folders())
+    root = read_params(path, torcs_folders() if folders is None else folders)
     header = root.child("Header")
     version = int(header.numbers.get("version", 0.0))
     if not 0 <= version <= 4:
