@@ -59,7 +59,7 @@ _LAST_SURFACES: dict[tuple[Path, bytes, int], dict[str, Section]] = {}
 """The sections of the shared surfaces that were read last, by file, content and depth."""
 
 
-@dataclass
+@dataclass(slots=True)
 class Section:
     """A section of a file, with its contents."""
 

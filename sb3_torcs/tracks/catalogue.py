@@ -55,7 +55,7 @@ def available_tracks() -> list[TrackSummary]:
     """List the bundled tracks and those of the installed TORCS, by category and name."""
     folders = tuple(torcs_folders())
     return sorted(
-        (_read(file, folders).summary() for file in known_tracks().values()),
+        (_read(file, folders, located=False).summary() for file in known_tracks().values()),
         key=lambda entry: (
             (CATEGORIES.index(entry.category), entry.name)
             if entry.category in CATEGORIES
@@ -90,15 +90,16 @@ def lasting_name(track: Track) -> str:
     return track.name if known else str(track.file)
 
 
-def _read(file: TrackFile, folders: tuple[Path, ...]) -> Track:
+def _read(file: TrackFile, folders: tuple[Path, ...], *, located: bool = True) -> Track:
     """
     Read a track file of either kind, once per content.
 
     :param file: of the track
     :param folders: of TORCS's data, in which to look for the surfaces of all tracks
+    :param located: whether the place of the road matters, too
     """
     content = digests(file.path, folders)
-    return _read_once(file.path.resolve(), file.source, folders, content)
+    return _read_once(file.path.resolve(), file.source, folders, content, located)
 
 
 @functools.lru_cache(maxsize=128)
@@ -107,6 +108,7 @@ def _read_once(
     source: Literal["bundled", "torcs", "file"],
     folders: tuple[Path, ...],
     content: tuple[str, ...],
+    located: bool,
 ) -> Track:
     """
     Read a track file of either kind.
@@ -115,11 +117,12 @@ def _read_once(
     :param source: where it came from
     :param folders: of TORCS's data
     :param content: from :func:`~sb3_torcs.torcs.params.digests`; only a key of the cache
+    :param located: whether the place of the road matters, too
     :return: the track
     """
     del content
     is_xml = path.suffix.lower() == ".xml"
-    track = read_track_xml(path, folders) if is_xml else read_track_file(path)
+    track = read_track_xml(path, folders, located=located) if is_xml else read_track_file(path)
     track = replace(track, source=source, file=path)
     try:
         return replace(track, segments=closed(track.segments))

@@ -93,6 +93,7 @@ class _Builder:
         """The same road in the steps of the game's loader."""
         self.names: list[str] = []
         """Of the segments that these steps are of."""
+        self._surfaces: dict[str, Surface] = {}
 
     def _of(self, section: Section, verge: _Verge, part: str) -> Keys:
         """Find what a section says of a part of the verge."""
@@ -145,6 +146,8 @@ class _Builder:
         :param name: of the surface
         :return: the surface
         """
+        if name in self._surfaces:
+            return self._surfaces[name]
         inside = () if self.version >= 4 else ("List",)
         section = self.root.child("Surfaces", *inside, name)
         numbers = section.numbers
@@ -157,6 +160,7 @@ class _Builder:
         )
         if min(surface[1:]) < 0.0:
             raise TrackFileError(f"{section.place}: the surface '{name}' has a negative number")
+        self._surfaces[name] = surface
         return surface
 
     def add(self, name: str, section: Section) -> None:
@@ -333,6 +337,7 @@ def _corner(segments: Iterable[Segment]) -> tuple[float, float]:
     :return: x and y [m] with the beginning of the road's right edge as origin
     """
     low_x = low_y = x = y = heading = 0.0
+    sin, cos = math.sin, math.cos
     for i, s in enumerate(segments):
         y = 0.5 * s.width_start if i == 0 else y
         samples = SAMPLES_PER_ARC if s.curvature else 1
@@ -385,12 +390,16 @@ def _grid(root: Section, segments: list[Segment], width: float) -> Grid:
     return Grid(section.numbers.get("distance to start", 10.0), offset if side == LEFT else -offset)
 
 
-def read_track_xml(path: Path, folders: Sequence[Path] | None = None) -> Track:
+def read_track_xml(
+    path: Path, folders: Sequence[Path] | None = None, *, located: bool = True
+) -> Track:
     """
     Read a track file of TORCS.
 
     :param path: of the file
     :param folders: of TORCS's data, with the surfaces of all tracks; ``None`` looks for them
+    :param located: whether to find where the game puts the road, which takes a third of the time;
+        else the road begins at the origin
     :return: the track as the game lays it, its gap at the start line included
     :raises TrackFileError: naming file and line
     """
@@ -407,7 +416,7 @@ def read_track_xml(path: Path, folders: Sequence[Path] | None = None) -> Track:
     if not builder.segments:
         raise TrackFileError(f"{listed.place}: there are no track segments")
     check_pits(builder.main, version, builder.names, builder.fine)
-    low_x, low_y = _corner(builder.fine)
+    low_x, low_y = _corner(builder.fine) if located else (0.0, 0.5 * builder.width)
     return Track(
         path.stem,
         header.texts.get("category", "road"),
