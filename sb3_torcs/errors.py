@@ -8,12 +8,14 @@ from __future__ import annotations
 import contextlib
 import difflib
 import functools
+import importlib.util
 import inspect
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, TypeVar, cast
 
 __all__ = [
+    "EXTRAS",
     "BackendUnavailable",
     "CarFileError",
     "CarLost",
@@ -53,9 +55,12 @@ __all__ = [
     "UnknownRobot",
     "WorkerLost",
     "ZooConfigError",
+    "check_extras",
     "ends_in_a_line",
+    "install_line",
     "keywords_of",
     "near_miss",
+    "needs_extra",
     "renamed",
     "unknown_argument",
     "with_known_arguments",
@@ -229,6 +234,64 @@ ELSEWHERE = {
     "threads": "gym.make_vec('Torcs-v0') and sb3_torcs.vec_env.TorcsVecEnv drive on threads",
 }
 """Arguments that people try where they are not, and what has them."""
+
+
+EXTRAS = {
+    "imageio_ffmpeg": "video",
+    "onnx": "export",
+    "onnxscript": "export",
+    "openskill": "races",
+    "pettingzoo": "races",
+    "plotly": "reports",
+    "pyarrow": "reports",
+    "ray": "study",
+    "rl_zoo3": "zoo",
+    "sb3_contrib": "zoo",
+    "sbx": "sbx",
+}
+"""Packages that the core does without, and the extra that brings each."""
+
+
+def install_line(package: str) -> str:
+    """
+    Say what to type for a package of an extra.
+
+    :param package: name of its module, one of :data:`EXTRAS`
+    """
+    return f'pip install "sb3-torcs[{EXTRAS[package]}]"'
+
+
+@contextlib.contextmanager
+def needs_extra(what: str) -> Iterator[None]:
+    """
+    Let imports of packages of an extra say what to type where they are missing.
+
+    :param what: needs the packages that the block imports
+    :raises PackageMissing: in place of Python's own error
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        package = (error.name or "").partition(".")[0]
+        if package not in EXTRAS:
+            raise
+        raise PackageMissing(
+            f"{what} needs {package}, which is not installed; type: {install_line(package)}"
+        ) from error
+
+
+def check_extras(what: str, *packages: str) -> None:
+    """
+    Make sure that packages are there before work begins whose result needs them.
+
+    :param what: needs them
+    :param packages: names of their modules, all in :data:`EXTRAS`
+    :raises PackageMissing: if one is not installed
+    """
+    with needs_extra(what):
+        for package in packages:
+            if importlib.util.find_spec(package) is None:
+                raise ModuleNotFoundError(name=package)
 
 
 @contextlib.contextmanager

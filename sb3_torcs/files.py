@@ -13,7 +13,7 @@ from typing import Any
 
 import yaml
 
-from sb3_torcs.errors import OutputNotWritable, Sb3TorcsError
+from sb3_torcs.errors import EXTRAS, OutputNotWritable, Sb3TorcsError, check_extras, install_line
 
 __all__ = [
     "IN_A_FOLDER",
@@ -32,6 +32,11 @@ __all__ = [
 
 PICTURES = (".png", ".svg", ".pdf")
 """Endings of pictures that matplotlib draws."""
+
+WRITTEN_BY = {
+    ".html": ("plotly", "pyarrow"), ".mp4": ("imageio_ffmpeg",), ".parquet": ("pyarrow",),
+}  # fmt: skip
+"""Packages of extras that it takes to write a file, by its ending."""
 
 IN_A_FOLDER = "choose a file in an existing folder that you may write to"
 """Advice where a file cannot be written."""
@@ -60,6 +65,8 @@ def import_advice(module: str) -> str:
     :param module: its dotted path
     """
     top = module.partition(".")[0]
+    if top in EXTRAS:
+        return f"type: {install_line(top)}"
     if Path(f"{top}.py").is_file() or Path(top).is_dir():
         return f"'{top}' lies in this folder; type PYTHONPATH=. before the command"
     return "install the package that it is in"
@@ -133,8 +140,11 @@ def writable_file(file: str | Path, suffixes: tuple[str, ...]) -> Path:
     :param suffixes: allowed endings, e.g. ``(".png",)``
     :return: its path
     :raises OutputNotWritable: if its folder cannot be written, or its kind is another
+    :raises PackageMissing: if a package that files of this kind take is not installed
     """
     path = checked_ending(file, suffixes)
+    ending = path.suffix.lower()
+    check_extras(f"a {ending} file", *WRITTEN_BY.get(ending, ()))
     if path.is_dir():
         raise OutputNotWritable(f"'{path}' is a folder; give a file in it")
     writable_folder(path.parent)

@@ -114,11 +114,12 @@ def run(args: argparse.Namespace) -> int:
     :return: the exit status
     """
     files = asked_files(args, FILES)
-    from sb3_torcs.errors import InvalidOption
+    from sb3_torcs.errors import InvalidOption, check_extras
     from sb3_torcs.telemetry import DriveLog
 
     if args.game and files:
         raise InvalidOption(f"--{next(iter(files))} is for races of the engine; leave out --game")
+    check_extras("a rating", "openskill")
     with quiet_output(args.json):
         entrants = _entrants(args)
         log = DriveLog() if "telemetry" in files or "report" in files else None

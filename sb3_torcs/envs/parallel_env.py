@@ -11,12 +11,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
-from pettingzoo import ParallelEnv
 
 from sb3_torcs.car import CarState, check_count
 from sb3_torcs.envs.making import NO_LIMIT, checked_time_limit
 from sb3_torcs.envs.torcs_race import RaceCarEnv, make_race
-from sb3_torcs.errors import EnvClosed, InvalidAction, InvalidOption
+from sb3_torcs.errors import EnvClosed, InvalidAction, InvalidOption, needs_extra
+
+with needs_extra("parallel_env"):
+    from pettingzoo import ParallelEnv
 
 __all__ = ["TorcsParallelEnv", "parallel_env"]
 

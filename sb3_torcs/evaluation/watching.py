@@ -18,7 +18,6 @@ from sb3_torcs.agents.robots import drive_log
 from sb3_torcs.agents.scripted import SCRIPTED
 from sb3_torcs.car import DEFAULT_CAR
 from sb3_torcs.errors import GameFailed, InvalidOption, ServerLost
-from sb3_torcs.rendering.encoder import PHOTOGRAPHIC, write_video
 from sb3_torcs.rendering.game_video import FPS, GameVideo, side_by_side
 from sb3_torcs.rendering.gap import Passing, draw_gap, time_behind
 from sb3_torcs.scr.protocol import plain_name
@@ -174,6 +173,8 @@ def record_shows(
     :raises OutputNotWritable: if the file cannot be written; no part of it is left behind
     :raises GameFailed: if a game ends too early; no part of the file is left behind
     """
+    from sb3_torcs.rendering.encoder import PHOTOGRAPHIC, write_video
+
     part = (size[0] // len(shows), size[1])
     if len(shows) > 1 and size[0] % (2 * len(shows)):
         raise InvalidOption(

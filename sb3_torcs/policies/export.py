@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import logging
 import os
 from collections.abc import Iterator
@@ -16,15 +15,13 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from torch import nn
 
-from sb3_torcs.errors import ModelMismatch, PackageMissing
+from sb3_torcs.errors import ModelMismatch, check_extras
 from sb3_torcs.files import IN_A_FOLDER, whole_file
 
 __all__ = ["INPUT", "OUTPUT", "export_actor"]
 
 INPUT, OUTPUT = "observation", "action"
 """Names in the graph: rows of float32 as the environment gives them, and as it takes them."""
-
-NEEDED = ("onnx", "onnxscript")
 
 
 class _Predicting(nn.Module):
@@ -101,11 +98,7 @@ def export_actor(model: Any, path: str | os.PathLike[str]) -> Path:
     :raises ModelMismatch: if the model cannot be written as one graph
     :raises OutputNotWritable: if the file cannot be written; no part of it is left behind
     """
-    missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
-    if missing:
-        raise PackageMissing(
-            f"an export needs {' and '.join(missing)}; type: pip install {' '.join(NEEDED)}"
-        )
+    check_extras("an export", "onnx", "onnxscript")
     policy, statistics = _parts(model)
     _check_policy(policy, statistics)
     path = Path(path)

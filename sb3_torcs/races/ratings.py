@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from sb3_torcs.errors import needs_extra
+
 __all__ = ["ratings"]
 
 
@@ -16,7 +18,8 @@ def ratings(orders: Sequence[Sequence[str]]) -> dict[str, list[float]]:
     :param orders: of each race the drivers, the winner first
     :return: the rating of each driver and its standard deviation
     """
-    from openskill.models import PlackettLuce
+    with needs_extra("a rating"):
+        from openskill.models import PlackettLuce
 
     model = PlackettLuce()
     rated = {driver: model.rating() for order in orders for driver in order}

@@ -9,7 +9,6 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-import imageio_ffmpeg
 import numpy as np
 import numpy.typing as npt
 from rich.console import Console
@@ -22,8 +21,11 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from sb3_torcs.errors import InvalidOption, OutputNotWritable
+from sb3_torcs.errors import InvalidOption, OutputNotWritable, needs_extra
 from sb3_torcs.files import whole_file
+
+with needs_extra("a video"):
+    import imageio_ffmpeg
 
 __all__ = ["ENCODING", "PHOTOGRAPHIC", "write_video"]
 

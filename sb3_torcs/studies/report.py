@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_torcs.errors import StudyError
+from sb3_torcs.errors import StudyError, check_extras
 from sb3_torcs.evaluation.ladder import RUNGS
 from sb3_torcs.studies.config import FIELDS, slug
 from sb3_torcs.studies.curves import NO_LAP, learning_of
@@ -106,7 +106,9 @@ def write_report(folder: Path, output: Path) -> Path:
     :return: ``report.md``; the page lies beside it
     :raises StudyError: if there is nothing to report
     :raises OutputNotWritable: if the report cannot be written
+    :raises PackageMissing: if Plotly is not installed
     """
+    check_extras("the report", "plotly")
     trials = read_results(folder)
     study = trials[0].train[0]["study"]
     notes = [NOTE, *_waiting(folder), *_diverged(folder)]

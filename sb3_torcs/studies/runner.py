@@ -30,6 +30,7 @@ from sb3_torcs.errors import (
     TrackFileError,
     TrackNotFound,
     TrainingDiverged,
+    install_line,
 )
 from sb3_torcs.signals import EXIT_STATUS, answered, handlers_kept
 from sb3_torcs.studies.config import Study, Trial
@@ -192,8 +193,7 @@ def require_ray(address: str | None = None) -> None:
         import ray.tune  # noqa: F401
     except ImportError as error:
         raise RayUnavailable(
-            f"a study needs Ray Tune, which does not import ({error}); type: "
-            'pip install "sb3-torcs[study]" (in a clone: pip install ".[study]")'
+            f"a study needs Ray Tune, which does not import ({error}); type: {install_line('ray')}"
         ) from error
 
 

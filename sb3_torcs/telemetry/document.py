@@ -11,7 +11,7 @@ from html import escape
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sb3_torcs.errors import PackageMissing
+from sb3_torcs.errors import needs_extra
 from sb3_torcs.files import whole_file
 
 __all__ = [
@@ -96,12 +96,8 @@ def _text(name: str) -> str:
 @functools.cache
 def _packed_plotly() -> str:
     """Return Plotly's own bundle, compressed; the same at each call."""
-    try:
+    with needs_extra("the report"):
         from plotly.offline import get_plotlyjs
-    except ImportError as error:
-        raise PackageMissing(
-            "the report is drawn by Plotly, which is not installed; type: pip install plotly"
-        ) from error
     return base64.b64encode(gzip.compress(get_plotlyjs().encode(), mtime=0)).decode()
 
 

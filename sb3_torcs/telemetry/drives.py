@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from sb3_torcs.car import CarState, Controls
-from sb3_torcs.errors import DriveFileError, InvalidOption
+from sb3_torcs.errors import DriveFileError, InvalidOption, needs_extra
 from sb3_torcs.files import checked_ending, readable, whole_file
 from sb3_torcs.sensors import SENSORS
 from sb3_torcs.telemetry.table import CONTROL_FIELDS, STATE_FIELDS
@@ -114,7 +114,8 @@ class DriveLog:
 
     def table(self) -> pa.Table:
         """Return all rows as a table of Apache Arrow."""
-        import pyarrow as pa
+        with needs_extra("a table of drives"):
+            import pyarrow as pa
 
         self._close()
         numbers = np.concatenate(self._numbers or [np.empty((0, len(COLUMNS)))])
@@ -148,7 +149,8 @@ class DriveLog:
         :param path: of the file, which ends in ``.parquet`` and appears when it is complete
         :raises OutputNotWritable: if the file has another ending or cannot be written
         """
-        from pyarrow import parquet
+        with needs_extra("a file of drives"):
+            from pyarrow import parquet
 
         file = checked_ending(path, (".parquet",))
         table = self.table()
@@ -171,7 +173,9 @@ def read_drives(path: str | Path) -> pd.DataFrame:
     :raises DriveFileError: if the file is missing, damaged, or holds something else
     """
     import pandas as pd
-    import pyarrow as pa
+
+    with needs_extra("a file of drives"):
+        import pyarrow as pa
 
     again = "write it anew: sb3-torcs evaluate MODEL --telemetry FILE.parquet"
     if not os.path.isfile(path):  # to read a pipe would wait for who writes it

@@ -13,7 +13,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sb3_torcs.car import check_count
-from sb3_torcs.errors import InvalidOption, OutputNotWritable, TrainingDiverged, WorkerLost
+from sb3_torcs.errors import (
+    InvalidOption,
+    OutputNotWritable,
+    TrainingDiverged,
+    WorkerLost,
+    check_extras,
+)
 from sb3_torcs.files import listed, writable_folder
 from sb3_torcs.signals import counted_interrupts
 from sb3_torcs.torcs.track_names import lasting_kwargs
@@ -125,10 +131,12 @@ def train_run(options: TrainOptions) -> Run:
     :raises InvalidOption: if a number is not allowed, or if the arguments for the zoo cannot be
         read, or would move the model
     :raises OutputNotWritable: if a folder cannot be written
+    :raises PackageMissing: if the RL Zoo is not installed
     """
     from sb3_torcs.agents.models import find_model
     from sb3_torcs.training import zoo
 
+    check_extras("to train", "rl_zoo3")
     _check_numbers(options)
     resume = None if options.resume is None else find_model(options.resume, prefer_last=True)
     entry, changed, place = _entry(options, resume)

@@ -21,7 +21,7 @@ import gymnasium as gym
 import yaml
 from stable_baselines3.common.policies import ActorCriticPolicy
 
-from sb3_torcs.agents.saved.algorithm import SBX, algorithm_class
+from sb3_torcs.agents.saved.algorithm import ALGORITHMS, SBX, algorithm_class
 from sb3_torcs.agents.wrapping import normalizes, unrebuilt, wrapped
 from sb3_torcs.car import is_count, look_both_ways, range_finder_angles
 from sb3_torcs.errors import InvalidOption, ModelMismatch, ZooConfigError, near_miss
@@ -132,8 +132,6 @@ def config_file(
         return path
     path = shipped_folder() / f"{algo.removeprefix(SBX)}.yml"
     if not path.is_file():
-        from rl_zoo3 import ALGOS
-
         known = sorted(file.stem for file in shipped_folder().glob("*.yml"))
         advice = (
             f"shipped: {', '.join(known)}; for another one give a file of your own, such as a "
@@ -141,7 +139,7 @@ def config_file(
         )
         raise ZooConfigError(
             f"no hyperparameters are shipped for the algorithm '{algo}'"
-            f"{near_miss(algo, () if algo in ALGOS else known, advice)}"
+            f"{near_miss(algo, () if algo in ALGORITHMS else known, advice)}"
         )
     return path
 

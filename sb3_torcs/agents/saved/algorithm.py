@@ -7,9 +7,17 @@ from pathlib import Path
 from typing import Any
 
 from sb3_torcs.agents.saved.file import referenced_class
-from sb3_torcs.errors import InvalidOption, ModelMismatch, PackageMissing, near_miss
+from sb3_torcs.errors import (
+    InvalidOption,
+    ModelMismatch,
+    PackageMissing,
+    install_line,
+    near_miss,
+    needs_extra,
+)
 
 __all__ = [
+    "ALGORITHMS",
     "SBX",
     "algorithm_class",
     "algorithm_of",
@@ -22,6 +30,15 @@ __all__ = [
 
 SBX = "sbx_"
 """Begins the names of SBX's algorithms, which are SB3's in JAX: ``"sbx_tqc"``."""
+
+ALGORITHMS = {
+    **{name.lower(): f"stable_baselines3.{name}" for name in (
+        "A2C", "DDPG", "DQN", "PPO", "SAC", "TD3",
+    )},
+    **{name.lower(): f"sb3_contrib.{name}" for name in ("ARS", "CrossQ", "QRDQN", "TQC", "TRPO")},
+    "ppo_lstm": "sb3_contrib.RecurrentPPO",
+}  # fmt: skip
+"""The RL Zoo's names, and the classes. Its own table would bring all that the zoo imports."""
 
 LIBRARIES = ("stable_baselines3", "sb3_contrib", "sbx")
 
@@ -49,15 +66,18 @@ def algorithm_class(name: str) -> Any:
     :raises InvalidOption: if there is no such algorithm
     :raises PackageMissing: if it is one of SBX, and that is not installed
     """
-    from rl_zoo3.utils import ALGOS
-
-    owner, classes = "the RL Zoo", ALGOS
     if name.startswith(SBX):
-        owner, classes = "SBX", _sbx_algorithms(name)
-    if name not in classes:
-        advice = f"it has: {', '.join(sorted(classes))}"
-        raise InvalidOption(f"{owner} has no algorithm '{name}'{near_miss(name, classes, advice)}")
-    return classes[name]
+        owner, known = "SBX", _sbx_algorithms(name)
+        if name in known:
+            return known[name]
+    else:
+        owner, known = "the RL Zoo", ALGORITHMS
+        if name in known:
+            library, _, class_name = known[name].rpartition(".")
+            with needs_extra(f"'{name}'"):
+                return getattr(importlib.import_module(library), class_name)
+    advice = f"it has: {', '.join(sorted(known))}"
+    raise InvalidOption(f"{owner} has no algorithm '{name}'{near_miss(name, known, advice)}")
 
 
 def known_parent(own: type) -> type:
@@ -90,8 +110,8 @@ def _sbx_algorithms(name: str) -> dict[str, Any]:
         sbx = importlib.import_module("sbx")
     except ImportError as error:
         raise PackageMissing(
-            f"'{name}' is an algorithm of SBX, which does not import ({error}); type: pip install "
-            "sbx-rl"
+            f"'{name}' is an algorithm of SBX, which does not import ({error}); type: "
+            f"{install_line('sbx')}"
         ) from error
     return {SBX + word.lower(): own for word, own in vars(sbx).items() if word[0].isupper()}
 
@@ -103,14 +123,12 @@ def told_algorithm(data: dict[str, Any]) -> str | None:
     :param data: of :func:`~sb3_torcs.agents.saved.file.saved_data`
     :return: the zoo's name of it; ``None`` if it cannot be inferred
     """
-    from rl_zoo3.utils import ALGOS
-
     if is_sbx(data):
         return SBX + referenced_class(data.get("policy_class")).split(".")[1]  # sbx.tqc.policies
     if "recurrent" in str(data.get("policy_class")).lower():
         return "ppo_lstm"
     family = referenced_class(data.get("policy_class")).split(".")[1:2]  # as in sb3_contrib.ars
-    if family and family[0] in ALGOS:
+    if family and family[0] in ALGORITHMS:
         return family[0]
     return next((algo for key, algo in TELLING_KEYS if key in data), None)
 

@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_torcs.agents.saved.file import referenced_class
-from sb3_torcs.errors import ModelNotTrusted
+from sb3_torcs.errors import ModelNotTrusted, needs_extra
 
 __all__ = [
     "Spaces",
@@ -208,7 +208,8 @@ def _known_class(path: str, modules: tuple[str, ...]) -> type:
     module, _, name = path.rpartition(".")
     if module not in modules:
         raise ModelNotTrusted(f"'{path}' is none of SB3's, sb3-contrib's or sb3_torcs's classes")
-    found = getattr(importlib.import_module(module), name, None)
+    with needs_extra(f"'{path}'"):
+        found = getattr(importlib.import_module(module), name, None)
     if not isinstance(found, type) or found.__module__ != module:
         raise ModelNotTrusted(f"'{module}' has no class '{name}'")
     return found
