@@ -14,7 +14,10 @@ _limits = [math.inf]
 
 def number() -> int:
     """Return how many cores this process may use at once."""
-    return int(min(len(os.sched_getaffinity(0)), *_limits))
+    # Windows and macOS do not restrict a process to some cores.
+    affinity = getattr(os, "sched_getaffinity", None)
+    own = (os.cpu_count() or 1) if affinity is None else len(affinity(0))
+    return int(min(own, *_limits))
 
 
 @contextlib.contextmanager

@@ -15,12 +15,18 @@ import yaml
 
 from sb3_torcs.errors import EXTRAS, OutputNotWritable, Sb3TorcsError, check_extras, install_line
 
+try:
+    import fcntl
+except ImportError:  # on Windows
+    fcntl = None  # type: ignore[assignment]
+
 __all__ = [
     "IN_A_FOLDER",
     "PICTURES",
     "checked_ending",
     "import_advice",
     "listed",
+    "lock",
     "path_and_arguments",
     "plain_python",
     "read_yaml",
@@ -173,7 +179,7 @@ def whole_file(
                 path.parent.mkdir(parents=True, exist_ok=True)
             aside.touch()  # a path that cannot be written raises here, before the work
             yield aside
-            with aside.open("rb") as written:
+            with aside.open("r+b") as written:  # Windows flushes only what may be written
                 os.fsync(written.fileno())
             aside.replace(path)
         finally:
@@ -185,6 +191,20 @@ def whole_file(
         raise OutputNotWritable(
             f"cannot write '{path}': {error.strerror or error}; {advice}"
         ) from error
+
+
+def lock(file: int, *, wait: bool) -> None:
+    """
+    Lock a file or a folder until it is closed. On Windows nothing is locked, as on file systems
+    that know no locks.
+
+    :param file: descriptor of the open file
+    :param wait: until another process has released it
+    :raises OSError: if the file system knows no locks
+    :raises BlockingIOError: if another process holds it, and this one does not wait
+    """
+    if fcntl is not None:
+        fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
 
 
 def read_yaml(text: str, loader_class: type[yaml.SafeLoader] = yaml.SafeLoader) -> Any:

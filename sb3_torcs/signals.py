@@ -12,6 +12,7 @@ from types import FrameType
 from typing import Any
 
 __all__ = [
+    "ENDING",
     "EXIT_STATUS",
     "answered",
     "counted_interrupts",
@@ -21,6 +22,10 @@ __all__ = [
 ]
 
 SOON = 0.1  # [s] until a signal that was ignored comes again
+# Windows has no SIGHUP.
+ENDING = tuple(signal.Signals[n] for n in ("SIGTERM", "SIGHUP") if n in signal.Signals.__members__)
+"""Signals that ask a process to end."""
+
 EXIT_STATUS = 128  # of a process that a signal has ended, plus the number of the signal
 
 
@@ -46,9 +51,8 @@ def answered(by: Callable[[int, FrameType | None], None], *numbers: int) -> Iter
 def held_back() -> Iterator[None]:
     """Let Ctrl-C, SIGTERM and SIGHUP wait until something has been done whole."""
     waiting: list[int] = []
-    signals = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
     try:
-        with answered(lambda number, _: waiting.append(number), *signals):
+        with answered(lambda number, _: waiting.append(number), signal.SIGINT, *ENDING):
             yield
     finally:
         for number in waiting[:1]:
@@ -89,7 +93,7 @@ def ignored_interrupts() -> Iterator[None]:
     """
     ignored: list[BaseException] = []
     timers: list[threading.Timer] = []
-    numbers: list[int] = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
+    numbers: list[int] = [signal.SIGINT, *ENDING]
     handlers = {number: signal.getsignal(number) for number in numbers}
     before = sys.unraisablehook
 
@@ -103,7 +107,7 @@ def ignored_interrupts() -> Iterator[None]:
         number = status - EXIT_STATUS if isinstance(status, int) else None
         # Whoever has set another handler counts signals, and knows of this one.
         if number in handlers and signal.getsignal(number) is handlers[number]:
-            timers.append(threading.Timer(SOON, os.kill, [os.getpid(), number]))
+            timers.append(threading.Timer(SOON, _send_again, [number]))
             timers[-1].start()
 
     sys.unraisablehook = note
@@ -117,6 +121,14 @@ def ignored_interrupts() -> Iterator[None]:
         for timer in timers:
             timer.cancel()
         sys.unraisablehook = before
+
+
+def _send_again(number: int) -> None:
+    """Send a signal to this process, which on Windows ``os.kill`` would end."""
+    if sys.platform == "win32":
+        signal.raise_signal(number)
+    else:
+        os.kill(os.getpid(), number)
 
 
 @contextlib.contextmanager

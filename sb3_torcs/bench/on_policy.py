@@ -14,6 +14,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import DummyVecEnv
 
+from sb3_torcs import cores
 from sb3_torcs.bench.drives import Figures
 from sb3_torcs.callbacks import LeanUpdatesCallback
 from sb3_torcs.policies.threads import one_thread
@@ -82,12 +83,12 @@ def ppo(seconds: float) -> Figures:
     :return: ``ppo_timesteps_per_s`` as ``sb3-torcs train`` learns, and
         ``ppo_dummy_timesteps_per_s`` in ``DummyVecEnv`` with SB3's own updates: of the best rollout
         with its update, by the wall clock, since other programs only slow down; ``None`` on a
-        single core
+        single core, and where a process cannot choose its cores
     """
     from sb3_torcs.training.zoo import config_file, read_entry
 
     names = "ppo_timesteps_per_s", "ppo_dummy_timesteps_per_s"
-    if len(os.sched_getaffinity(0)) < CORES:
+    if cores.number() < CORES or not hasattr(os, "sched_setaffinity"):
         return dict.fromkeys(names)
     entry = read_entry(config_file("ppo"), ENTRY)
     begin = time.perf_counter()
@@ -104,10 +105,10 @@ def ppo(seconds: float) -> Figures:
 @contextlib.contextmanager
 def _on_two_cores() -> Iterator[None]:
     """Let this thread, and those that it starts, run on two cores, and PyTorch on one."""
-    cores = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, sorted(cores)[:CORES])
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, sorted(before)[:CORES])
     try:
         with one_thread():
             yield
     finally:
-        os.sched_setaffinity(0, cores)
+        os.sched_setaffinity(0, before)

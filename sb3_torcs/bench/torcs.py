@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 import signal
 import statistics
 import time
@@ -15,6 +14,7 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 
+from sb3_torcs import cores
 from sb3_torcs.bench.drives import (
     RACES,
     REPEAT,
@@ -135,7 +135,7 @@ def vector(seconds: float) -> Figures:
     :return: ``torcs_vector2_ratio``: the speed-up of ``gym.make_vec`` by a second thread, divided
         by that of bare engines by a second process; the median over the turns
     """
-    if len(os.sched_getaffinity(0)) < 2:
+    if cores.number() < 2:
         return {"torcs_vector2_ratio": None}
     one, two = (gym.make_vec(TORCS, num_envs=RACES, threads=threads) for threads in (1, 2))
     actions = scripted_batches(one.reset(seed=0)[0], one.step, BATCHES)

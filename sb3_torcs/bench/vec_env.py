@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import statistics
 import time
 from collections.abc import Callable
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING
 import gymnasium as gym
 import numpy as np
 
+from sb3_torcs import cores
 from sb3_torcs.bench.drives import (
     RACES,
     REPEAT,
@@ -56,7 +56,7 @@ def vec_env(seconds: float) -> Figures:
         fast += _rates(two, actions, PART, time.perf_counter)
     one.close()
     two.close()
-    several = len(os.sched_getaffinity(0)) > 1
+    several = cores.number() > 1
     return {
         "vec_env_timesteps_per_s": statistics.median(processor),
         "vec_env_two_threads_ratio": max(fast) / max(slow) if several else None,

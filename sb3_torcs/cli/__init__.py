@@ -8,7 +8,6 @@ import os
 import signal
 import sys
 from collections.abc import Iterable, Sequence
-from signal import SIGHUP, SIGTERM
 from types import FrameType
 
 from sb3_torcs import __version__
@@ -33,7 +32,7 @@ from sb3_torcs.cli.common import CACHE_FIX, INTERRUPTED, READER_LEFT, drop_outpu
 from sb3_torcs.cli.parser import Parser
 from sb3_torcs.cli.plain import any_terminal, open_streams
 from sb3_torcs.errors import Sb3TorcsError
-from sb3_torcs.signals import EXIT_STATUS, answered, ignored_interrupts
+from sb3_torcs.signals import ENDING, EXIT_STATUS, answered, ignored_interrupts
 
 __all__ = ["main"]
 
@@ -83,7 +82,7 @@ def _run(args: argparse.Namespace) -> int:
         return USAGE_ERROR
     try:
         # Under nohup, SIGHUP is ignored and stays so.
-        ends = [n for n in (SIGTERM, SIGHUP) if signal.getsignal(n) == signal.SIG_DFL]
+        ends = [n for n in ENDING if signal.getsignal(n) == signal.SIG_DFL]
         with answered(_end, *ends), ignored_interrupts():
             status: int = args.run(args)
         sys.stdout.flush()

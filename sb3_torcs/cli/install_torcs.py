@@ -76,4 +76,9 @@ def _found_or_installed(args: argparse.Namespace, tell: Tell) -> Game:
     except BackendUnavailable as absent:
         if args.check:
             raise
+        if sys.platform in ("win32", "darwin"):
+            raise InstallFailed(
+                "the game is installed on Linux only; on Windows the whole package runs in WSL 2, "
+                "and TorcsLite-v0 needs no game"
+            ) from None
         return install_game(absent, tell, for_user=args.user or os.geteuid() != 0)

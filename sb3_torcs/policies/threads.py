@@ -109,4 +109,5 @@ def _work(tasks: SimpleQueue[Task]) -> None:
         tasks.get()()
 
 
-os.register_at_fork(after_in_child=_second.cache_clear)  # a child has none of the threads
+if hasattr(os, "register_at_fork"):  # a child has none of the threads
+    os.register_at_fork(after_in_child=_second.cache_clear)

@@ -6,7 +6,6 @@ the start and ends one second after the race.
 
 from __future__ import annotations
 
-import fcntl
 import os
 import select
 import struct
@@ -84,6 +83,8 @@ class GameVideo:
             self.display = stack.enter_context(VirtualDisplay(size))
             self._frames, written = os.pipe()
             stack.callback(os.close, self._frames)
+            import fcntl  # of Linux, like the game: other systems import this module, too
+
             with suppress(OSError):  # only faster
                 fcntl.fcntl(written, fcntl.F_SETPIPE_SZ, PIPE_SIZE)
             try:

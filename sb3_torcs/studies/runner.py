@@ -43,6 +43,8 @@ SESSION = ".session"  # where a killed run's temporary files are
 SCRATCH = "st-"  # prefix of folders for temporary files; short, since paths of sockets are limited
 MARK = ".of-a-study"  # a file that names the folder for temporary files
 PATIENCE = 30.0  # [s] until a folder for temporary files counts as one that cannot be removed
+REPLACED = [number for number in signal.Signals if number.name in ("SIGINT", "SIGTERM", "SIGUSR1")]
+"""Signals whose handlers Ray replaces; Windows has no SIGUSR1."""
 GRACE = 20.0  # [s] that Ray has to end after SIGTERM
 PRIVATE = "sb3_torcs_study"  # a resource that marks a Ray that was started by a study
 FAILED = "failed"  # the phase of a row with an error instead of a race
@@ -158,7 +160,7 @@ def run_study(
                 tell(trial, {"state": "done"})
         if left:
             # Ray and Tune replace these handlers and never put them back.
-            kept = handlers_kept(signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
+            kept = handlers_kept(*REPLACED)
             with kept, _ray(store, jobs, address, signals) as scratch:
                 _tune(left, store, scratch, tell)
     return store.results
@@ -223,7 +225,7 @@ def _ray(
     options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
     if address is None:
         options.update(
-            address="local", num_cpus=jobs or len(os.sched_getaffinity(0)),
+            address="local", num_cpus=jobs or cores.number(),
             include_dashboard=False, _temp_dir=str(scratch), resources={PRIVATE: 1},
         )  # fmt: skip
     else:

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import contextlib
 import csv
-import fcntl
 import io
 import json
 import shutil
@@ -28,7 +27,7 @@ import yaml
 
 from sb3_torcs.agents.saved.record import BEST_MODEL, STATISTICS
 from sb3_torcs.errors import StudyError
-from sb3_torcs.files import read_yaml, whole_file
+from sb3_torcs.files import lock, read_yaml, whole_file
 from sb3_torcs.studies.config import FIELDS, Study, Trial, track_name
 
 __all__ = [
@@ -80,7 +79,7 @@ class StudyFolder:
         with (self.path / LOCK).open("w") as file:
             try:
                 # What filelock does, in as few lines.
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                lock(file.fileno(), wait=False)
             except BlockingIOError as error:
                 raise StudyError(
                     f"another process runs the study in '{self.path}'; wait for it, or give "

@@ -20,9 +20,17 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_torcs.agents.saved.record import STATISTICS
 from sb3_torcs.car import check_count
-from sb3_torcs.errors import TrainingDiverged
+from sb3_torcs.errors import OutputNotWritable, TrainingDiverged
+from sb3_torcs.files import writable_folder
 
-__all__ = ["REPLAY_BUFFER", "SAVING", "KeepCallback", "WholeFiles", "check_healthy"]
+__all__ = [
+    "REPLAY_BUFFER",
+    "SAVING",
+    "KeepCallback",
+    "WholeFiles",
+    "check_healthy",
+    "tensorboard_folder",
+]
 
 SAVING = "saving what was learned; Ctrl-C once more drops it\n"
 
@@ -52,7 +60,7 @@ class WholeFiles:
         """Move the files, which are complete, to their final paths."""
         files = self.unfinished()
         for file in files:
-            with file.open("rb") as content:
+            with file.open("r+b") as content:  # Windows flushes only what may be written
                 os.fsync(content.fileno())
         for file in files:
             file.replace(self.place(file))
@@ -194,3 +202,22 @@ def _is_healthy(model: BaseAlgorithm) -> bool:
     except ValueError:  # of a distribution whose mean is no number
         return False
     return bool(np.isfinite(actions).all())
+
+
+def tensorboard_folder(folder: str | Path) -> Path:
+    """
+    Make a folder for TensorBoard, whose code accepts only UTF-8 names.
+
+    :param folder: of its files
+    :return: the folder
+    :raises OutputNotWritable: if it cannot be written, or has another name
+    """
+    path = writable_folder(folder)
+    try:
+        str(path.absolute()).encode()
+    except UnicodeEncodeError as error:
+        raise OutputNotWritable(
+            f"TensorBoard cannot write to '{path}', whose name is not UTF-8; give another folder: "
+            "--tensorboard DIR"
+        ) from error
+    return path

@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import copy
-import fcntl
 import io
 import locale
 import os
@@ -44,6 +43,7 @@ from sb3_torcs.errors import (
     WorkerLost,
     ZooConfigError,
 )
+from sb3_torcs.files import lock
 from sb3_torcs.signals import counted_interrupts
 from sb3_torcs.training.keeping import SAVING, KeepCallback, WholeFiles
 from sb3_torcs.training.resuming import restore_statistics
@@ -401,13 +401,13 @@ def _alone(folder: Path) -> Iterator[None]:
     :param folder: of all runs of an algorithm; is made
     """
     folder.mkdir(parents=True, exist_ok=True)
-    directory = os.open(folder, os.O_RDONLY)
-    try:
-        with contextlib.suppress(OSError):  # of file systems without locks
-            fcntl.flock(directory, fcntl.LOCK_EX)
+    with contextlib.ExitStack() as stack:
+        # Windows does not open folders, and some file systems have no locks.
+        with contextlib.suppress(OSError):
+            directory = os.open(folder, os.O_RDONLY)
+            stack.callback(os.close, directory)
+            lock(directory, wait=True)
         yield
-    finally:
-        os.close(directory)
 
 
 @contextlib.contextmanager

@@ -135,6 +135,7 @@ def train_run(options: TrainOptions) -> Run:
     """
     from sb3_torcs.agents.models import find_model
     from sb3_torcs.training import zoo
+    from sb3_torcs.training.keeping import tensorboard_folder
 
     check_extras("to train", "rl_zoo3")
     _check_numbers(options)
@@ -149,7 +150,7 @@ def train_run(options: TrainOptions) -> Run:
     if options.progress or options.pictures is not None:
         entry["callback"] = _with_display(options, entry.get("callback"))
     folder = writable_folder(options.folder)
-    tensorboard = _for_tensorboard(options.tensorboard or folder / "tensorboard")
+    tensorboard = tensorboard_folder(options.tensorboard or folder / "tensorboard")
     words = _zoo_words(options, wanted, changed)
     words += ["--log-folder", str(folder), "--tensorboard-log", str(tensorboard)]
     words += ["--trained-agent", str(resume)] if resume else []
@@ -162,19 +163,6 @@ def _check_numbers(options: TrainOptions) -> None:
         check_count("timesteps", options.timesteps)
     check_count("eval_episodes", options.eval_episodes)
     check_count("seed", options.seed, least=0)
-
-
-def _for_tensorboard(folder: str | Path) -> Path:
-    """Make a folder for TensorBoard, whose code accepts only UTF-8 names."""
-    path = writable_folder(folder)
-    try:
-        str(path.absolute()).encode()
-    except UnicodeEncodeError as error:
-        raise OutputNotWritable(
-            f"TensorBoard cannot write to '{path}', whose name is not UTF-8; give another folder: "
-            "--tensorboard DIR"
-        ) from error
-    return path
 
 
 def _entry(
