@@ -27,7 +27,7 @@ from sb3_torcs import __version__
 from sb3_torcs.agents import ScriptedDriver, models
 from sb3_torcs.agents.saved import record as model_record
 from sb3_torcs.bench.stages import KEYS
-from sb3_torcs.cli import VERBS, common, doctor, evaluate, main, train
+from sb3_torcs.cli import VERBS, common, doctor, evaluate, main, requirements, train
 from sb3_torcs.errors import BackendUnavailable, InvalidOption, OutputNotWritable, ZooConfigError
 from sb3_torcs.evaluation import protocol as evaluation
 from sb3_torcs.evaluation import recording
@@ -1175,10 +1175,11 @@ def test_a_cache_that_cannot_be_written_is_told_with_what_to_type(capsys, monkey
 
 
 def test_the_doctor_says_what_to_type(capsys, monkeypatch):
-    monkeypatch.setattr(doctor, "PACKAGES", {"no-such-package": "no_such_package"})
-    _, out, _ = run(capsys, "doctor")
+    monkeypatch.setattr(requirements.metadata, "requires", lambda _: ["no-such-package[a,b]>=2"])
+    status, out, _ = run(capsys, "doctor")
+    assert status == 1
     assert "MISSING  no-such-package" in out
-    assert "-> pip install 'no-such-package'" in out
+    assert '-> pip install "no-such-package[a,b]>=2"' in out
 
 
 # bench

@@ -3,54 +3,31 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib
-import importlib.metadata
 import os
 import shutil
 import sys
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any
 
 from sb3_torcs.car import DEFAULT_CAR
 from sb3_torcs.cli.common import CACHE_FIX, lacks_cache, print_json, quiet_output
-from sb3_torcs.errors import BackendUnavailable, Sb3TorcsError
+from sb3_torcs.cli.requirements import Check, check_core, check_extras
+from sb3_torcs.errors import BackendUnavailable, Sb3TorcsError, install_line
 from sb3_torcs.torcs.building import build_command
 from sb3_torcs.torcs.installation import find_game, linker_knows
 
 __all__ = ["Check", "add_parser", "checks", "run"]
 
 OLDEST_PYTHON = (3, 11)
-PACKAGES = {
-    "gymnasium": "gymnasium",
-    "highway-env": "highway_env",
-    "imageio-ffmpeg": "imageio_ffmpeg",
-    "matplotlib": "matplotlib",
-    "numba": "numba",
-    "numpy": "numpy",
-    "rl_zoo3": "rl_zoo3",
-    "stable-baselines3": "stable_baselines3",
-    "tensorboard": "tensorboard",
-    "torch": "torch",
-}
-"""Names of distributions, and of the modules that are imported of them."""
-
 EXTENSION = "sb3_torcs._engine"
 COMPILERS = ("c++", "g++", "clang++")
 GAME_LIBRARIES = ("_scr_server", "_game_window")
 PROGRAM_USERS = "`watch`, `serve`, `robots --game`, backend 'scr' and render_mode 'game'"
 LIBRARY_USERS = "`watch`, `serve`, backend 'scr' and render_mode 'game'"
 REINSTALL = "sudo apt-get install --reinstall torcs torcs-data"
-
-
-@dataclass(frozen=True)
-class Check:
-    """The result of one check."""
-
-    name: str
-    ok: bool
-    found: str
-    fix: str | None  # what to do; ``None`` when nothing is wrong
 
 
 def add_parser(subparsers: Any) -> None:
@@ -94,8 +71,9 @@ def checks() -> list[Check]:
 
     :return: one result per check
     """
-    results = [_python(), *(_package(name, module) for name, module in PACKAGES.items())]
-    results += [_guarded(check) for check in (_compile_cache, _bundled_tracks, _video_encoder)]
+    results = [_python(), *check_core(), *check_extras()]
+    plain = _compile_cache, _mathematics, _bundled_tracks, _video_encoder
+    results += [_guarded(check) for check in plain]
     results.append(_guarded(_torcslite, "TorcsLite-v0"))
     results += [_guarded(check) for check in (_compiler, _extension)]
     game = _guarded(_game)
@@ -135,15 +113,6 @@ def _python() -> Check:
     return Check("python", ok, found, None if ok else "install Python 3.11 or newer")
 
 
-def _package(name: str, module: str) -> Check:
-    try:
-        version = importlib.metadata.version(name)
-        importlib.import_module(module)
-    except Exception as error:
-        return Check(name, False, f"{type(error).__name__}: {error}", f"pip install '{name}'")
-    return Check(name, True, version, None)
-
-
 def _compile_cache() -> Check:
     """Ask numba where it keeps what it compiles. Without that, each start takes seconds longer."""
     try:
@@ -153,10 +122,24 @@ def _compile_cache() -> Check:
     return Check("compile cache", True, automatic_gear.stats.cache_path, None)
 
 
-def _bundled_tracks() -> Check:
-    from sb3_torcs.tracks.catalogue import available_tracks
+def _mathematics() -> Check:
+    """Compute known values by the functions on which the laps of all machines depend."""
+    wrong = []
+    for module in ("sb3_torcs._engine", "sb3_torcs.maths"):
+        with contextlib.suppress(ImportError, AttributeError):  # another check misses the engine
+            wrong += importlib.import_module(module).check_maths()
+    if not wrong:
+        return Check("mathematics", True, "the same as on other machines", None)
+    found = f"other values of {', '.join(wrong)}: laps differ from those of other machines"
+    return Check("mathematics", False, found, build_command())
 
-    names = [track.name for track in available_tracks() if track.source == "bundled"]
+
+def _bundled_tracks() -> Check:
+    from sb3_torcs.torcs.track_names import known_tracks
+    from sb3_torcs.tracks.catalogue import summaries
+
+    files = [file for file in known_tracks().values() if file.source == "bundled"]
+    names = [track.name for track in summaries(files)]
     fix = None if names else "pip install --force-reinstall sb3-torcs"
     return Check("bundled tracks", bool(names), ", ".join(names) or "none", fix)
 
@@ -166,8 +149,11 @@ def _video_encoder() -> Check:
         import imageio_ffmpeg
 
         return Check("video encoder", True, imageio_ffmpeg.get_ffmpeg_exe(), None)
-    except (ImportError, RuntimeError) as error:
-        return Check("video encoder", False, str(error), "pip install imageio-ffmpeg")
+    except ImportError as error:
+        found = f"{error}; type: {install_line('imageio_ffmpeg')}"
+        return _optional("video encoder", found, "videos")
+    except RuntimeError as error:
+        return Check("video encoder", False, str(error), install_line("imageio_ffmpeg"))
 
 
 def _torcslite() -> Check:
@@ -211,12 +197,12 @@ def _game() -> Check:
 
 def _tracks() -> Check:
     """Read all tracks of the game."""
-    from sb3_torcs.tracks.catalogue import load_track
+    from sb3_torcs.torcs.track_names import known_tracks
+    from sb3_torcs.tracks.catalogue import summaries
 
-    tracks = find_game().tracks()
+    tracks = known_tracks(find_game())
     try:
-        for path in tracks.values():
-            load_track(path)
+        summaries(tracks.values())
     except Sb3TorcsError as error:
         return Check("tracks", False, str(error), REINSTALL)
     categories = [name.partition("/")[0] for name in tracks]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -19,7 +20,7 @@ from sb3_torcs.tracks.generator import random_track
 from sb3_torcs.tracks.torcs_xml import read_track_xml
 from sb3_torcs.tracks.track import Track, TrackSummary, closed
 
-__all__ = ["CATEGORIES", "available_tracks", "lasting_name", "load_track", "tracks_of"]
+__all__ = ["CATEGORIES", "available_tracks", "lasting_name", "load_track", "summaries", "tracks_of"]
 
 
 CATEGORIES = ("road", "oval", "dirt")
@@ -53,9 +54,20 @@ def load_track(
 
 def available_tracks() -> list[TrackSummary]:
     """List the bundled tracks and those of the installed TORCS, by category and name."""
+    return summaries(known_tracks().values())
+
+
+def summaries(files: Iterable[TrackFile]) -> list[TrackSummary]:
+    """
+    Read track files only as far as a list of tracks needs.
+
+    :param files: of the tracks
+    :return: by category and name
+    :raises TrackFileError: if one cannot be read
+    """
     folders = tuple(torcs_folders())
     return sorted(
-        (_read(file, folders, located=False).summary() for file in known_tracks().values()),
+        (_read(file, folders, located=False).summary() for file in files),
         key=lambda entry: (
             (CATEGORIES.index(entry.category), entry.name)
             if entry.category in CATEGORIES
