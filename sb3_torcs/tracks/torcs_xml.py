@@ -337,7 +337,6 @@ def _corner(segments: Iterable[Segment]) -> tuple[float, float]:
     :return: x and y [m] with the beginning of the road's right edge as origin
     """
     low_x = low_y = x = y = heading = 0.0
-    sin, cos = math.sin, math.cos
     for i, s in enumerate(segments):
         y = 0.5 * s.width_start if i == 0 else y
         samples = SAMPLES_PER_ARC if s.curvature else 1
