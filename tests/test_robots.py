@@ -11,7 +11,7 @@ import resource
 
 import pytest
 
-from sb3_torcs.agents.robots import race, race_to_its_end
+from sb3_torcs.agents.robots import _result, race, race_to_its_end
 from sb3_torcs.backends.native import make_engine
 from sb3_torcs.car import CONTROL_TICK
 from sb3_torcs.errors import InvalidOption, OutputNotWritable, TrackNotFound, UnknownRobot
@@ -97,6 +97,16 @@ class TestEqualToTheGame:
 
 
 class TestItself:
+    def test_who_still_drives_when_the_race_is_over_has_not_finished(self, game):
+        """The winner has driven one more lap by then; the game says no more of such a car."""
+        entries = [game.parse_robot("inferno"), AGENT]
+        engine = make_engine(game, "g-track-1", entries, session="race", laps=1, flagged=True)
+        engine.start()
+        while not engine.ended:
+            engine.advance(50)  # the agent stands on its brake
+        winner, other = (_result(engine, entries, 1, row) for row in engine.results())
+        assert (winner.out, other.out) == (False, True)
+
     def test_a_race_is_the_same_again(self, game):
         drivers = [game.parse_robot(name) for name in ("bt", "olethros", "inferno")]
         first = race(drivers, "dirt-2", 2, session="race")

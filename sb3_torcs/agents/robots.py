@@ -127,7 +127,7 @@ def _engine(
 def _result(
     engine: Any, robots: Sequence[tuple[str, int]], rank: int, row: tuple[Any, ...]
 ) -> RobotResult:
-    entry, laps_completed, total_time, best_lap, damage, out = row
+    entry, laps_completed, total_time, best_lap, damage, _ = row
     name, index = robots[entry]
     return RobotResult(
         robot=name,
@@ -137,7 +137,7 @@ def _result(
         total_time=total_time,
         rank=rank,
         damage=damage,
-        out=out,
+        out=not engine.finished(entry),
         laps_completed=laps_completed,
         best_lap=best_lap or None,
     )

@@ -33,7 +33,7 @@ class RobotResult:
         [s]; 0 without one
     :param rank: at the end, 1 for the winner
     :param damage: at the end of a race, and at the end of the last whole lap of a practice [-]
-    :param out: whether it was out of the race before the end: wrecked, or out of fuel
+    :param out: whether it did not see the flag: wrecked, out of fuel, or a lap too slow
     :param laps_completed: number of whole laps
     :param best_lap: of those that count by the rules: no wall touched, no corner cut [s]
     :param client: the name or the address of the client that drove; empty for a robot

@@ -100,7 +100,8 @@ def _race_results(
     last_seen = [r.total_time - row.number("penaltytime")
                  for r, row in zip(results, ranked, strict=True)]  # fmt: skip
     finished = [t for r, t in zip(results, last_seen, strict=True) if r.laps_completed == laps]
-    # Lapped drivers end at the line after the winner; those who are out do not reach it.
+    # Lapped drivers end at the line after the winner. The race is over when one who has finished is
+    # there again: who has not been there by then has not finished, wrecked or just slow.
     over = min(finished, default=math.inf)
     return [
         replace(result, out=result.laps_completed < laps and seen < over)
