@@ -133,10 +133,8 @@ def config_file(
     path = shipped_folder() / f"{algo.removeprefix(SBX)}.yml"
     if not path.is_file():
         known = sorted(file.stem for file in shipped_folder().glob("*.yml"))
-        advice = (
-            f"shipped: {', '.join(known)}; for another one give a file of your own, such as a "
-            f"changed copy of {shipped_folder() / 'sac.yml'}: {option}"
-        )
+        example = shipped_folder() / "sac.yml"
+        advice = f"shipped: {', '.join(known)}; else give a changed copy of {example}: {option}"
         raise ZooConfigError(
             f"no hyperparameters are shipped for the algorithm '{algo}'"
             f"{near_miss(algo, () if algo in ALGORITHMS else known, advice)}"
