@@ -191,12 +191,12 @@ def test_a_forward_of_somebody_else_decides_and_stays():
 
 
 @pytest.mark.parametrize("algorithm", [PPO, DDPG, TD3])
-def test_parameters_in_shared_memory_learn(algorithm):
-    """PyTorch moves the parameters, and frees the memory in which they lay."""
+def test_parameters_that_processes_share_learn(algorithm):
+    """PyTorch moves the parameters, and frees the place where they lay."""
 
     def share(model):
         model.policy.share_memory()
-        np.zeros(1 << 20, np.float32)[:] = 1.7e9  # takes the memory that was freed
+        np.zeros(1 << 20, np.float32)[:] = 1.7e9  # takes the place that was freed
 
     stock, _, _ = learned(algorithm, share, "_on_rollout_end", lean=False)
     lean, _, fits = learned(algorithm, share, "_on_rollout_end", lean=True)
