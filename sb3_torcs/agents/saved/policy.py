@@ -185,6 +185,8 @@ def build_policy(said: Mapping[str, Any], seen: Spaces) -> Any:
     :return: the policy, without its weights; it cannot learn
     :raises ModelNotTrusted: if that takes more than plain data and known classes
     """
+    from stable_baselines3.common.policies import ActorCriticPolicy
+
     from sb3_torcs.policies.optimizers import IdleOptimizer
 
     if "unreadable" in said:
@@ -200,6 +202,8 @@ def build_policy(said: Mapping[str, Any], seen: Spaces) -> Any:
     taken = inspect.signature(policy_class).parameters
     if "optimizer_class" in taken or "kwargs" in taken:
         kwargs["optimizer_class"] = IdleOptimizer
+    if issubclass(policy_class, ActorCriticPolicy):
+        kwargs["ortho_init"] = False  # of weights that are replaced: it would load LAPACK
     return policy_class(**{key: given[key] for key in given if key in taken}, **kwargs)
 
 
