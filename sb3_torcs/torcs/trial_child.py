@@ -9,7 +9,6 @@ import contextlib
 import ctypes
 import json
 import os
-import resource
 import signal
 import sys
 from typing import Any
@@ -75,6 +74,8 @@ def _limit(owner: int, seconds: int) -> None:
     :param owner: the process that waits for this one
     :param seconds: of processor time, so that a busy machine does not change the result
     """
+    import resource  # of Linux, like the game: other systems import this module, too
+
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != owner:
         os._exit(1)  # it had ended before
