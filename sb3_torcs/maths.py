@@ -13,10 +13,14 @@ Errors stay below one unit of the last place. Compiled code calls these function
 from __future__ import annotations
 
 import math
+import types
 
 import numpy as np
 import numpy.typing as npt
 from numba import njit
+
+from sb3_torcs import plain_maths
+from sb3_torcs.plain_maths import ARCS, ONE, ROUND, arc, parts
 
 __all__ = [
     "atan",
@@ -31,31 +35,17 @@ __all__ = [
     "lengths",
     "sin",
     "tan",
+    "wrong_functions",
 ]
 
 FloatArray = npt.NDArray[np.float64]
 
 _compiled = njit(cache=True, error_model="numpy")
 
-ONE = 1 << 200  # stands for 1 in the whole numbers that make the tables
-ARCS = 16  # [-] entries from 0 to 1 in the table of arcs, without the last
 BENDS = 10  # [-] terms of its series
 POWERS = 32  # [-] entries from 1 to 2 in the table of powers
-ROUND = 1.5 * 2.0**52  # added and taken away again, it rounds to a whole number
-FAR = 1000.0  # [rad] angles beyond are first reduced by whole turns, which is less precise
 LARGEST, SMALLEST = 710.0, -746.0  # beyond, the exponential function is infinite or 0
 LEAST = 1077  # [-] halvings of 1 in the table of scales, before which it has no entries
-
-
-def _arc(share: int) -> int:
-    """Arc tangent of ``share / ARCS`` in parts of ``ONE``, by Euler's series."""
-    square, whole = share * share, ARCS * ARCS
-    term = ONE * share * ARCS // (whole + square)
-    total, n = 0, 0
-    while term:
-        total, n = total + term, n + 1
-        term = term * 2 * n * square // ((2 * n + 1) * (whole + square))
-    return total
 
 
 def _bends(share: int) -> list[float]:
@@ -80,113 +70,31 @@ def _power(share: int) -> int:
     return power
 
 
-def _parts(number: int, *bits: int) -> list[float]:
-    """Floats of so many bits each, whose sum is a number in parts of ``ONE``."""
-    parts = []
-    for size in bits:
-        cut = max(number.bit_length() - size, 0)
-        part = (number + (1 << cut >> 1)) >> cut << cut
-        parts.append(part / ONE)
-        number -= part
-    return parts
-
-
-_ARCS = [_arc(share) for share in range(ARCS + 1)]
+_ARCS = [arc(share) for share in range(ARCS + 1)]
 _PI = 4 * _ARCS[-1]
 # What arcs count from, in the octants of atan2: 0, a quarter turn back, half a turn back, a
 # quarter turn on.
 _BASES = np.array([
-    [_parts(base + sign * arc, 53, 53) for arc in _ARCS]
+    [parts(base + sign * arc, 53, 53) for arc in _ARCS]
     for base, sign in ((0, 1), (_PI // 2, -1), (_PI, -1), (_PI // 2, 1))
 ])  # fmt: skip
 _BENDS = np.array([_bends(share) for share in range(ARCS + 1)])
-_POWERS = np.array([_parts(_power(share), 53, 53) for share in range(POWERS)])
+_POWERS = np.array([parts(_power(share), 53, 53) for share in range(POWERS)])
 _SCALES = np.array([math.ldexp(1.0, halvings) for halvings in range(-LEAST, 1024)] + [math.inf])
 _LN2 = sum((ONE >> n) // n for n in range(1, ONE.bit_length()))
 # Of so few bits that products with the number of reductions are exact, but for the last part.
-_QUARTER_1, _QUARTER_2, _QUARTER_3 = _parts(_PI // 2, 33, 33, 53)
-_STEP_1, _STEP_2 = _parts(_LN2 // POWERS, 36, 53)
-_EIGHTH = _parts(_PI // 4, 53)[0]
-_QUARTERS = 2 * ONE / _PI  # [1/rad]
+_STEP_1, _STEP_2 = parts(_LN2 // POWERS, 36, 53)
 _STEPS = POWERS * ONE / _LN2
 
-_S3, _S5, _S7, _S9 = -1.0 / 6.0, 1.0 / 120.0, -1.0 / 5040.0, 1.0 / 362880.0
-_S11, _S13 = -1.0 / 39916800.0, 1.0 / 6227020800.0
-_S15, _S17 = -1.0 / 1307674368000.0, 1.0 / 355687428096000.0
-_C4, _C6, _C8, _C10 = 1.0 / 24.0, -1.0 / 720.0, 1.0 / 40320.0, -1.0 / 3628800.0
-_C12, _C14, _C16 = 1.0 / 479001600.0, -1.0 / 87178291200.0, 1.0 / 20922789888000.0
 
-
-@_compiled
-def _reduced(angle: float) -> tuple[int, float, float]:
-    """Return how many quarter turns an angle has, and the rest in two parts [rad]."""
-    if abs(angle) <= _EIGHTH:
-        return 0, angle, 0.0
-    if abs(angle) > FAR:
-        angle %= math.tau
-    quarters = angle * _QUARTERS + ROUND - ROUND
-    near, taken = angle - quarters * _QUARTER_1, quarters * _QUARTER_2
-    rest = near - taken
-    back = near - rest
-    lost = (near - (rest + back)) + (back - taken)  # by rounding the rest
-    return int(quarters) & 3, rest, lost - quarters * _QUARTER_3
-
-
-@_compiled
-def _sine(rest: float, lost: float) -> float:
-    """What is to be added to an angle of at most an eighth turn to get its sine."""
-    z = rest * rest
-    w = z * z
-    even = _S3 + w * (_S7 + w * (_S11 + w * _S15))
-    odd = _S5 + w * (_S9 + w * (_S13 + w * _S17))
-    return rest * z * (even + z * odd) + lost * (1.0 - 0.5 * z)
-
-
-@_compiled
-def _cosine(rest: float, lost: float) -> tuple[float, float]:
-    """The cosine of an angle of at most an eighth turn, in two parts."""
-    z = rest * rest
-    w = z * z
-    even = _C4 + w * (_C8 + w * (_C12 + w * _C16))
-    odd = _C6 + w * (_C10 + w * _C14)
-    half = 0.5 * z
-    most = 1.0 - half
-    return most, (1.0 - most - half) + (w * (even + z * odd) - rest * lost)
-
-
-@_compiled
-def cos_sin(angle: float) -> tuple[float, float]:
-    """
-    Compute cosine and sine together, which is faster than one after the other.
-
-    :param angle: [rad]
-    """
-    quarter, rest, lost = _reduced(angle)
-    most, little = _cosine(rest, lost)
-    sine, cosine = rest + _sine(rest, lost), most + little
-    if quarter & 1:
-        cosine, sine = -sine, cosine
-    return (-cosine, -sine) if quarter & 2 else (cosine, sine)
-
-
-@_compiled
-def cos(angle: float) -> float:
-    """
-    Compute the cosine.
-
-    :param angle: [rad]
-    """
-    return cos_sin(angle)[0]
-
-
-@_compiled
-def sin(angle: float) -> float:
-    """
-    Compute the sine.
-
-    :param angle: [rad]
-    """
-    return cos_sin(angle)[1]
+_home = dict(vars(plain_maths))
+"""Where the compiled functions find each other, in place of the plain ones."""
+for _name in ("reduced", "sine_rest", "cosine_parts", "cos_sin", "cos", "sin"):
+    _copy = types.FunctionType(getattr(plain_maths, _name).__code__, _home, _name)
+    _copy.__doc__ = getattr(plain_maths, _name).__doc__
+    _home[_name] = _compiled(_copy)
+_reduced, _sine, _cosine = _home["reduced"], _home["sine_rest"], _home["cosine_parts"]
+cos_sin, cos, sin = _home["cos_sin"], _home["cos"], _home["sin"]
 
 
 @_compiled
@@ -338,3 +246,24 @@ def lengths(vectors: FloatArray) -> FloatArray:
     for i in range(len(vectors)):
         found[i] = hypot(vectors[i, 0], vectors[i, 1])
     return found
+
+
+_KNOWN = (
+    (atan, (-7.1,), "-0x1.6e4d9ad83dd98p+0"),
+    (atan2, (-5.0, 0.1), "-0x1.8d0129acd6d1cp+0"),
+    (cos, (-123.456,), "-0x1.307e5980a1558p-1"),
+    (exp, (-12.3,), "0x1.31765fdaf4f37p-18"),
+    (hypot, (0.3, -2.0), "0x1.02dd2dc67f097p+1"),
+    (sin, (-123.456,), "0x1.9b9dadc41aeb6p-1"),
+    (tan, (-123.456,), "-0x1.5a0fe5da94890p+0"),
+)
+"""What functions return for some arguments on every machine."""
+
+
+def wrong_functions() -> list[str]:
+    """List the functions that compute something else on this machine."""
+    return [
+        function.__name__
+        for function, arguments, known in _KNOWN
+        if function(*arguments) != float.fromhex(known)
+    ]

@@ -124,10 +124,11 @@ def _compile_cache() -> Check:
 
 def _mathematics() -> Check:
     """Compute known values by the functions on which the laps of all machines depend."""
-    wrong = []
-    for module in ("sb3_torcs._engine", "sb3_torcs.maths"):
-        with contextlib.suppress(ImportError, AttributeError):  # another check misses the engine
-            wrong += importlib.import_module(module).check_maths()
+    from sb3_torcs.maths import wrong_functions
+
+    wrong = wrong_functions()
+    with contextlib.suppress(ImportError, AttributeError):  # another check misses the engine
+        wrong += importlib.import_module(EXTENSION).wrong_functions()
     if not wrong:
         return Check("mathematics", True, "the same as on other machines", None)
     found = f"other values of {', '.join(wrong)}: laps differ from those of other machines"

@@ -22,7 +22,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_torcs import maths
 from sb3_torcs.errors import TrackFileError
 from sb3_torcs.torcs.installation import torcs_folders
 from sb3_torcs.torcs.params import Keys, Section, read_params
@@ -336,6 +335,8 @@ def _corner(segments: Iterable[Segment]) -> tuple[float, float]:
     :param segments: in the steps of the game's loader
     :return: x and y [m] with the beginning of the road's right edge as origin
     """
+    from sb3_torcs import maths  # compiled: a long road has 100,000 samples
+
     low_x = low_y = x = y = heading = 0.0
     for i, s in enumerate(segments):
         y = 0.5 * s.width_start if i == 0 else y

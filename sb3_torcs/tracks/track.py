@@ -17,8 +17,8 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from sb3_torcs import maths
 from sb3_torcs.car import FloatArray
+from sb3_torcs.plain_maths import cos_sin, sin
 from sb3_torcs.tracks.profile import RoadProfile, road_profile
 
 __all__ = [
@@ -250,7 +250,7 @@ class Track:
         """
         curvature, *begin = self.table[index, CURVATURE:WIDTH_START].tolist()
         x, y, heading = _advance(Pose(*begin), along, curvature)
-        cosine, sine = maths.cos_sin(heading)
+        cosine, sine = cos_sin(heading)
         return Pose(x - offset * sine, y + offset * cosine, heading)
 
     def summary(self) -> TrackSummary:
@@ -270,9 +270,9 @@ def _advance(pose: Pose, length: float, curvature: float) -> Pose:
     :return: the pose there
     """
     half_turn = 0.5 * curvature * length
-    chord = length * (maths.sin(half_turn) / half_turn if half_turn else 1.0)
+    chord = length * (sin(half_turn) / half_turn if half_turn else 1.0)
     direction = pose.heading + half_turn
-    cosine, sine = maths.cos_sin(direction)
+    cosine, sine = cos_sin(direction)
     return Pose(pose.x + chord * cosine, pose.y + chord * sine, direction + half_turn)
 
 
@@ -336,7 +336,7 @@ def _closing_step(segments: Sequence[Segment], gap: Pose) -> tuple[Segment, ...]
     lengths = np.array([segment.length for segment in segments])
     curvatures = np.array([segment.curvature for segment in segments])
     x, y, heading = np.array(ends).T
-    cosines, sines = maths.directions(heading).T
+    cosines, sines = np.array([cos_sin(angle) for angle in heading.tolist()]).T
     # One metre more of a segment moves the rest along its end and turns it about its end.
     effect = np.stack([
         cosines - curvatures * (pose.y - y), sines + curvatures * (pose.x - x), curvatures
