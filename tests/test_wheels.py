@@ -77,7 +77,10 @@ def installed(wheel, folder):
 
 
 def run(python, code, folder, *words):
-    environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}  # to compile for a few steps takes longer
+    environment = {
+        **os.environ,
+        "NUMBA_DISABLE_JIT": "1",
+    }  # to compile for a few steps takes longer
     call = [python, "-c", code, *words]
     done = subprocess.run(call, cwd=folder, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

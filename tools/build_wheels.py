@@ -100,7 +100,15 @@ def named(wheel: Path) -> Path:
     found = json.loads(subprocess.run(audit, check=True, capture_output=True, text=True).stdout)
     if found["external_libs"]:
         raise SystemExit(f"{wheel.name} needs libraries that not every Linux has: {found}")
-    tags = [sys.executable, "-m", "wheel", "tags", "--remove", "--platform-tag", found["overall_tag"]]
+    tags = [
+        sys.executable,
+        "-m",
+        "wheel",
+        "tags",
+        "--remove",
+        "--platform-tag",
+        found["overall_tag"],
+    ]
     done = subprocess.run([*tags, str(wheel)], check=True, capture_output=True, text=True)
     return wheel.parent / done.stdout.split()[-1]
 
