@@ -23,6 +23,7 @@ from unittest.mock import patch
 import gymnasium as gym
 import pytest
 from gymnasium.utils.env_checker import check_env as check_gymnasium
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 import sb3_torcs  # noqa: F401  registers the environments
@@ -45,7 +46,7 @@ from sb3_torcs.training.run import TrainOptions
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
 PACKAGE = ROOT / "sb3_torcs"
-TINY = "TIMESTEPS = 150"  # timesteps of a training in a snippet
+SHORT = 150  # [timesteps] of a training in a snippet
 
 
 # ------------------------------------------------------------------------------ generated tables
@@ -184,7 +185,7 @@ def sensor_table(name="base"):
 
 
 GENERATED = {
-    "README.md": {"verbs": verbs_table},
+    "docs/commands.md": {"verbs": verbs_table},
     "docs/environments.md": {
         "arguments": arguments_table,
         "torcs-arguments": torcs_arguments_table,
@@ -254,10 +255,15 @@ WITH_PYTHON = [page for page in PAGES if fenced(page, "python")]
 def test_the_snippets_of_a_page_run_one_after_the_other(page, tmp_path, monkeypatch, capsys):
     """Trainings are cut to a budget of seconds; nothing else is changed."""
     monkeypatch.chdir(tmp_path)
+    begin = BaseAlgorithm._setup_learn
+
+    def begin_short(model, total_timesteps, *args, **kwargs):
+        return begin(model, min(total_timesteps, SHORT), *args, **kwargs)
+
+    monkeypatch.setattr(BaseAlgorithm, "_setup_learn", begin_short)
     names = {"__name__": f"snippets_{page.stem}"}
     with patch.dict(rewards.TERMS):  # to which a page adds one
         for number, code in enumerate(fenced(page, "python"), 1):
-            code = re.sub(r"^TIMESTEPS = .*$", TINY, code, flags=re.M)
             exec(compile(code, f"{page.name}, snippet {number}", "exec"), names)
     for value in names.values():
         if isinstance(value, gym.Env | VecEnv):
@@ -309,7 +315,11 @@ MENTIONED = [(page.stem, line) for page in PAGES for line in inline(page)]
 SETUP = configparser.ConfigParser()
 SETUP.read(ROOT / "setup.cfg", "utf-8")
 EXTRAS = SETUP.options("options.extras_require")
-TARGETS = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text("utf-8"), re.M))
+TARGETS = {
+    target
+    for line in re.findall(r"^([a-z][a-z -]*):", (ROOT / "Makefile").read_text("utf-8"), re.M)
+    for target in line.split()
+}
 
 
 @pytest.fixture
@@ -369,6 +379,8 @@ def test_a_command_in_the_docs_parses_and_names_what_exists(page, line, parsed, 
             assert (ROOT / script).is_file()
         case ["pip", "install", what] | ["SB3_TORCS_WITHOUT_ENGINE=1", "pip", "install", what]:
             assert what in (".", *(f".[{extra}]" for extra in EXTRAS))
+        case ["pip", "install", "torch", "--index-url", address]:
+            assert address in (ROOT / "tools" / "make-environment").read_text("utf-8")
         case ["sudo", "apt", "install", *packages]:
             tools = {"git", "make", "g++", "python3-dev", "python3-venv"}
             assert set(packages) <= {*tools, *VIDEO_PACKAGES}
@@ -386,6 +398,8 @@ def test_a_command_in_the_text_parses(page, line, parsed):
             pass  # the verb alone, which needs to be told what to do it with
         case ["sb3-torcs", *words]:
             parsed(words)
+        case ["make", word]:
+            assert word in TARGETS or re.fullmatch(r"(PYTHON|WORKERS)=\S+", word)
         case ["make", target, *_]:
             assert target in TARGETS
 
