@@ -188,7 +188,7 @@ def test_robots_write_the_same_drive_in_both_formats(tmp_path):
     race([("bt", 3)], "dirt-1", 1, telemetry=tmp_path / "drive.csv")
     (result,) = race([("bt", 3)], "dirt-1", 1, telemetry=tmp_path / "drive.parquet")
     table, drives = (
-        pd.read_csv(tmp_path / "drive.csv", float_precision="round_trip"),
+        pd.read_csv(tmp_path / "drive.csv", engine="python"),
         read_drives(tmp_path / "drive.parquet"),
     )
     for name in ("time", "x", "speed_x", "laps", "throttle", "gear_asked"):
