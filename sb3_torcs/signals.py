@@ -23,7 +23,7 @@ __all__ = [
 
 SOON = 0.1  # [s] until a signal that was ignored comes again
 # Windows has no SIGHUP.
-ENDING = tuple(signal.Signals[n] for n in ("SIGTERM", "SIGHUP") if n in signal.Signals.__members__)
+ENDING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
 """Signals that ask a process to end."""
 
 EXIT_STATUS = 128  # of a process that a signal has ended, plus the number of the signal

@@ -43,7 +43,9 @@ SESSION = ".session"  # where a killed run's temporary files are
 SCRATCH = "st-"  # prefix of folders for temporary files; short, since paths of sockets are limited
 MARK = ".of-a-study"  # a file that names the folder for temporary files
 PATIENCE = 30.0  # [s] until a folder for temporary files counts as one that cannot be removed
-REPLACED = [number for number in signal.Signals if number.name in ("SIGINT", "SIGTERM", "SIGUSR1")]
+REPLACED = [
+    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGUSR1") if hasattr(signal, name)
+]
 """Signals whose handlers Ray replaces; Windows has no SIGUSR1."""
 GRACE = 20.0  # [s] that Ray has to end after SIGTERM
 PRIVATE = "sb3_torcs_study"  # a resource that marks a Ray that was started by a study
