@@ -89,7 +89,7 @@ def test_a_model_of_sbx_needs_trust_and_its_package(env, saved, monkeypatch):
     with pytest.raises(ModelNotTrusted, match=r"SBX pickles its weights.*add --trust"):
         models.load_driver(saved[1], env)
     monkeypatch.setitem(sys.modules, "sbx", None)
-    with pytest.raises(PackageMissing, match=r"is a model of SBX.*pip install sbx-rl"):
+    with pytest.raises(PackageMissing, match=r"is a model of SBX.*sb3-torcs\[sbx\]"):
         models.load_driver(saved[1], env, trust=True)
     found = types.SimpleNamespace(load=lambda *_, **__: saved[0])
     monkeypatch.setitem(sys.modules, "sbx", types.SimpleNamespace(TQC=found))

@@ -48,7 +48,7 @@ def test_an_unknown_algorithm_of_it_is_told():
 
 def test_without_it_the_package_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "sbx", None)
-    with pytest.raises(PackageMissing, match=r"'sbx_sac' is an algorithm of SBX.*install sbx-rl"):
+    with pytest.raises(PackageMissing, match=r"'sbx_sac' is an algorithm of SBX.*sb3-torcs\[sbx\]"):
         algorithm_class("sbx_sac")
 
 
