@@ -28,6 +28,8 @@ __all__ = [
     "safe_speed",
 ]
 
+cos, sin = map(maths.compiled, (maths.cos, maths.sin))
+
 BRAKING = 10.0  # [m/s²] a car on asphalt can do twice that, but not while it turns in
 BEND_SPEED = 12.0  # [m/s] in a bend behind which nothing is seen; the tightest hairpins need it
 NO_SLIDE = 0.1  # [-] speed across per speed along of a car that corners on asphalt
@@ -38,12 +40,12 @@ Term = Callable[[CarState, CarState, Controls], float]
 
 def speed_along(before: CarState, after: CarState, controls: Controls) -> float:
     """Vx cos θ [m/s]: speed along the road (Lillicrap et al., arXiv:1509.02971, section 4)."""
-    return after.speed_x * maths.cos(after.heading_error)
+    return after.speed_x * cos(after.heading_error)
 
 
 def speed_across(before: CarState, after: CarState, controls: Controls) -> float:
     """Vx sin θ, without its sign [m/s]: speed across the road, of the post's reward."""
-    return abs(after.speed_x * maths.sin(after.heading_error))
+    return abs(after.speed_x * sin(after.heading_error))
 
 
 def speed_off_axis(before: CarState, after: CarState, controls: Controls) -> float:

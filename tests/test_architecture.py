@@ -32,7 +32,6 @@ LONGER_FILES = {
 
 # From the ground up. `sb3_torcs/__init__.py` registers the environments and loads nothing.
 FLOORS = (
-    {"plain_maths"},
     {"_engine", "cores", "errors", "maths", "signals"},
     {"car", "files"},
     {"torcs"},

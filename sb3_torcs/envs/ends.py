@@ -18,6 +18,8 @@ __all__ = [
     "waited",
 ]
 
+cos = maths.compiled(maths.cos)
+
 STUCK_SPEED = 5.0 / KMH  # [m/s] along the road; slower than walking counts as standing
 STUCK_TICKS = 75  # control ticks of standing that end an episode: 1.5 s
 GRACE_TICKS = 150  # 3 s to get going after a standing start
@@ -58,7 +60,7 @@ def stands(car: CarState) -> bool:
 
     :param car: at the end of a timestep
     """
-    along = maths.cos(car.heading_error)
+    along = cos(car.heading_error)
     return along < 0.0 or car.speed_x * along < STUCK_SPEED
 
 

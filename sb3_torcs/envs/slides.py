@@ -7,6 +7,8 @@ from sb3_torcs.car import STEER_LOCK, CarState
 
 __all__ = ["caught_steering", "sideslip", "slides"]
 
+atan2, hypot = map(maths.compiled, (maths.atan2, maths.hypot))
+
 SIDESLIP = 0.3  # [rad] from which on a car slides; on asphalt it corners with about 0.1
 SLOWEST = 8.0  # [m/s] below which a car that slides comes to a stand soon enough
 
@@ -19,7 +21,7 @@ def sideslip(car: CarState) -> float:
 
     :param car: at the beginning of a timestep
     """
-    return maths.atan2(car.speed_y, car.speed_x)
+    return atan2(car.speed_y, car.speed_x)
 
 
 def slides(car: CarState) -> bool:
@@ -30,7 +32,7 @@ def slides(car: CarState) -> bool:
 
     :param car: at the beginning of a timestep
     """
-    if car.gear < 0 or car.speed_x <= 0.0 or maths.hypot(car.speed_x, car.speed_y) < SLOWEST:
+    if car.gear < 0 or car.speed_x <= 0.0 or hypot(car.speed_x, car.speed_y) < SLOWEST:
         return False
     return abs(sideslip(car)) > SIDESLIP
 

@@ -9,6 +9,8 @@ from sb3_torcs.car import CarState
 
 __all__ = ["freeing_controls", "needs_freeing"]
 
+hypot = maths.compiled(maths.hypot)
+
 TURNED = math.pi / 6.0  # [rad] to the road from which a car stands across it
 SLOW = 5.0  # [m/s] below which a car is stuck that stands across the road, or beside it
 CREEP = 4.0  # [m/s] at most, forward and backward
@@ -30,7 +32,7 @@ def needs_freeing(car: CarState) -> bool:
     """
     if abs(car.heading_error) < TURNED and abs(car.track_position) <= 1.0:
         return False
-    return car.gear < 0 or maths.hypot(car.speed_x, car.speed_y) < SLOW
+    return car.gear < 0 or hypot(car.speed_x, car.speed_y) < SLOW
 
 
 def freeing_controls(car: CarState) -> tuple[float, float, float, int]:

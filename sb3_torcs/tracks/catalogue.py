@@ -16,6 +16,7 @@ from sb3_torcs.torcs.installation import torcs_folders, track_files
 from sb3_torcs.torcs.params import digests
 from sb3_torcs.torcs.track_names import RANDOM_TRACK, TrackFile, find_track, known_tracks
 from sb3_torcs.tracks.compact import read_track_file
+from sb3_torcs.tracks.generator import random_track
 from sb3_torcs.tracks.torcs_xml import read_track_xml
 from sb3_torcs.tracks.track import Track, TrackSummary, closed
 
@@ -47,8 +48,6 @@ def load_track(
                 f"track '{RANDOM_TRACK}' needs a generator, and rng is {rng!r}; pass "
                 "rng=numpy.random.default_rng(seed)"
             )
-        from sb3_torcs.tracks.generator import random_track  # compiled, and seldom asked for
-
         return random_track(rng)
     return _read(find_track(track), tuple(torcs_folders()))
 

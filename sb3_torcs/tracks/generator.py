@@ -105,7 +105,7 @@ def _rounded(corners: FloatArray, rng: np.random.Generator) -> list[tuple[float,
         (edges * before).sum(axis=1),
         before[:, 0] * edges[:, 1] - before[:, 1] * edges[:, 0],
     )
-    turns = maths.headings(np.stack([ahead, aside], axis=1)).tolist()
+    turns = list(map(maths.atan2, aside.tolist(), ahead.tolist()))
     sides = maths.lengths(edges).tolist()
     radii, tangents = [], []
     for i, turn in enumerate(turns):

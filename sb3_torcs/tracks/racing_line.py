@@ -35,6 +35,8 @@ __all__ = [
     "racing_line",
 ]
 
+_atan2, _hypot = maths.compiled(maths.atan2), maths.compiled(maths.hypot)
+
 LINE_DISTANCES = (
     0, 8, 16, 24, 33, 43, 54, 66, 80, 95, 112, 132, 155, 180, 208, 240, 275, 315, 355, 400,
 )  # fmt: skip
@@ -122,7 +124,7 @@ def _relax(
             for k in range(1, 4):
                 across_x = x[k - 1] - 2.0 * x[k] + x[k + 1]
                 across_y = y[k - 1] - 2.0 * y[k] + y[k + 1]
-                along = 0.5 * maths.hypot(x[k + 1] - x[k - 1], y[k + 1] - y[k - 1])
+                along = 0.5 * _hypot(x[k + 1] - x[k - 1], y[k + 1] - y[k - 1])
                 part = -2.0 if k == 2 else 1.0  # of this place in the second difference
                 weight = part / max(along, 1e-3) ** 3
                 slope += weight * (across_x * normals[i, 0] + across_y * normals[i, 1])
@@ -246,7 +248,7 @@ def _turn(line: FloatArray, heading: float, lap: float) -> tuple[FloatArray, Flo
     :return: (n,) the turn since the start line [rad], and (n,) the curvature [1/m]
     """
     chords = np.roll(line, -1, axis=0) - line
-    after = np.unwrap(maths.headings(chords))
+    after = np.unwrap([_atan2(y, x) for x, y in chords.tolist()])
     after += 2.0 * math.pi * round((heading - after[0]) / (2.0 * math.pi))
     before = np.append(after[-1] - lap, after[:-1])
     lengths = maths.lengths(chords)

@@ -347,24 +347,31 @@ def _corner(segments: Iterable[Segment]) -> tuple[float, float]:
         left_most = 0.5 * s.width_end + left
         right_most = -0.5 * s.width_end - right
         turn = s.curvature * s.length / samples
+        turned_x, turned_y = maths.cos_sin(turn)
         chord = s.length / samples * (maths.sin(0.5 * turn) / (0.5 * turn) if turn else 1.0)
+        along_x, along_y = maths.cos_sin(heading + 0.5 * turn)
+        ahead_x, ahead_y = maths.cos_sin(heading + turn)
+        heading += turn * samples
         # Most segments lie far from the corner: looking at each of their samples would take most
         # of the time to read a track.
         reach = s.length + max(left_most, -right_most) + ROUNDING
         far = x - reach > low_x and y - reach > low_y
         for _ in range(samples):
-            cosine, sine = maths.cos_sin(heading + 0.5 * turn)
-            x += chord * cosine
-            y += chord * sine
-            heading += turn
+            x += chord * along_x
+            y += chord * along_y
+            along_x, along_y = (
+                along_x * turned_x - along_y * turned_y, along_x * turned_y + along_y * turned_x
+            )  # fmt: skip
             if far:
                 continue
-            cosine, sine = maths.cos_sin(heading)
             for offset in (left_most, right_most):
-                if x - offset * sine < low_x:  # quicker than min()
-                    low_x = x - offset * sine
-                if y + offset * cosine < low_y:
-                    low_y = y + offset * cosine
+                if x - offset * ahead_y < low_x:  # quicker than min()
+                    low_x = x - offset * ahead_y
+                if y + offset * ahead_x < low_y:
+                    low_y = y + offset * ahead_x
+            ahead_x, ahead_y = (
+                ahead_x * turned_x - ahead_y * turned_y, ahead_x * turned_y + ahead_y * turned_x
+            )  # fmt: skip
     return low_x, low_y
 
 

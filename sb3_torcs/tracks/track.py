@@ -17,8 +17,8 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from sb3_torcs import maths
 from sb3_torcs.car import FloatArray
-from sb3_torcs.plain_maths import cos_sin, sin
 from sb3_torcs.tracks.profile import RoadProfile, road_profile
 
 __all__ = [
@@ -181,8 +181,9 @@ class Track:
         """All segments as numbers, (n_segments, COLUMNS), read-only; for compiled code."""
         table = np.empty((len(self.segments), COLUMNS))
         start = 0.0
-        pose = Pose(self.start_x, self.start_y, self.start_heading)
-        for row, s in zip(table, self.segments, strict=True):
+        begin = Pose(self.start_x, self.start_y, self.start_heading)
+        poses = _chain(self.segments, begin)
+        for row, s, pose in zip(table, self.segments, poses, strict=False):
             row[:LENGTH] = start
             row[LENGTH:X] = s.length, s.curvature
             row[X:WIDTH_START] = pose
@@ -198,7 +199,6 @@ class Track:
                 for value in (wall.friction, wall.rebound, wall.damage)
             ]
             start += s.length
-            pose = _advance(pose, s.length, s.curvature)
         table.setflags(write=False)
         return table
 
@@ -250,7 +250,7 @@ class Track:
         """
         curvature, *begin = self.table[index, CURVATURE:WIDTH_START].tolist()
         x, y, heading = _advance(Pose(*begin), along, curvature)
-        cosine, sine = cos_sin(heading)
+        cosine, sine = maths.cos_sin(heading)
         return Pose(x - offset * sine, y + offset * cosine, heading)
 
     def summary(self) -> TrackSummary:
@@ -270,10 +270,29 @@ def _advance(pose: Pose, length: float, curvature: float) -> Pose:
     :return: the pose there
     """
     half_turn = 0.5 * curvature * length
-    chord = length * (sin(half_turn) / half_turn if half_turn else 1.0)
+    chord = length * (maths.sin(half_turn) / half_turn if half_turn else 1.0)
     direction = pose.heading + half_turn
-    cosine, sine = cos_sin(direction)
+    cosine, sine = maths.cos_sin(direction)
     return Pose(pose.x + chord * cosine, pose.y + chord * sine, direction + half_turn)
+
+
+def _chain(segments: Sequence[Segment], begin: Pose | None = None) -> FloatArray:
+    """
+    Follow all segments, as :func:`_advance` does one.
+
+    :param segments: from the start line on
+    :param begin: the pose there; the origin if left out
+    :return: (n + 1, 3) the poses where they begin and where the last one ends
+    """
+    lengths = np.array([segment.length for segment in segments])
+    half_turns = 0.5 * np.array([segment.curvature for segment in segments]) * lengths
+    bent = half_turns != 0.0
+    x, y, heading = begin or Pose(0.0, 0.0, 0.0)
+    lengths[bent] *= maths.directions(half_turns[bent])[:, 1] / half_turns[bent]
+    headings = np.cumsum([heading, *np.repeat(half_turns, 2)])
+    chords = lengths[:, None] * maths.directions(headings[1::2])
+    places = np.cumsum([(x, y), *chords], axis=0)
+    return np.column_stack([places, headings[::2]])
 
 
 def closing_gap(segments: Sequence[Segment]) -> Pose:
@@ -284,10 +303,8 @@ def closing_gap(segments: Sequence[Segment]) -> Pose:
     :return: x and y of the end seen from the start [m], and the turn missing or in excess of
         whole turns [rad]
     """
-    pose = Pose(0.0, 0.0, 0.0)
-    for segment in segments:
-        pose = _advance(pose, segment.length, segment.curvature)
-    return Pose(pose.x, pose.y, math.remainder(pose.heading, math.tau))
+    x, y, heading = _chain(segments)[-1].tolist()
+    return Pose(x, y, math.remainder(heading, math.tau))
 
 
 def closed(segments: Sequence[Segment]) -> tuple[Segment, ...]:
@@ -328,18 +345,13 @@ def _closing_step(segments: Sequence[Segment], gap: Pose) -> tuple[Segment, ...]
     :param gap: of these segments
     :return: segments with other lengths
     """
-    ends = []
-    pose = Pose(0.0, 0.0, 0.0)
-    for segment in segments:
-        pose = _advance(pose, segment.length, segment.curvature)
-        ends.append(pose)
+    x, y, heading = _chain(segments)[1:].T
     lengths = np.array([segment.length for segment in segments])
     curvatures = np.array([segment.curvature for segment in segments])
-    x, y, heading = np.array(ends).T
-    cosines, sines = np.array([cos_sin(angle) for angle in heading.tolist()]).T
+    cosines, sines = maths.directions(heading).T
     # One metre more of a segment moves the rest along its end and turns it about its end.
     effect = np.stack([
-        cosines - curvatures * (pose.y - y), sines + curvatures * (pose.x - x), curvatures
+        cosines - curvatures * (y[-1] - y), sines + curvatures * (x[-1] - x), curvatures
     ])  # fmt: skip
     weighted = effect * lengths
     sums = [[math.fsum(row * column) for column in effect] for row in weighted]

@@ -16,6 +16,9 @@ from sb3_torcs import maths
 from sb3_torcs.actions import SHIFT_UP, automatic_gear, launch_clutch
 from sb3_torcs.car import CAR_LENGTH, CAR_WIDTH, LIMITER_RPM, REST_HEIGHT, RPM
 
+_cos_sin, _hypot = maths.compiled(maths.cos_sin), maths.compiled(maths.hypot)
+_sin, _atan, _exp = map(maths.compiled, (maths.sin, maths.atan, maths.exp))
+
 GRAVITY = 9.80665  # [m/s²]
 
 # Body
@@ -101,10 +104,10 @@ def front_wheels(angle: float) -> tuple[tuple[float, float], tuple[float, float]
 
     :param angle: of the inner one, left positive [rad]
     """
-    ahead, aside = maths.cos_sin(angle)
+    ahead, aside = _cos_sin(angle)
     outer_ahead = WHEELBASE * ahead + 0.5 * (TRACK_FRONT + TRACK_REAR) * abs(aside)
     outer_aside = WHEELBASE * aside
-    size = maths.hypot(outer_ahead, outer_aside)
+    size = _hypot(outer_ahead, outer_aside)
     inner, outer = (ahead, aside), (outer_ahead / size, outer_aside / size)
     return (outer, inner) if angle > 0.0 else (inner, outer)
 
@@ -151,8 +154,8 @@ def tyre_grip(slip: float, load: float, rated_load: float) -> float:
     """
     slip = min(slip, MAX_SLIP)
     bx = TYRE_B * slip
-    shape = maths.sin(TYRE_C * maths.atan(bx * (1.0 - TYRE_E) + TYRE_E * maths.atan(bx)))
-    load_factor = LOAD_FACTOR_MIN + (LOAD_FACTOR_MAX - LOAD_FACTOR_MIN) * maths.exp(
+    shape = _sin(TYRE_C * _atan(bx * (1.0 - TYRE_E) + TYRE_E * _atan(bx)))
+    load_factor = LOAD_FACTOR_MIN + (LOAD_FACTOR_MAX - LOAD_FACTOR_MIN) * _exp(
         LOAD_FACTOR_K * load / rated_load
     )
     return shape * (1.0 + SKID_FACTOR * slip) * TYRE_MU * load_factor * load

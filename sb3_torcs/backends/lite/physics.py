@@ -22,6 +22,8 @@ from sb3_torcs.car import CAR_LENGTH, CAR_WIDTH, CONTROL_TICK, MAX_DAMAGE, STEER
 from sb3_torcs.car import FloatArray as Floats
 from sb3_torcs.tracks import track as column
 
+cos_sin, hypot = maths.compiled(maths.cos_sin), maths.compiled(maths.hypot)
+
 SUBSTEPS = 10  # physics steps per control tick, as in TORCS
 DT = CONTROL_TICK / SUBSTEPS  # [s]
 STEPS_PER_SECOND = 500.0  # time is counted in steps, so that it never drifts
@@ -118,8 +120,8 @@ def _hit_walls(state: Floats, track: Floats) -> None:
     offset = state[OFFSET]
     if abs(offset) + CAR_LENGTH < min(left, right):  # nowhere near
         return
-    cos_yaw, sin_yaw = maths.cos_sin(state[YAW])
-    to_left_y, sin_tangent = maths.cos_sin(state[TANGENT])
+    cos_yaw, sin_yaw = cos_sin(state[YAW])
+    to_left_y, sin_tangent = cos_sin(state[TANGENT])
     to_left_x = -sin_tangent
     for corner in range(4):
         ahead = (0.5 if corner < 2 else -0.5) * CAR_LENGTH
@@ -137,7 +139,7 @@ def _hit_walls(state: Floats, track: Floats) -> None:
         state[Y] += ny * depth
         offset += depth * (1.0 if wall == column.RIGHT_WALL_FRICTION else -1.0)
         impact = nx * (state[VX] - state[YAW_RATE] * dy) + ny * (state[VY] + state[YAW_RATE] * dx)
-        speed = max(1.0, maths.hypot(state[VX], state[VY]))
+        speed = max(1.0, hypot(state[VX], state[VY]))
         normal_speed = nx * state[VX] + ny * state[VY]
         cosine = normal_speed / speed
         friction, rebound = track[segment, wall], track[segment, wall + REBOUND]
@@ -167,7 +169,7 @@ def _air(vx: float, vy: float, damage: float) -> tuple[float, float, float]:
     pressure = vx * vx
     # Wings work forwards only; the ground effect fades when the car slides sideways.
     wings = pressure if vx > 0.0 else 0.0
-    straight = max(vx, 0.0) / max(maths.hypot(vx, vy), 1.0)
+    straight = max(vx, 0.0) / max(hypot(vx, vy), 1.0)
     front = car.LIFT_FRONT * pressure * straight + car.WING_LIFT * car.WING_FRONT * wings
     rear = car.LIFT_REAR * pressure * straight + car.WING_LIFT * car.WING_REAR * wings
     wing_drag = (car.WING_FRONT + car.WING_REAR) * wings
@@ -220,7 +222,7 @@ def _roll(
     sliding_speed = vy * cos_angle - vx * sin_angle
     reference = max(abs(rolling_speed), car.SLIP_SPEED)
     slip_x = (rolling_speed - spin * radius) / reference
-    slip_y = sliding_speed / max(maths.hypot(vx, vy), car.SLIP_SPEED)
+    slip_y = sliding_speed / max(hypot(vx, vy), car.SLIP_SPEED)
     slip = math.sqrt(slip_x * slip_x + slip_y * slip_y)
     grip = 0.0  # [N] per slip
     if slip > 1e-9:
@@ -240,7 +242,7 @@ def _substep(
 ) -> None:
     """Advance the car by one physics step."""
     yaw, yaw_rate = state[YAW], state[YAW_RATE]
-    cos_yaw, sin_yaw = maths.cos_sin(yaw)
+    cos_yaw, sin_yaw = cos_sin(yaw)
     vx = state[VX] * cos_yaw + state[VY] * sin_yaw
     vy = state[VY] * cos_yaw - state[VX] * sin_yaw
     right, left = _steer(state, steering)
@@ -256,7 +258,7 @@ def _substep(
     state[SINK] += state[SINK_RATE] * DT
     segment, along, offset = int(state[SEGMENT]), state[ALONG], state[OFFSET]
     skew = yaw - state[TANGENT]
-    cos_skew, sin_skew = maths.cos_sin(skew)
+    cos_skew, sin_skew = cos_sin(skew)
 
     force_x, force_y, moment, rolling = -drag, 0.0, 0.0, 0.0
     for wheel in range(4):
@@ -275,7 +277,7 @@ def _substep(
         moment += fy * x - fx * y
         rolling += loads[wheel] * resistance
 
-    speed = maths.hypot(vx, vy)
+    speed = hypot(vx, vy)
     rolling = min(rolling, car.MASS * speed / DT) / max(speed, 1e-6)
     acc_x, acc_y = (force_x - rolling * vx) / car.MASS, (force_y - rolling * vy) / car.MASS
     state[ACC_X] += (acc_x - state[ACC_X]) * (DT / car.LOAD_LAG)
@@ -311,7 +313,7 @@ def advance(
         if gear == AUTOMATIC:
             wanted = automatic_gear(int(state[GEAR]), state[MOTOR], car.RATIOS)
         elif gear == BY_ROAD_SPEED:
-            cos_yaw, sin_yaw = maths.cos_sin(state[YAW])
+            cos_yaw, sin_yaw = cos_sin(state[YAW])
             speed = state[VX] * cos_yaw + state[VY] * sin_yaw
             wanted, launch = car.road_speed_gear(int(state[GEAR]), speed)
             clutch = max(pressed, launch)
@@ -341,7 +343,7 @@ def place(x: float, y: float, yaw: float, speed: float, segment: int, track: Flo
     """
     state = np.zeros(STATE_SIZE)
     state[X], state[Y], state[YAW] = x, y, wrap(yaw)
-    cos_yaw, sin_yaw = maths.cos_sin(yaw)
+    cos_yaw, sin_yaw = cos_sin(yaw)
     state[VX], state[VY] = speed * cos_yaw, speed * sin_yaw
     state[SPIN_FR] = state[SPIN_FL] = speed / car.RADIUS[0]
     state[SPIN_RR] = state[SPIN_RL] = speed / car.RADIUS[2]
@@ -393,7 +395,7 @@ def read(
     """
     segment, along = int(state[SEGMENT]), state[ALONG]
     yaw = state[YAW]
-    cos_yaw, sin_yaw = maths.cos_sin(yaw)
+    cos_yaw, sin_yaw = cos_sin(yaw)
     width = road_width(track, segment, along)
     scalars[0] = state[STEPS] / STEPS_PER_SECOND
     scalars[1], scalars[2], scalars[3] = state[X], state[Y], yaw

@@ -19,6 +19,8 @@ from sb3_torcs import maths
 from sb3_torcs.car import FloatArray
 from sb3_torcs.tracks.track import Track
 
+cos_sin = maths.compiled(maths.cos_sin)
+
 __all__ = ["RANGE", "Edges", "cast", "road_edges"]
 
 RANGE = 200.0  # [m] of an SCR range finder since 2010
@@ -166,7 +168,9 @@ def cast(
     x, y, yaw = pose
     n = reach.shape[0]
     rays = angles.shape[0]
-    ahead = maths.directions(yaw - angles)
+    ahead = np.empty((rays, 2))
+    for ray in range(rays):
+        ahead[ray, 0], ahead[ray, 1] = cos_sin(yaw - angles[ray])
     out[:] = RANGE
     for step in range(-reach[segment, 0], reach[segment, 1] + 1):
         at = (segment + step) % n

@@ -10,6 +10,8 @@ from sb3_torcs import maths
 from sb3_torcs.car import FloatArray as Floats
 from sb3_torcs.tracks import track as column
 
+atan2, cos_sin = maths.compiled(maths.atan2), maths.compiled(maths.cos_sin)
+
 
 @njit(cache=True, inline="always")
 def wrap(angle: float) -> float:
@@ -72,7 +74,7 @@ def project(track: Floats, segment: int, x: float, y: float) -> tuple[int, float
     for _ in range(n):
         dx, dy = x - track[segment, column.X], y - track[segment, column.Y]
         heading, curvature = track[segment, column.HEADING], track[segment, column.CURVATURE]
-        cosine, sine = maths.cos_sin(heading)
+        cosine, sine = cos_sin(heading)
         ahead = dx * cosine + dy * sine
         left = dy * cosine - dx * sine
         if curvature == 0.0:
@@ -83,7 +85,7 @@ def project(track: Floats, segment: int, x: float, y: float) -> tuple[int, float
             inward = radius - side * left  # from the centre of the arc towards the start
             # Measured from the middle of the arc, so that one of more than half a turn works too.
             half = 0.5 * abs(curvature) * track[segment, column.LENGTH]
-            along = (wrap(maths.atan2(ahead, inward) - half) + half) * radius
+            along = (wrap(atan2(ahead, inward) - half) + half) * radius
             offset = side * (radius - math.sqrt(ahead * ahead + inward * inward))
         if along < 0.0:
             segment = (segment - 1) % n

@@ -15,6 +15,8 @@ from sb3_torcs.car import CarState, Controls, FloatArray
 
 __all__ = ["PEDAL", "STEERING", "Line", "blended", "lap_of", "repeated", "waypoint"]
 
+_exp = maths.compiled(maths.exp)
+
 TIME, DISTANCE, OFFSET, HEADING, SPEED, STEERING, PEDAL = range(7)
 
 THROTTLE = 0.9  # [-] from which a line counts as accelerating
@@ -99,7 +101,10 @@ def _speed_worth(rows: FloatArray) -> FloatArray:
     for index in range(len(rows) - 2, -1, -1):
         if accelerates[index]:
             left[index] = left[index + 1] + rows[index + 1, TIME] - rows[index, TIME]
-    lasts = FADING * (1.0 - maths.exps(-left / FADING)) + LEAST_FADING
+    lasts = (
+        FADING * (1.0 - np.array([_exp(-seconds / FADING) for seconds in left.tolist()]))
+        + LEAST_FADING
+    )
     worth: FloatArray = lasts / np.maximum(rows[:, SPEED], SLOWEST)
     return worth
 
