@@ -155,18 +155,15 @@ def _apart(segments: list[Segment], clearance: float) -> bool:
     """
     track = Track("candidate", "road", tuple(segments))
     n = math.ceil(track.length / SAMPLE)
-    places: FloatArray = np.arange(n, dtype=np.float64) * (track.length / n)
-    x, y = _axis(track, places)
+    step = track.length / n
+    x, y = _axis(track, np.arange(n) * step)
+    twice_x, twice_y = np.concatenate([x, x]), np.concatenate([y, y])
     # Points close to each other along the road may be near; beyond half a turn they may not.
-    apart = np.abs(places[:, None] - places[None, :])
-    apart = np.minimum(apart, track.length - apart)
-    gaps_x, gaps_y = x[:, None] - x[None, :], y[:, None] - y[None, :]
-    return not bool(
-        np.any(
-            (gaps_x * gaps_x + gaps_y * gaps_y < clearance * clearance)
-            & (apart > 0.5 * math.pi * clearance)
-        )
-    )
+    for far in range(math.floor(0.5 * math.pi * clearance / step) + 1, n // 2 + 1):
+        gaps_x, gaps_y = twice_x[far : far + n] - x, twice_y[far : far + n] - y
+        if (gaps_x * gaps_x + gaps_y * gaps_y).min() < clearance * clearance:
+            return False
+    return True
 
 
 def _axis(track: Track, places: FloatArray) -> tuple[FloatArray, FloatArray]:
