@@ -34,6 +34,7 @@ OLD_PROCESSOR = {
     "NUMBA_CPU_NAME": "generic",
     "NUMBA_CPU_FEATURES": "",
     "ATEN_CPU_CAPABILITY": "default",
+    "MKL_CBWR": "COMPATIBLE",
 }
 """Lets libraries compute as on a processor of 2010, each in its own way."""
 

@@ -130,6 +130,14 @@ class TestClosing:
         assert abs(closing_gap(broken).heading) == pytest.approx(0.01)
         assert max(abs(value) for value in closing_gap(closed(broken))) <= 1e-9
 
+    def test_a_circle_is_closed_though_only_its_whole_length_matters(self):
+        """Its segments all change the end in one way, so the equations for it are one."""
+        arc = 2.0 * math.pi * 50.0 / 8.0
+        broken = (segment(arc + 0.1, 1.0 / 50.0), *[segment(arc, 1.0 / 50.0)] * 7)
+        repaired = closed(broken)
+        assert max(abs(value) for value in closing_gap(repaired)) <= 1e-9
+        assert math.fsum(s.length for s in repaired) == pytest.approx(8.0 * arc, abs=1e-9)
+
     @pytest.mark.parametrize("length", [340.0, 200.0])
     def test_what_is_no_circuit_is_refused(self, oval, length):
         with pytest.raises(ValueError, match=r"the end lies .* m and .* degrees from the start"):
