@@ -522,7 +522,7 @@ def test_laps_are_compared(monkeypatch, capsys, tmp_path):
     ours, line, robot, _, drawn = capsys.readouterr().out.splitlines()
     told = r"in \d+% of it; \d+% of that at most 120 m before a bend, \d+% in one"
     assert re.fullmatch(rf"ddpg-aalborg: [\d.]+ s, on the brake {told}", ours)
-    assert re.fullmatch(rf"inferno: 76\.356 s, on the brake {told}", robot)
+    assert re.fullmatch(rf"inferno: 76\.320 s, on the brake {told}", robot)
     told = r"  \d\.\d\d m from the middle of the road, [1-9]\.\d\d m from inferno's line"
     assert re.fullmatch(told, line)
     assert drawn == str(picture)

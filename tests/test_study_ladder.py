@@ -22,14 +22,14 @@ def race(*laps, end="laps", distance=7000.0):
     ("lap", "expected"),
     [
         (120.0, "finishes"),
-        (110.784, "finishes"),  # as fast is not faster
-        (110.783, "beats scripted"),
-        (78.013, "beats bt"),
-        (76.355, "beats the best robot"),
+        (110.336, "finishes"),  # as fast is not faster
+        (110.335, "beats scripted"),
+        (78.075, "beats bt"),
+        (76.319, "beats the best robot"),
     ],
 )
 def test_the_best_flying_lap_says_how_high_a_race_stands(lap, expected):
-    """The scripted driver's, bt's and inferno's laps of aalborg are 110.784, 78.014 and 76.356."""
+    """The scripted driver's, bt's and inferno's laps of aalborg are 110.336, 78.076 and 76.320."""
     drive = race(70.0, lap, lap + 1.0)
     assert rung(drive, "Torcs-v0", "car1-trb1", "aalborg") == expected
 
