@@ -19,7 +19,12 @@ headers = sorted(glob("sb3_torcs/native/**/*.h", recursive=True))
 maths = [f"sb3_torcs/native/maths/{name}.cpp" for name in ("as_glibc", "doubles", "rounded")]
 engine = Pybind11Extension(
     "sb3_torcs._engine",
-    [*sorted(glob("sb3_torcs/native/*.cpp")), *maths, "sb3_torcs/native/scr/messages.cpp"],
+    [
+        *sorted(glob("sb3_torcs/native/*.cpp")),
+        *maths,
+        "sb3_torcs/native/maths/check.cpp",
+        "sb3_torcs/native/scr/messages.cpp",
+    ],
     depends=headers,
     cxx_std=17,
     extra_compile_args=[*flags, *(SANITIZERS if sanitize else ["-O2"])],

@@ -153,6 +153,11 @@ void all_floats(const char* name, const char* only, Check check) {
 void check_rounded(const char* only) {
     for (const Function& function : ROUNDED)
         all_floats(function.name, only, [&](float x) {
+            const bool odd = function.exact != mpfr_acos;
+            if (odd && std::signbit(x)) {  // then the reference of -x will do
+                compare(function.name, function.ours(x), -function.ours(-x), x);
+                return;
+            }
             compare(function.name, function.ours(x), reference(function, x), x);
         });
 }

@@ -11,6 +11,7 @@
 #include "engine.h"
 #include "errors.h"
 #include "fleet.h"
+#include "maths/check.h"
 #include "rollouts.h"
 #include "scr/messages.h"
 
@@ -190,6 +191,15 @@ py::tuple follow(Rollouts& rollouts, const py::array_t<double, py::array::c_styl
         rollouts.follow(order);
     }
     return py::make_tuple(paths, lasted);
+}
+
+void bind_maths(py::module_& module) {
+    module.def("wrong_functions", maths::wrong_functions,
+               "Return the names of mathematical functions with wrong values on this machine.");
+    module.def("maths_checksum", maths::checksum, py::call_guard<WithoutPython>(), "function"_a,
+               "step"_a, "added"_a = false,
+               "Sum up a float function's results at every so many-th of all arguments; `added` "
+               "does without the processor's fused multiply-adds.");
 }
 
 // The game's side of the SCR protocol, so that tests can compare the Python client with it.
@@ -503,6 +513,7 @@ PYBIND11_MODULE(_engine, module) {
              "Follow a line with offsets; returns the paths, and how many timesteps each lasted.");
 
     bind_scr(module);
+    bind_maths(module);
 }
 
 }  // namespace torcs

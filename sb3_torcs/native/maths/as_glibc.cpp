@@ -19,11 +19,19 @@ constexpr float INF = std::numeric_limits<float>::infinity();
 #define EITHER inline __attribute__((always_inline))
 #define FOR_FMA __attribute__((target("fma")))
 
+// What is near enough where the last digits of a double do not matter.
+struct Separate {
+    static EITHER double fused(double a, double b, double c) { return a * b + c; }
+};
+
 struct Processor {
+    static constexpr bool IS_QUICK = true;
     static EITHER double fused(double a, double b, double c) { return __builtin_fma(a, b, c); }
 };
 
 struct Additions {
+    static constexpr bool IS_QUICK = false;
+
     struct Sum {
         double nearest, rest;
     };
@@ -54,6 +62,24 @@ struct Additions {
         return high.nearest + rest.nearest;
     }
 };
+
+// Round what a formula yields by fused operations. Where these take long, separate ones decide if
+// they are not near the middle between two floats: a double from the one and the other way differs
+// by much less than the margin.
+template <typename Unit, typename Formula>
+EITHER float rounded(Formula formula) {
+    if constexpr (!Unit::IS_QUICK) {
+        constexpr std::uint64_t SURPLUS = (1 << 29) - 1, MIDDLE = 1 << 28, MARGIN = 1 << 11;
+        const double near = formula(Separate{});
+        const bool sure = (bits(near) & SURPLUS) - (MIDDLE - MARGIN) > 2 * MARGIN;
+        if (sure && std::fabs(near) >= std::numeric_limits<float>::min())
+            return static_cast<float>(near);
+    }
+    return static_cast<float>(formula(Unit{}));
+}
+
+// A formula for a unit that it is called with.
+#define BY_UNIT [&](auto unit) __attribute__((always_inline))
 
 // ---- Sine and cosine ----------------------------------------------------------------------------
 
@@ -116,8 +142,10 @@ EITHER float wave(float angle, unsigned more) {
     const Quarters at = size < REDUCED ? Quarters{angle, 0} : reduce<Unit>(angle);
     const double x2 = at.rest * at.rest;
     const unsigned number = at.number + more;
-    const double found = number & 1 ? cosine<Unit>(x2) : sine<Unit>(at.rest, x2);
-    return static_cast<float>(number & 2 ? -found : found);
+    const float found = number & 1
+                            ? rounded<Unit>(BY_UNIT { return cosine<decltype(unit)>(x2); })
+                            : rounded<Unit>(BY_UNIT { return sine<decltype(unit)>(at.rest, x2); });
+    return number & 2 ? -found : found;
 }
 
 template <typename Unit>
@@ -130,8 +158,8 @@ EITHER void waves(float angle, float* sine_, float* cosine_) {
     }
     const Quarters at = size < REDUCED ? Quarters{angle, 0} : reduce<Unit>(angle);
     const double x2 = at.rest * at.rest;
-    const auto odd = static_cast<float>(sine<Unit>(at.rest, x2));
-    const auto even = static_cast<float>(cosine<Unit>(x2));
+    const float odd = rounded<Unit>(BY_UNIT { return sine<decltype(unit)>(at.rest, x2); });
+    const float even = rounded<Unit>(BY_UNIT { return cosine<decltype(unit)>(x2); });
     const bool swapped = at.number & 1;
     const float s = swapped ? even : odd, c = swapped ? odd : even;
     *sine_ = at.number & 2 ? -s : s;
@@ -164,8 +192,10 @@ EITHER float exponential(float x) {
     const double rest = Unit::fused(PARTS, x, -(shifted - ROUNDER));
     const std::uint64_t number = bits(shifted);
     const double power = from_bits(POWERS[number % 32] + (number << 47));
-    const double first = Unit::fused(E1, rest, 1.0);
-    return static_cast<float>(Unit::fused(Unit::fused(E3, rest, E2), rest * rest, first) * power);
+    return rounded<Unit>(BY_UNIT {
+        const double first = unit.fused(E1, rest, 1.0);
+        return unit.fused(unit.fused(E3, rest, E2), rest * rest, first) * power;
+    });
 }
 
 struct Knot {
@@ -199,9 +229,11 @@ EITHER float logarithm(float x) {
     const int exponent = static_cast<std::int32_t>(above) >> 23;
     const float mantissa = from_bits(pattern - (above & 0xff800000));
     const double rest = Unit::fused(mantissa, knot.inverse, -1.0), rest2 = rest * rest;
-    const double first = rest + Unit::fused(exponent, LN2, knot.logarithm);
-    const double second = Unit::fused(L3, rest2, Unit::fused(L2, rest, L1));
-    return static_cast<float>(Unit::fused(second, rest2, first));
+    return rounded<Unit>(BY_UNIT {
+        const double first = rest + unit.fused(exponent, LN2, knot.logarithm);
+        const double second = unit.fused(L3, rest2, unit.fused(L2, rest, L1));
+        return unit.fused(second, rest2, first);
+    });
 }
 
 // ---- For either processor -----------------------------------------------------------------------

@@ -175,8 +175,7 @@ struct Quarters {
     bool odd;
 };
 
-// From here on only quadruple precision has enough digits.
-constexpr double MANY_TURNS = 0x1p20;  // [rad]
+constexpr float MANY_TURNS = 0x1p20f;  // [rad] beyond them the digits of `reduce` do not suffice
 
 Quarters<double> reduce(double x) {
     if (std::fabs(x) < 0.75) return {x, false};
@@ -189,7 +188,8 @@ Quarters<double> reduce(double x) {
 
 // x is the mantissa times 2^exponent. Of 2/pi those 192 digits matter that neither make up whole
 // turns nor are beyond the last digit of the result.
-Quarters<Quad> reduce_exactly(float x) {
+template <typename Real>
+Quarters<Real> reduce_exactly(float x) {
     if (std::fabs(x) < 0.75f) return {x, false};
     using Wide = unsigned __int128;
     const std::uint64_t mantissa = (bits(x) & 0x7fffff) | 0x800000;
@@ -203,12 +203,13 @@ Quarters<Quad> reduce_exactly(float x) {
     Wide turned = Wide(high) << 64 | static_cast<std::uint64_t>(middle);
     const Wide number = (turned + (Wide(1) << 125)) >> 126;
     turned -= number << 126;
-    const Quad rest = static_cast<Quad>(static_cast<__int128>(turned)) * 0x1p-126 * (PI / 2);
+    const Real unit = static_cast<Real>(PI / 2) * 0x1p-126;
+    const Real rest = static_cast<Real>(static_cast<__int128>(turned)) * unit;
     return {x < 0.0f ? -rest : rest, (number & 1) != 0};
 }
 
 Quad tangent_exactly(float x) {
-    const Quarters<Quad> at = reduce_exactly(x);
+    const Quarters<Quad> at = reduce_exactly<Quad>(x);
     const Ratio ratio = tangent_series(at.rest, -1);
     return at.odd ? -ratio.den / ratio.num : ratio.num / ratio.den;
 }
@@ -226,8 +227,7 @@ Quad hyperbolic_tangent_exactly(float x) {
 float tanf(float x) {
     if (std::fabs(x) < TINY) return x;
     if (!std::isfinite(x)) return x - x;
-    if (std::fabs(x) >= MANY_TURNS) return static_cast<float>(tangent_exactly(x));
-    const Quarters<double> at = reduce(x);
+    const Quarters<double> at = std::fabs(x) < MANY_TURNS ? reduce(x) : reduce_exactly<double>(x);
     const Fraction found = tangent(std::fabs(at.rest), -1, CIRCULAR.of);
     const double size = at.odd ? -found.den / found.num : found.num / found.den;
     return rounded(std::copysign(1.0, at.rest) * size, RARELY { return tangent_exactly(x); });
