@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 BUILT := $(VENV)/.built
 NATIVE := $(wildcard sb3_torcs/native/*.* sb3_torcs/native/*/*)
-SCRIPTS := .ci/run $(filter-out %.py,$(wildcard tools/*))
+SCRIPTS := .ci/run $(filter-out %.py %.cpp %.md,$(wildcard tools/*))
 SHELL := /bin/bash
 CORES := $(shell env -u OMP_NUM_THREADS nproc)
 # One more than cores: some tests wait for the game or the browser.

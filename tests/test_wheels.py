@@ -27,7 +27,7 @@ SETUP.read(ROOT / "setup.cfg")
 EXTRAS = SETUP["options.extras_require"]
 IMPORTED_AS = {"imageio-ffmpeg": "imageio_ffmpeg", "sb3-contrib": "sb3_contrib", "sbx-rl": "sbx"}
 BROUGHT_BY_THE_CORE = {"pandas", "pillow"}  # by highway-env
-LIBRARIES = {"_engine", "_game_window", "_scr_server"}
+LIBRARIES = {"_engine", "_game_maths", "_game_window", "_scr_server"}
 
 
 def load_builder():

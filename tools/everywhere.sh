@@ -1,6 +1,7 @@
 #!/bin/sh
 # Make an agent like `ppo-everywhere`: 22 specialists, then a student of them and of those they come
 # from. It takes two cores about an hour.
+# shellcheck disable=SC2046  # each word is an argument
 set -e
 export OMP_NUM_THREADS=1
 
