@@ -12,8 +12,8 @@ import pytest
 from numpy._core._multiarray_umath import __cpu_dispatch__, __cpu_features__
 
 FIGURES = {
-    "roads": "a3297cbc27f03d06",
-    "lines": "79e4338534b817c5",
+    "roads": "90ccafd59978d422",
+    "lines": "168e72782344e7a8",
     "random roads": "ed4178abfa046532",
     "lines of random roads": "5af2cb6d46d4e9fc",
     "drives on aalborg": "0305983c12a05cbc",

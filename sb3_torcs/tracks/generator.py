@@ -156,7 +156,7 @@ def _apart(segments: list[Segment], clearance: float) -> bool:
     track = Track("candidate", "road", tuple(segments))
     n = math.ceil(track.length / SAMPLE)
     step = track.length / n
-    x, y = _axis(track, np.arange(n) * step)
+    x, y = _axis(track, np.arange(n, dtype=np.float64) * step)
     twice_x, twice_y = np.concatenate([x, x]), np.concatenate([y, y])
     # Points close to each other along the road may be near; beyond half a turn they may not.
     for far in range(math.floor(0.5 * math.pi * clearance / step) + 1, n // 2 + 1):

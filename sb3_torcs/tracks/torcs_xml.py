@@ -15,7 +15,7 @@ its outer edge.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -36,7 +36,6 @@ MAX_WIDTH = 1000.0  # [m] of road or ground; the game's tracks have 101
 MAX_LENGTH = 100_000.0  # [m] of one segment; the game computes in single precision
 LEAST = 1e-6  # [m] or [rad] of a length, a radius or an arc: less is lost in rounding
 SAMPLES_PER_ARC = 36  # as TORCS does when it looks for the corner of its map
-ROUNDING = 1.0  # [m] more than what rounding moves a road by
 
 
 @dataclass
@@ -325,7 +324,7 @@ def _joined(steps: list[Segment]) -> list[Segment]:
     ]
 
 
-def _corner(segments: Iterable[Segment]) -> tuple[float, float]:
+def _corner(segments: Sequence[Segment]) -> tuple[float, float]:
     """
     Find the lower left corner of the map, which TORCS makes the origin of its coordinates.
 
@@ -337,42 +336,32 @@ def _corner(segments: Iterable[Segment]) -> tuple[float, float]:
     """
     from sb3_torcs import maths  # compiled: a long road has 100,000 samples
 
-    low_x = low_y = x = y = heading = 0.0
-    for i, s in enumerate(segments):
-        y = 0.5 * s.width_start if i == 0 else y
-        samples = SAMPLES_PER_ARC if s.curvature else 1
-        left, right = s.left_end, s.right_end
-        if s.curvature:
-            left, right = max(s.left_start, left), max(s.right_start, right)
-        left_most = 0.5 * s.width_end + left
-        right_most = -0.5 * s.width_end - right
-        turn = s.curvature * s.length / samples
-        turned_x, turned_y = maths.cos_sin(turn)
-        chord = s.length / samples * (maths.sin(0.5 * turn) / (0.5 * turn) if turn else 1.0)
-        along_x, along_y = maths.cos_sin(heading + 0.5 * turn)
-        ahead_x, ahead_y = maths.cos_sin(heading + turn)
-        heading += turn * samples
-        # Most segments lie far from the corner: looking at each of their samples would take most
-        # of the time to read a track.
-        reach = s.length + max(left_most, -right_most) + ROUNDING
-        far = x - reach > low_x and y - reach > low_y
-        for _ in range(samples):
-            x += chord * along_x
-            y += chord * along_y
-            along_x, along_y = (
-                along_x * turned_x - along_y * turned_y, along_x * turned_y + along_y * turned_x
-            )  # fmt: skip
-            if far:
-                continue
-            for offset in (left_most, right_most):
-                if x - offset * ahead_y < low_x:  # quicker than min()
-                    low_x = x - offset * ahead_y
-                if y + offset * ahead_x < low_y:
-                    low_y = y + offset * ahead_x
-            ahead_x, ahead_y = (
-                ahead_x * turned_x - ahead_y * turned_y, ahead_x * turned_y + ahead_y * turned_x
-            )  # fmt: skip
-    return low_x, low_y
+    curvatures = np.array([s.curvature for s in segments])
+    samples = np.where(curvatures != 0.0, SAMPLES_PER_ARC, 1)
+    lengths = np.array([s.length for s in segments])
+    turns, chords = curvatures * lengths / samples, lengths / samples
+    half = 0.5 * turns[curvatures != 0.0]
+    chords[curvatures != 0.0] *= maths.directions(half)[:, 1] / half
+    left, right = np.array([_reach(s) for s in segments]).T
+
+    turns, chords, left, right = (
+        np.repeat(row, samples) for row in (turns, chords, left, right)
+    )  # now of each sample
+    headings = np.cumsum([0.0, *turns])
+    moved = chords[:, None] * maths.directions(headings[:-1] + 0.5 * turns)
+    x, y = np.cumsum([(0.0, 0.5 * segments[0].width_start), *moved], axis=0)[1:].T
+    cosines, sines = maths.directions(headings[1:]).T
+    low_x = min(0.0, *((x - side * sines).min() for side in (left, right)))
+    low_y = min(0.0, *((y + side * cosines).min() for side in (left, right)))
+    return float(low_x), float(low_y)
+
+
+def _reach(segment: Segment) -> tuple[float, float]:
+    """How far the ground reaches from the axis to the left and, negative, to the right [m]."""
+    left, right = segment.left_end, segment.right_end
+    if segment.curvature:
+        left, right = max(segment.left_start, left), max(segment.right_start, right)
+    return 0.5 * segment.width_end + left, -0.5 * segment.width_end - right
 
 
 def _grid(root: Section, segments: list[Segment], width: float) -> Grid:
