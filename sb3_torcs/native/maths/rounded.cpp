@@ -158,7 +158,7 @@ struct Fraction {
 };
 
 Fraction tangent(double size, int sign, const double* table) {
-    const int cell = static_cast<int>(size * 16.0 + 0.5);
+    const int cell = (static_cast<int>(size * 32.0) + 1) / 2;  // the nearest
     const double rest = size - cell / 16.0, middle = table[cell], square = -sign * rest * rest;
     // The minimax polynomial of tan(x) / x - 1 in the square of x from -2^-10 to 2^-10, by mpmath;
     // it is wrong by 2^-59. The hyperbolic tangent is that of an imaginary angle.
