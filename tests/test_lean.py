@@ -257,8 +257,7 @@ def test_every_module_imports_where_there_is_no_posix(tmp_path):
         + """
 import importlib, pkgutil, sb3_torcs
 for module in pkgutil.walk_packages(sb3_torcs.__path__, "sb3_torcs."):
-    last = module.name.rpartition(".")[2]
-    if last not in ("_engine", "_game_window", "_scr_server", "__main__"):
+    if not module.name.rpartition(".")[2].startswith("_"):
         importlib.import_module(module.name)
 """
     )
@@ -284,7 +283,7 @@ assert main(["install-torcs", "--check"]) in (0, 1)
     )
     status, out, err = python(code, tmp_path)
     assert status == 0, err
-    assert "TorcsLite-v0  drives" in out
+    assert "ok       TorcsLite-v0 " in out
     written = {path.name for path in tmp_path.iterdir()}
     assert {"a.csv", "a.html", "a.png", "board", "model.zip"} <= written
 
