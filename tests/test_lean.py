@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from sb3_torcs import maths, plain_maths
 from sb3_torcs.cli import requirements
 from sb3_torcs.errors import EXTRAS, PackageMissing, check_extras, needs_extra
 from sb3_torcs.files import import_advice
@@ -98,13 +97,6 @@ HEAVY = {"highway_env", "matplotlib", "numba", "pandas", "rl_zoo3", "scipy", "te
 def test_nothing_heavy_is_loaded_needlessly(code, allowed, tmp_path):
     """numba loads SciPy, and Stable-Baselines3 TensorBoard."""
     assert loaded(code, tmp_path) & HEAVY <= allowed
-
-
-@pytest.mark.parametrize("name", ["cos_sin", "cos", "sin"])
-def test_plain_mathematics_equal_the_compiled_to_the_bit(name):
-    plain, compiled = getattr(plain_maths, name), getattr(maths, name)
-    for angle in (0.0, 1e-300, 0.7, -0.785398163397448, 5.3, -123.456, 999.9, 1000.1, 1e20):
-        assert plain(angle) == compiled(angle), angle
 
 
 def imported_packages():
