@@ -49,7 +49,7 @@ class TestTheGame:
         assert (result.laps_completed, result.best_lap) == (3, 76.32)
 
     def test_a_practice_without_fuel_use_gives_known_times(self, game, tmp_path):
-        """With another description of the race, in which no fuel is used: the rest is the game's."""
+        """With another description of the race, in which no fuel is used."""
         data = tmp_path / "data"
         data.mkdir()
         for path in game.data.iterdir():
