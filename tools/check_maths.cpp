@@ -94,12 +94,17 @@ void compare(const char* name, float ours, float reference, float x, float y = 0
     if (++different <= 20) std::printf("%s(%a, %a) is %a, not %a\n", name, x, y, ours, reference);
 }
 
+template <typename Real>
+bool unsure_subnormal(Real value) {
+    const Real steps = std::fabs(value) * 0x1p149;
+    return std::fabs(steps - std::floor(steps) - 0.5) <= steps * 0x1p-40;
+}
+
 // Whether a number that is right but for its last 7 or 13 digits does not say which float is the
 // nearest.
 bool unsure(double value) {
     constexpr std::uint64_t SURPLUS = (1 << 29) - 1, MIDDLE = 1 << 28, MARGIN = 1 << 7;
-    if (std::fabs(value) < std::numeric_limits<float>::min())
-        return value != static_cast<float>(value);
+    if (std::fabs(value) < std::numeric_limits<float>::min()) return unsure_subnormal(value);
     return (bits(value) & SURPLUS) - (MIDDLE - MARGIN) <= 2 * MARGIN;
 }
 
@@ -108,8 +113,7 @@ bool unsure(long double value) {
     constexpr std::uint64_t MARGIN = 1 << 13;
     std::uint64_t mantissa;
     std::memcpy(&mantissa, &value, sizeof mantissa);
-    if (std::fabs(value) < std::numeric_limits<float>::min())
-        return value != static_cast<float>(value);
+    if (std::fabs(value) < std::numeric_limits<float>::min()) return unsure_subnormal(value);
     return (mantissa & SURPLUS) - (MIDDLE - MARGIN) <= 2 * MARGIN;
 }
 
@@ -206,21 +210,21 @@ Pair draw() {
         return from_bits((pattern & 0x807fffff) | 0x3f800000);  // from 1 to 2, and a sign
     };
     const float one = unit(static_cast<std::uint32_t>(next()));
+    if (random % 1024 == 0) {  // y is x times the middle between two subnormal numbers
+        const auto odd = static_cast<double>((random >> 10 & 0x3fff) * 2 + 1);
+        const float x = std::ldexp(static_cast<float>(next() & 0x1ff), 60);
+        return {static_cast<float>(odd * x * 0x1p-150), x};
+    }
     switch (random % 8) {
-        case 0:
         case 1:
-            return {from_bits(static_cast<std::uint32_t>(next())), any};
         case 2:
+            return {from_bits(static_cast<std::uint32_t>(next())), any};
+        case 3:
             return {static_cast<float>(static_cast<std::int32_t>(next()) * 0x1p-22),
                     static_cast<float>(static_cast<std::int32_t>(next()) * 0x1p-22)};
-        case 3:  // from -158 to -94 is the exponent of the result
-            return {std::ldexp(one, -110 + static_cast<int>(random >> 8 & 63) - 32),
+        case 4:  // from -158 to -94 is the exponent of the result
+            return {std::ldexp(one, -142 + static_cast<int>(random >> 8 & 63)),
                     std::ldexp(unit(static_cast<std::uint32_t>(next())), 16)};
-        case 4: {  // y is x times the middle between two subnormal numbers
-            const auto odd = static_cast<double>((random >> 8 & 0x3fff) * 2 + 1);
-            const float x = std::ldexp(static_cast<float>(next() & 0x1ff), 60);
-            return {static_cast<float>(odd * x * 0x1p-150), x};
-        }
         case 5: {  // y / x is as near to a middle as floats allow
             const double middle = std::fabs(one) + 0x1p-24;
             const float x = unit(static_cast<std::uint32_t>(next()) & 0x7fffffff);
