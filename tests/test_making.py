@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import configparser
 import os
 import re
 import shutil
@@ -11,9 +12,11 @@ from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
-from test_wheels import ROOT, SETUP
 
+ROOT = Path(__file__).parent.parent
 TOOLS = ROOT / "tools"
+SETUP = configparser.ConfigParser()
+SETUP.read(ROOT / "setup.cfg")
 REAL = ("basename", "bash", "env", "mktemp", "nice", "rm", "cat", "timeout")
 NVIDIA = Path("/proc/driver/nvidia/version").exists()
 
