@@ -377,4 +377,4 @@ def test_torcs_own_format_could_not_keep_the_bundled_tracks():
     """It says radius and arc of a bend, whose product is its length."""
     bends = [s for name in BUNDLED for s in load_track(name).segments if s.curvature]
     lost = [s for s in bends if 1 / abs(s.curvature) * (s.length * abs(s.curvature)) != s.length]
-    assert (len(lost), len(bends)) == (186, 804)
+    assert (len(lost), len(bends)) == (181, 804)
