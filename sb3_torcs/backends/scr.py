@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from sb3_torcs import maths
 from sb3_torcs.actions import checked_gearbox, controls_from_action
 from sb3_torcs.car import (
     DEFAULT_CAR,
@@ -273,7 +272,6 @@ class ScrBackend:
         with self.rehearsal():
             encode(self.reset(np.random.default_rng(), None))
             encode(self.step(controls_from_action(np.zeros(3, np.float32)), 5))
-        maths.wrong_functions()  # rewards and ends call some of those that it compiles
 
     def _connect(self, start: Start | None) -> None:
         """
