@@ -51,6 +51,20 @@ ModuleInfo module_info(const Library& library, const std::string& name, int inde
                                     "; list them with: sb3-torcs robots");
 }
 
+// The game's loader divides by the length of pits, if the file names the segments where they are.
+bool has_too_short_pits(const Params& file) {
+    const bool is_new = file.number("Header", "version", 0.0f) >= 4.0f;
+    const char* const section = is_new ? "Main Track/Pits" : "Main Track";
+    const std::string segments = is_new ? "Main Track/Track Segments/" : "Main Track/segments/";
+    const std::string prefix = is_new ? "" : "pit ";
+    if (!is_new && file.text(section, "pit type", "no pit") == "no pit") return false;
+    for (const char* const place : {"entry", "start", "end", "exit"}) {
+        const std::string name = file.text(section, (prefix + place).c_str());
+        if (name.empty() || file.text((segments + name).c_str(), "type").empty()) return false;
+    }
+    return !(file.number(section, (prefix + "length").c_str(), PIT_LENGTH) >= SHORTEST_PIT);
+}
+
 void no_track(int, TrackData*, void*, void** params, Situation*) { *params = nullptr; }
 void no_race(int, CarElement*, Situation*) {}
 int no_pit(int, CarElement*, Situation*) { return 0; }
@@ -138,9 +152,7 @@ void Race::load_track() {
     const Params file = Params::read(game_, options_.track);
     if (!file) refuse_file("TrackFileError", options_.track);
     std::string path = options_.track;
-    // The game's loader fills the pit lane with pits, however short they are.
-    if (!(file.number("Main Track", "pit length", PIT_LENGTH) >= SHORTEST_PIT &&
-          file.number("Main Track/Pits", "length", PIT_LENGTH) >= SHORTEST_PIT))
+    if (has_too_short_pits(file))
         throw Error("TrackFileError", path + " has pits of no length; 15 m are usual");
     forget_printed();
     try {

@@ -66,10 +66,24 @@ class Section:
     place: str
     """File and line, for complaints."""
     numbers: dict[str, float] = field(default_factory=dict)
+    unreadable: dict[str, str] = field(default_factory=dict)
+    """Numbers that are none, with what is wrong: many stand in sections that the game ignores."""
     texts: dict[str, str] = field(default_factory=dict)
     names: set[str] = field(default_factory=set)
     """Of numbers and texts."""
     children: dict[str, Section] = field(default_factory=dict)
+
+    def number(self, name: str, default: float) -> float:
+        """
+        Return a number.
+
+        :param name: of the number
+        :param default: if it is not there
+        :raises TrackFileError: if its text is not a number
+        """
+        if name in self.unreadable:
+            raise TrackFileError(self.unreadable[name])
+        return self.numbers.get(name, default)
 
     def child(self, *names: str) -> Section:
         """
@@ -97,7 +111,7 @@ class Keys(NamedTuple):
         :param name: after the prefix
         :param default: if it is not there
         """
-        return self.section.numbers.get(self.prefix + name, default)
+        return self.section.number(self.prefix + name, default)
 
     def text(self, name: str, default: str = "") -> str:
         """
@@ -282,9 +296,10 @@ class _Parser:
             if name in inside.names:
                 return
             inside.names.add(name)
+            text = self._attribute(tag, attributes, "val")
             if tag == "attnum":
-                inside.numbers[name] = self._number(attributes)
-            elif text := self._attribute(tag, attributes, "val"):  # an empty text counts as missing
+                self._take_number(inside, name, text, attributes.get("unit", ""))
+            elif text:  # an empty one counts as missing
                 inside.texts[name] = text
 
     def _end(self, tag: str) -> None:
@@ -315,15 +330,21 @@ class _Parser:
             raise self._fail(f"<{tag}> without '{name}'")
         return attributes[name]
 
-    def _number(self, attributes: dict[str, str]) -> float:
+    def _take_number(self, inside: Section, name: str, text: str, unit: str) -> None:
+        """Keep a number, or what is wrong with it, until it is needed."""
+        try:
+            inside.numbers[name] = self._number(text, unit)
+        except TrackFileError as error:
+            inside.unreadable[name] = str(error)
+
+    def _number(self, text: str, unit: str) -> float:
         """
         Read the value of an ``attnum`` in SI units.
 
-        :param attributes: of the tag
+        :param text: the value as it is written
+        :param unit: of the file
         :return: the value
         """
-        text = self._attribute("attnum", attributes, "val")
-        unit = attributes.get("unit", "")
         if unit and unit not in UNITS:
             raise self._fail(f"unknown unit '{unit}'; known are {', '.join(UNITS)}")
         value = math.nan

@@ -111,7 +111,7 @@ def _pictures(graphic: Section) -> list[str]:
     :param graphic: the section of the track's file on its appearance
     """
     names = []
-    if graphic.numbers.get("background type", 0) in WITH_BACKGROUND:
+    if graphic.number("background type", 0) in WITH_BACKGROUND:
         names.append(graphic.texts.get("background image") or USUAL_BACKGROUND)
     reflections = graphic.child("Environment Mapping")
     for number in range(1, 1 + max(1, len(reflections.children))):

@@ -53,10 +53,16 @@ class _Verge:
 class _Strip(NamedTuple):
     """The ground beside one segment."""
 
-    start: float  # [m]
-    end: float  # [m]
+    border: float  # [m]
+    start: float  # [m] with the border
+    end: float  # [m] with the border
     surface: Surface
     wall: Surface
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether its width changes linearly: the side beyond the border has no negative width."""
+        return min(self.start, self.end) >= self.border
 
     def at(self, fraction: float) -> float:
         """
@@ -64,7 +70,7 @@ class _Strip(NamedTuple):
 
         :param fraction: of the segment's length
         """
-        return self.start + fraction * (self.end - self.start)
+        return max(self.border, self.start + fraction * (self.end - self.start))
 
 
 class _Builder:
@@ -74,17 +80,17 @@ class _Builder:
         self.root = root
         self.version = version
         self.main = root.child("Main Track")
-        self.width = self.main.numbers.get("width", 15.0)
+        self.width = self.main.number("width", 15.0)
         if not 0.0 < self.width <= MAX_WIDTH:
             raise TrackFileError(
                 f"{self.main.place}: the road's width is {self.width:g} m; it has to be above 0, "
                 f"and {MAX_WIDTH:g} at most"
             )
-        self.step_length = self.main.numbers.get("profil steps length", 0.0)
+        self.step_length = self.main.number("profil steps length", 0.0)
         self.material = self.main.texts.get("surface", "asphalt")
         self.verges = {side: _Verge(side) for side in (LEFT, RIGHT)}
         for verge in self.verges.values():
-            verge.end_width = _width(self._of(self.main, verge, "side"), "width", 0.0)
+            verge.end_width = _side_width(self._of(self.main, verge, "side"), "width", 0.0)
             self._update(self.main, verge)
         self.segments: list[Segment] = []
         self.fine: list[Segment] = []
@@ -124,13 +130,14 @@ class _Builder:
         """
         self._update(section, verge)
         side = self._of(section, verge, "side")
-        start = _width(side, "start width", verge.end_width)
-        end = start if self.version < 4 else _width(side, "width", start)
-        end = _width(side, "end width", end)
+        start = _side_width(side, "start width", verge.end_width)
+        end = start if self.version < 4 else _side_width(side, "width", start)
+        end = _side_width(side, "end width", end)
         verge.end_width = end
         border = verge.border_width
         wider = verge.material if start + end >= 2.0 * border else verge.border_material
         return _Strip(
+            border,
             border + start,
             border + end,
             self.surface(wider),
@@ -148,13 +155,12 @@ class _Builder:
             return self._surfaces[name]
         inside = () if self.version >= 4 else ("List",)
         section = self.root.child("Surfaces", *inside, name)
-        numbers = section.numbers
         surface = Surface(
             name,
-            numbers.get("friction", 0.8),
-            numbers.get("rolling resistance", 0.001),
-            numbers.get("rebound", 0.5 if self.version >= 4 else 1.0),
-            numbers.get("dammage", 10.0),
+            section.number("friction", 0.8),
+            section.number("rolling resistance", 0.001),
+            section.number("rebound", 0.5 if self.version >= 4 else 1.0),
+            section.number("dammage", 10.0),
         )
         if min(surface[1:]) < 0.0:
             raise TrackFileError(f"{section.place}: the surface '{name}' has a negative number")
@@ -193,7 +199,7 @@ class _Builder:
             fine.append(step)
         self.fine += fine
         self.names += [name] * len(fine)
-        self.segments += _joined(fine)
+        self.segments += _joined(fine) if left.is_linear and right.is_linear else fine
 
     def _bends(self, section: Section) -> Iterator[tuple[float, float]]:
         """
@@ -214,7 +220,7 @@ class _Builder:
             )
         sign = 1.0 if kind == "lft" else -1.0
         radius, arc = _positive(section, "radius"), _positive(section, "arc")
-        end_radius = _positive(section, "end radius") if "end radius" in section.numbers else radius
+        end_radius = _positive(section, "end radius") if "end radius" in section.names else radius
         length = 0.5 * (radius + end_radius) * arc
         steps = self._steps(section, length)
         if steps == 1 or end_radius == radius:
@@ -241,8 +247,8 @@ class _Builder:
             )
         if section.texts.get("profil", "spline") != "spline":
             return 1
-        wanted = section.numbers.get("profil steps", 1.0)
-        step_length = section.numbers.get("profil steps length", self.step_length)
+        wanted = section.number("profil steps", 1.0)
+        step_length = section.number("profil steps length", self.step_length)
         steps = int(wanted)
         if steps == 1 and step_length:
             steps = _quotient(length, step_length) + 1
@@ -273,21 +279,27 @@ def _quotient(length: float, step_length: float) -> int:
     return int(np.float32(length) / np.float32(step_length))
 
 
-def _width(keys: Keys, name: str, default: float) -> float:
+def _width(keys: Keys, name: str, default: float, least: float = 0.0) -> float:
     """
-    Read a width, which cannot be negative: the game's loader crashes at some that are.
+    Read a width.
 
     :param keys: of a part beside the road
     :param name: after the prefix
     :param default: if it is not there [m]
+    :param least: that is allowed [m]
     """
     width = keys.number(name, default)
-    if not 0.0 <= width <= MAX_WIDTH:
+    if not least <= width <= MAX_WIDTH:
         raise TrackFileError(
-            f"{keys.section.place}: '{keys.prefix}{name}' is {width:g} m; 0 to {MAX_WIDTH:g} "
-            "is allowed"
+            f"{keys.section.place}: '{keys.prefix}{name}' is {width:g} m; {least:g} to "
+            f"{MAX_WIDTH:g} is allowed"
         )
     return width
+
+
+def _side_width(side: Keys, name: str, default: float) -> float:
+    """Read the width of a side. The game takes a negative one, and lays no ground there."""
+    return _width(side, name, default, -MAX_WIDTH)
 
 
 def _positive(section: Section, name: str) -> float:
@@ -298,7 +310,7 @@ def _positive(section: Section, name: str) -> float:
     :param name: of the number
     :return: its value
     """
-    value = section.numbers.get(name, 0.0)
+    value = section.number(name, 0.0)
     if value < LEAST:
         raise TrackFileError(
             f"{section.place}: the segment needs '{name}' above 0, it is {value:g}; at least "
@@ -380,10 +392,10 @@ def _grid(root: Section, segments: list[Segment], width: float) -> Grid:
     section = root.child("Starting Grid")
     first_bend = next((s.curvature for s in segments if s.curvature), -1.0)
     side = section.texts.get("pole position side", LEFT if first_bend > 0.0 else RIGHT)
-    places = max(int(section.numbers.get("rows", 2.0)), 1)
+    places = max(int(section.number("rows", 2.0)), 1)
     from_pole_edge = width / (places + 1)
     offset = 0.5 * width - from_pole_edge
-    return Grid(section.numbers.get("distance to start", 10.0), offset if side == LEFT else -offset)
+    return Grid(section.number("distance to start", 10.0), offset if side == LEFT else -offset)
 
 
 def read_track_xml(
@@ -401,7 +413,7 @@ def read_track_xml(
     """
     root = read_params(path, torcs_folders() if folders is None else folders)
     header = root.child("Header")
-    version = int(header.numbers.get("version", 0.0))
+    version = int(header.number("version", 0.0))
     if not 0 <= version <= 4:
         raise TrackFileError(f"{header.place}: version {version} of the format; known are 0 to 4")
     builder = _Builder(root, version)
