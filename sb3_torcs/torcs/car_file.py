@@ -62,8 +62,13 @@ class _Merged:
         :param name: of the number
         :param default: what the game takes if no file has it
         """
-        for file in reversed(self._files):
-            default = file.child(*section).number(name, default)
+        car, *category = (file.child(*section) for file in self._files)
+        for limits in category:
+            default = limits.number(name, default)
+        default = car.number(name, default)
+        # The game takes no more than the category allows, but less than its least.
+        for limits in category:
+            default = min(default, limits.largest(name))
         if not math.isfinite(default):
             raise ValueError(f"{name} is {default}")
         return default

@@ -543,9 +543,20 @@ class Node:
         :raises ValueError: if it is not a number
         """
         value = self._value(name)
+        return default if value is None else float(_in_si(value, "val", real))
+
+    def largest(self, name: str) -> float:
+        """
+        Read the upper limit of a number, in SI units; without ``max`` its value is the limit.
+
+        :param name: of the value
+        :return: infinity if the value is not there
+        :raises ValueError: if it is not a number
+        """
+        value = self._value(name)
         if value is None:
-            return default
-        return float(real(value.get("val", "")) * real(UNITS.get(value.get("unit", ""), 1.0)))
+            return math.inf
+        return float(_in_si(value, "max" if "max" in value.attrib else "val", float))
 
     def _value(self, name: str) -> ElementTree.Element | None:
         values = (value for value in self._element if value.tag in ("attnum", "attstr"))
@@ -563,3 +574,8 @@ class Node:
             if old.get("name") == name:
                 self._element.remove(old)
         ElementTree.SubElement(self._element, tag, name=name, val=str(value))
+
+
+def _in_si(value: ElementTree.Element, attribute: str, real: Callable[[Any], Any]) -> Any:
+    """Convert an attribute of a value into SI units; unknown units count as SI."""
+    return real(value.get(attribute, "")) * real(UNITS.get(value.get("unit", ""), 1.0))
