@@ -75,3 +75,12 @@ def test_a_number_that_is_read_has_to_be_one(written, tmp_path, name):
     path.write_text(rewritten(text, [(rf'(name="{name}"[^>]*val=")[^"]*"', r'\g<1>LOWS"')]))
     with pytest.raises(TrackFileError, match=rf"{path}, line \d+: 'LOWS' is not a finite number"):
         LiteBackend(path)
+
+
+def test_a_folder_of_one_s_own_may_be_called_as_those_of_the_game(game, tmp_path):
+    """The game's loader opens the shared surfaces relative to the track's file."""
+    path = tmp_path / "data/tracks/mine/aalborg/aalborg.xml"
+    path.parent.mkdir(parents=True)
+    text = game.tracks()["road/aalborg"].read_text(encoding="utf-8", errors="replace")
+    path.write_text(text + "<!-- mine -->", encoding="utf-8")
+    NativeBackend(path)

@@ -130,10 +130,13 @@ FILE* open_file(const char* path, const char* mode) {
     if (!current) return fopen(path, mode);
     if (path[0] != '/') return fopen((current->data + path).c_str(), mode);
     FILE* file = fopen(path, mode);
+    if (file) return file;
     // A track names the files that all tracks share relative to itself, and it may lie outside of
-    // the game's folder.
-    const char* common = file ? nullptr : std::strstr(path, "/data/tracks/");
-    return common ? fopen((current->data + (common + 1)).c_str(), mode) : file;
+    // the game's folder. Its own folders may have that name, too.
+    const std::string name = path;
+    const std::size_t common = name.rfind("/data/tracks/");
+    return common == std::string::npos ? nullptr
+                                       : fopen((current->data + name.substr(common + 1)).c_str(), mode);
 }
 
 int make_directory(const char*, unsigned) {

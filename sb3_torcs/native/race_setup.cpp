@@ -182,7 +182,9 @@ Params Race::load_car(const std::string& name) {
     Params limits = Params::read(game_, category_path);
     if (!limits)
         throw Error("CarFileError", game_.data + path + " is of the category " + category +
-                                        ", but " + category_path + " cannot be read: " + printed());
+                                        ", but " + category_path +
+                                        " is missing or broken; the game has those of its folder "
+                                        "categories/, for example trb1");
     if (car.misfits(limits))
         throw Error("CarFileError", game_.data + path + " does not fit its category " + category +
                                         ": " + printed());
