@@ -49,6 +49,15 @@ def test_a_path_is_a_file_in_both(fake, tmp_path, monkeypatch):
     assert find_track("mine.XML") == find_track(Path("mine.XML"), fake) == found
 
 
+def test_a_folder_is_answered_by_the_file_in_it(fake, tmp_path):
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    (folder / "mine.xml").touch()
+    for game in (None, fake):
+        with pytest.raises(TrackNotFound, match=rf"is a folder: .*'{folder / 'mine.xml'}'$"):
+            find_track(str(folder), game)
+
+
 def test_our_own_files_are_not_for_the_game(fake, tmp_path):
     path = tmp_path / "mine.csv"
     path.touch()

@@ -239,6 +239,9 @@ class TestLoading:
         sources = {entry.name: entry.source for entry in available_tracks()}
         assert sources == {**dict.fromkeys(BUNDLED, "bundled"), "loop": "torcs"}
         assert load_track("loop").length == pytest.approx(100.0 * math.pi)
+        write(tmp_path / "tracks/road/loop", "<params>", "loop.xml")
+        with pytest.warns(UserWarning, match=r"left out: .*loop\.xml.*well-formed"):
+            assert [entry.name for entry in available_tracks()] == BUNDLED
 
 
 class TestCompactFile:

@@ -202,10 +202,12 @@ def _tracks() -> Check:
     from sb3_torcs.tracks.catalogue import summaries
 
     tracks = known_tracks(find_game())
-    try:
-        summaries(tracks.values())
-    except Sb3TorcsError as error:
-        return Check("tracks", False, str(error), REINSTALL)
+    for file in tracks.values():
+        try:
+            summaries([file])
+        except Sb3TorcsError as error:
+            fix = f"repair or remove '{file.path}'; for a track of the game: {REINSTALL}"
+            return Check("tracks", False, str(error), fix)
     categories = [name.partition("/")[0] for name in tracks]
     counts = [f"{categories.count(kind)} {kind}" for kind in sorted(set(categories))]
     return Check("tracks", True, f"{len(tracks)}: {', '.join(counts)}", None)

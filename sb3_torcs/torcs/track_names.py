@@ -80,6 +80,10 @@ def find_track(track: str | os.PathLike[str] | TrackFile, game: Game | None = No
 
 def _hint(name: str, game: Game | None) -> str:
     """Say more of a name that no track has."""
+    if os.path.isdir(name):
+        inside = sorted(Path(name).glob(f"*{XML}"))
+        example = f", e.g. '{inside[0]}'" if inside else ""
+        return f"; '{name}' is a folder: name the {XML} file of the track{example}"
     if os.path.isfile(name):
         return f"; there is a file '{name}', and a track's ends in {XML} or {COMPACT}"
     if game is not None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
+import warnings
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -53,8 +54,18 @@ def load_track(
 
 
 def available_tracks() -> list[TrackSummary]:
-    """List the bundled tracks and those of the installed TORCS, by category and name."""
-    return summaries(known_tracks().values())
+    """
+    List the bundled tracks and those of the installed TORCS, by category and name.
+
+    A broken file is left out with a warning: the others can be driven.
+    """
+    good = []
+    for file in known_tracks().values():
+        try:
+            good += summaries([file])
+        except TrackFileError as error:
+            warnings.warn(f"a track is left out: {error}", stacklevel=2)
+    return _sorted(good)
 
 
 def summaries(files: Iterable[TrackFile]) -> list[TrackSummary]:
@@ -66,8 +77,12 @@ def summaries(files: Iterable[TrackFile]) -> list[TrackSummary]:
     :raises TrackFileError: if one cannot be read
     """
     folders = tuple(torcs_folders())
+    return _sorted(_read(file, folders, located=False).summary() for file in files)
+
+
+def _sorted(summaries: Iterable[TrackSummary]) -> list[TrackSummary]:
     return sorted(
-        (_read(file, folders, located=False).summary() for file in files),
+        summaries,
         key=lambda entry: (
             (CATEGORIES.index(entry.category), entry.name)
             if entry.category in CATEGORIES
