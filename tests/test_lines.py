@@ -124,7 +124,8 @@ def test_the_first_lap_of_a_car_that_learns_is_told_at_once(oval):
     ]
 
 
-def test_a_terminal_shows_curves_below_what_is_told(oval):
+def test_a_terminal_shows_curves_below_what_is_told(oval, monkeypatch):
+    monkeypatch.setenv("TERM", "xterm-256color")
     stream = Terminal()
     learned(oval, [driven(oval, 296.0), driven(oval, 900.0, 104.2)], stream=stream)
     text = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", stream.getvalue())
