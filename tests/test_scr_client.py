@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from scr_loopback import COUNTDOWN, Errant, Loopback
 
+from sb3_torcs.backends.scr import ScrBackend
 from sb3_torcs.car import Start
-from sb3_torcs.errors import ServerLost, ServerNotFound
+from sb3_torcs.errors import MessageBroken, ServerLost, ServerNotFound
 from sb3_torcs.scr.client import ScrClient
 from sb3_torcs.scr.protocol import ScrAction, format_action, parse_state
 
@@ -223,3 +224,41 @@ def test_what_watches_the_server_has_the_last_word():
     with pytest.raises(RuntimeError, match="burnt down"):
         client.identify()
     client.close()
+
+
+class Garbling(Loopback):
+    """Sends other bytes instead of states."""
+
+    def __init__(self, words, places):
+        super().__init__()
+        self.words, self.places, self.sent = words, places, 0
+
+    def send_state(self):
+        self.sent += 1
+        if self.sent in self.places:
+            self.say(self.words)
+        else:
+            super().send_state()
+
+
+NAN = b"(angle 0)(curLapTime 0.02)(gear 1)(rpm 10)(speedX nan)(trackPos 0)\0"
+
+
+@pytest.mark.parametrize("words", [NAN, b"(angle", b"\xff\x00\x01", b""])
+def test_a_broken_state_is_left_out_with_one_warning(words):
+    with Garbling(words, {4, 7, *range(10, 19)}) as server:
+        client = client_of(server, skips_broken=True, pause=0.01)
+        client.identify()
+        with pytest.warns(UserWarning, match="is left out") as warned:
+            distances = drive(client, 20)
+        client.close()
+    assert distances[-1] == 20 - COUNTDOWN - 1
+    assert len(warned) == 1
+
+
+def test_a_server_that_sends_nothing_else_is_given_up():
+    with Garbling(NAN, range(4, 999)) as server:
+        world = ScrBackend("aalborg", host=server.host, port=server.port)
+        warns = pytest.warns(UserWarning, match="left out")
+        with warns, pytest.raises(MessageBroken, match="speedX"):
+            world.reset(np.random.default_rng(0), None)

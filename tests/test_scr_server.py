@@ -101,6 +101,13 @@ def serve(game):
         each.stop() if isinstance(each, GameProcess) else each.close()
 
 
+def await_words(process, words):
+    until = time.monotonic() + PATIENCE
+    while words not in process.words() and time.monotonic() < until:
+        time.sleep(0.05)
+    return words in process.words()
+
+
 def numbers(state, tag):
     """Read the numbers of a tag."""
     found = re.search(rf"\({tag} ([^()]*)\)", state.decode())
@@ -493,6 +500,22 @@ class TestRestart:
         while not second.receive().startswith(b"***restart***"):
             second.send(STAND)
         assert first.receive() == b"***restart***\0"
+
+    def test_the_server_names_who_asks_and_who_does_not_come_back(self, serve):
+        """A client that ends at a restart would stop the race without a sign."""
+        process, first, second = serve([DRIVER, ("scr_server", 1)])
+        first.identify()
+        second.identify()
+        first.receive()
+        first.send("(meta 1)")
+        assert first.receive() == second.receive() == b"***restart***\0"
+        first.identify()
+        assert await_words(process, "restarts the race, for all clients")
+        gone = f"127.0.0.1:{second.socket.getsockname()[1]}"
+        assert await_words(process, f"scr_server 1: the race waits for {gone}")
+        second.identify()
+        second.send(STAND)
+        assert first.receive().startswith(b"(angle ")
 
     def test_often(self, serve):
         process, client = serve()
@@ -934,6 +957,11 @@ class TestDeadline:
             state = client.ask(action(state))
         process.wait(PATIENCE)
         assert re.search(r"\d+ control ticks, 3 late", process.words())
+
+    def test_a_slow_client_is_reported_while_it_drives(self, serve):
+        process, client = serve(deadline=0.001)
+        client.identify()
+        assert await_words(process, " is too slow: 10 of ")
 
     def test_late_answers_are_counted_and_used(self, serve):
         """A client that thinks for three deadlines: the game goes on meanwhile."""

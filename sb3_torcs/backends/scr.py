@@ -299,6 +299,7 @@ class ScrBackend:
                 self._address = bound.getsockname()
         manners: dict[str, Any] = {
             "patience": self.patience, "silence": SILENCE, "latencies": self.latencies,
+            "skips_broken": True,
         }  # fmt: skip
         if self._own:
             manners = {"patience": PATIENCE, "pause": PAUSE}

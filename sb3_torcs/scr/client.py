@@ -11,6 +11,7 @@ import math
 import os
 import socket
 import struct
+import warnings
 import weakref
 from array import array
 from collections.abc import Callable
@@ -18,7 +19,7 @@ from contextlib import suppress
 from time import perf_counter
 
 from sb3_torcs.car import FloatArray, Start
-from sb3_torcs.errors import ServerLost, ServerNotFound
+from sb3_torcs.errors import MessageBroken, ServerLost, ServerNotFound
 from sb3_torcs.scr.protocol import (
     IDENTIFIED,
     RESTART,
@@ -26,6 +27,7 @@ from sb3_torcs.scr.protocol import (
     ScrAction,
     format_action,
     format_init,
+    parse_state,
 )
 
 __all__ = ["ScrClient"]
@@ -39,6 +41,7 @@ NO_LUCK = -200
 FIRST_PAUSE = 1.0  # [s] before the first message is sent again; servers load for a while
 PAUSE = 1.0  # [s] before an action is sent again
 LONGEST_PAUSE = 5.0  # [s] until a closed port is noticed
+MOST_BROKEN = 10  # states in a row
 PATIENCE = 10.0  # [s] without a datagram after which a server counts as lost
 
 
@@ -63,6 +66,8 @@ class ScrClient:
     :param latencies: to which the time from each state to its answer is added [s], for a server
         that does not wait
     :param watch: called while nothing comes; raises if the server has ended
+    :param skips_broken: leave broken states out, with one warning, until ``MOST_BROKEN`` have come
+        in a row: networks garble datagrams
     :raises ServerNotFound: if the host has no address
     """
 
@@ -78,6 +83,7 @@ class ScrClient:
         name: str = "",
         latencies: array[float] | None = None,
         watch: Callable[[], None] = lambda: None,
+        skips_broken: bool = False,
     ) -> None:
         self.address = f"{host}:{port}"
         self.over = True
@@ -86,6 +92,9 @@ class ScrClient:
         """Whether that was to begin it anew: then whoever identifies again drives in it."""
         self.lost = 0
         """States that another one followed before our answer: the server did not wait for it."""
+        self._skips_broken = skips_broken
+        self._broken = 0  # states in a row
+        self._has_warned = False
         self._latencies = latencies
         self._arrived = 0.0
         self._angles = angles
@@ -286,13 +295,34 @@ class ScrClient:
         state = None
         for text in (message, *self._drain()):
             if not text.startswith(b"***"):
-                if text not in (state, self._taken):
+                if text not in (state, self._taken) and self._is_whole(text):
                     self.lost += state is not None
                     state = text
             elif text.startswith((SHUTDOWN, RESTART)):
                 self.over = True
                 self.restarted = text.startswith(RESTART)
         return state
+
+    def _is_whole(self, text: bytes) -> bool:
+        """
+        Check a state, where broken ones are left out.
+
+        :raises MessageBroken: if too many are broken: the server speaks another language
+        """
+        if not self._skips_broken:
+            return True
+        try:
+            parse_state(text)
+        except MessageBroken as error:
+            self._broken += 1
+            if self._broken >= MOST_BROKEN:
+                raise
+            if not self._has_warned:
+                self._has_warned = True
+                warnings.warn(f"{self.address} sent {error}; it is left out", stacklevel=2)
+            return False
+        self._broken = 0
+        return True
 
     def _unreachable(self, error: OSError) -> ServerLost:
         """Build the error."""

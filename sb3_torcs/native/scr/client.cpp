@@ -149,8 +149,17 @@ std::optional<Action> Client::ask(const State& state) {
         owed_ = 0;
         return answer_;
     }
-    if (!ending()) late_++;
+    if (!ending()) count_late();
     return late_answer_;
+}
+
+// A race is lost by late answers: who runs it hears of them while it goes on.
+void Client::count_late() {
+    late_++;
+    if (late_ != next_report_) return;
+    next_report_ *= 10;
+    report(description() + " is too slow: " + std::to_string(late_) + " of " +
+           std::to_string(ticks_) + " answers came late");
 }
 
 void Client::tell(const State& state) {
@@ -302,6 +311,10 @@ void Client::note(const std::string& what) {
     if (text == last_note_ || notes_ >= MANY_NOTES) return;
     last_note_ = text;
     ++notes_;
+    report(text);
+}
+
+void Client::report(const std::string& text) const {
     std::printf("scr_server %d: %s\n", index_, text.c_str());
     std::fflush(stdout);
 }

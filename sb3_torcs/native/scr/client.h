@@ -57,6 +57,9 @@ public:
     long ticks() const { return ticks_; }  // states that were sent
     long late() const { return late_; }    // of them, answered too late
 
+    // Prints a line for who runs the server.
+    void report(const std::string& text) const;
+
 private:
     using Clock = std::chrono::steady_clock;
 
@@ -76,7 +79,8 @@ private:
     bool is_admitted() const;
     void refuse();
     void hear_stranger(std::string_view text);
-    void note(const std::string& what);  // for who runs the server
+    void note(const std::string& what);  // reports what its sender does, once
+    void count_late();
     void await_client();
     // Reads all datagrams up to a wish for a restart; `answers` tells whether one answers the last
     // state.
@@ -105,6 +109,7 @@ private:
     long owed_ = 0;  // states that may still be answered, by who does not say which one he answers
     char message_[LONGEST_MESSAGE];
     long ticks_ = 0, late_ = 0;
+    long next_report_ = 10;  // when so many answers were late
 };
 
 // Ends the game when its owner is gone. Checks only now and then.

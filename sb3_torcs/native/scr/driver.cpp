@@ -1,6 +1,7 @@
 #include "driver.h"
 
 #include <algorithm>
+#include <chrono>
 #include <cmath>
 #include <cstdio>
 
@@ -11,8 +12,9 @@
 namespace torcs::scr {
 namespace {
 
-constexpr double FOCUS_COOL_DOWN = 1.0;  // [s] the focused range finders rest
-constexpr double FOCUS_NOISE = 0.01;     // [-] of each reading, standard deviation
+constexpr auto PATIENCE = std::chrono::seconds(3);  // until the user learns who is awaited
+constexpr double FOCUS_COOL_DOWN = 1.0;             // [s] the focused range finders rest
+constexpr double FOCUS_NOISE = 0.01;                // [-] of each reading, standard deviation
 constexpr float WHITE[] = {1.0f, 1.0f, 1.0f, 1.0f};
 
 }  // namespace
@@ -35,9 +37,18 @@ void Driver::new_race(CarElement* car, const Situation* situation) {
     action_ = Action{};
     action_.focus.reset();  // nobody has asked for it yet
     if (!client_.has_network() || leaving() == Leaving::UNNOTICED) return;
-    while (!ending() && !client_.await_introduction())
+    // Clients that end at a restart would stop the race for the others, without a sign.
+    const bool restarts = leaving() == Leaving::TO_RESTART;
+    const auto until = std::chrono::steady_clock::now() + PATIENCE;
+    bool reported = !restarts;
+    while (!ending() && !client_.await_introduction()) {
         for (Driver& other : drivers())
             if (other.client_.has_network()) other.client_.hear_introduction();
+        if (reported || std::chrono::steady_clock::now() < until) continue;
+        reported = true;
+        client_.report("the race waits for " + client_.description() +
+                       ", who has not come back after the restart; start that client again");
+    }
     name_car();
 }
 
@@ -61,6 +72,7 @@ bool Driver::drive() {
     control.steering = static_cast<float>(action_.steering);
     control.gear = action_.gear;
     if (ReInfo->display_mode != TEXT_MODE) show_board(state);
+    if (action_.restart) report_restart();
     return action_.restart;
 }
 
@@ -68,7 +80,18 @@ bool Driver::watch() {
     if (!car_ || !client_.has_network() || !goes_on()) return false;
     if (!(car_->pub.status & NOT_SIMULATED)) return false;
     const auto answer = client_.ask(sense());
-    return answer && answer->restart;
+    if (!answer || !answer->restart) return false;
+    report_restart();
+    return true;
+}
+
+// It is nobody's own affair where several clients race.
+void Driver::report_restart() const {
+    const auto races = [](const Driver& driver) {
+        return driver.races() && driver.client_.has_network();
+    };
+    if (std::count_if(drivers().begin(), drivers().end(), races) > 1)
+        client_.report(client_.description() + " restarts the race, for all clients");
 }
 
 void Driver::leave() {

@@ -33,6 +33,7 @@ public:
 
 private:
     void name_car();
+    void report_restart() const;
     State sense();
     void sense_focus(State& state);
     void show_board(const State& state) const;
