@@ -10,6 +10,8 @@ import subprocess
 import time
 from pathlib import Path
 
+from sb3_torcs.torcs.process import PROCESS_NAME
+
 
 def raise_in_c(number):
     """Raise a signal in a function that C calls: Python ignores what its handler raises."""
@@ -20,7 +22,7 @@ def children() -> set[int]:
     """Games and displays that this process has started, by whatever test, and that still run."""
     call = ["ps", "--ppid", str(os.getpid()), "-o", "pid=,comm="]
     listed = subprocess.run(call, capture_output=True, text=True, check=False).stdout
-    return {int(pid) for pid in re.findall(r"^ *(\d+) (?:torcs-bin|Xvfb)\b", listed, re.MULTILINE)}
+    return {int(pid) for pid in re.findall(rf"^ *(\d+) (?:{PROCESS_NAME}|Xvfb)\b", listed, re.MULTILINE)}
 
 
 def runs(pid):

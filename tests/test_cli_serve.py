@@ -67,6 +67,20 @@ def games_of(folder):
     return found
 
 
+def test_no_process_is_ended_by_pkill_torcs(folder):
+    """Clients of gym_torcs call it before they start a game of their own."""
+    port = free_ports()
+    process = serve(folder, port)
+    with ThirdParty(port) as client:
+        client.identify()
+        pids = [process.pid, *games_of(folder)]
+        assert len(pids) == 2
+        names = [Path(f"/proc/{pid}/comm").read_text().strip() for pid in pids]
+    process.terminate()
+    process.communicate(timeout=PATIENCE)
+    assert names == ["sb3-racing", "racing-game"]
+
+
 def test_a_client_drives_a_race_to_its_end(folder):
     port = free_ports()
     process = serve(folder, port, "--track", "a-speedway", "--laps", "1", "--wait")

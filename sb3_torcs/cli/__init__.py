@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import errno
 import os
 import signal
 import sys
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from types import FrameType
 
 from sb3_torcs import __version__
@@ -37,6 +39,7 @@ from sb3_torcs.signals import ENDING, EXIT_STATUS, answered, ignored_interrupts
 __all__ = ["main"]
 
 USAGE_ERROR = 2
+PROCESS_NAME = "sb3-racing"
 VERBS = (
     doctor, install_torcs, tracks, train, evaluate, compare, watch, optimize_lap, study, report,
     robots, race, serve, compete, bench,
@@ -51,10 +54,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     :return: the exit status: 0, 2 if the command cannot be run as typed, 130 after Ctrl-C
     """
     words = list(sys.argv[1:] if argv is None else argv)
+    if argv is None:
+        _name_process()
     open_streams()
     with any_terminal():
         args = _parsed(words)
         return 0 if args is None else _run(args)
+
+
+def _name_process() -> None:
+    """Choose the name in lists of processes: SCR clients end games of theirs by `pkill torcs`."""
+    with contextlib.suppress(OSError):  # only Linux has it
+        Path("/proc/self/comm").write_text(PROCESS_NAME, encoding="utf-8")
 
 
 def _parsed(words: list[str]) -> argparse.Namespace | None:

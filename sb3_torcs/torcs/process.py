@@ -26,8 +26,9 @@ from sb3_torcs.torcs.race_setup import RACE_FILE, SCR_SERVER, RaceSetup, write_r
 from sb3_torcs.torcs.scenery import Scenery, find_scenery
 from sb3_torcs.torcs.track_names import TrackFile, find_track
 
-__all__ = ["GameProcess", "TrackCheck", "compiled_library", "game_environment"]
+__all__ = ["PROCESS_NAME", "GameProcess", "TrackCheck", "compiled_library", "game_environment"]
 
+PROCESS_NAME = "racing-game"  # as `ps` lists it, and `pkill` finds it
 PREFIX = "sb3-torcs-game-"  # of private folders
 LAST_LINES = 5  # [lines] of the game's output, for an error
 OWN_TRACKS = "own"  # the category of a track that is not the game's
@@ -113,7 +114,9 @@ class GameProcess:
                 call += ["-r", str(self.folder / RACE_FILE)]
             else:
                 variables["SB3_TORCS_RACE"] = str(self.folder / RACE_FILE)
-            self._process = _start(call, data, variables, descriptors, self.folder / "words")
+            # Scripts of gym_torcs call `pkill torcs`: that shall end what they have started.
+            (self.folder / PROCESS_NAME).symlink_to(game.program)
+            self._process = _start(call, self.folder, data, variables, descriptors)
         except BaseException:
             shutil.rmtree(self.folder, ignore_errors=True)
             raise
@@ -333,26 +336,27 @@ def _link_all(source: Path, target: Path, besides: str = "") -> None:
 
 def _start(
     call: Sequence[str],
+    folder: Path,
     data: Path,
     variables: Mapping[str, str],
     descriptors: Sequence[int],
-    words: Path,
 ) -> subprocess.Popen[bytes]:
     """
     Start the game's program.
 
     :param call: the program and its arguments
+    :param folder: with a link to the program, and for the file of all that it prints
     :param data: the game opens its data relative to where it runs
     :param variables: its environment
     :param descriptors: that it inherits
-    :param words: the file for all that it prints
     """
-    with words.open("wb") as output:
+    with (folder / "words").open("wb") as output:
         try:
             # A group of its own: Ctrl-C is for this process, which then ends the game.
             return subprocess.Popen(
-                call, cwd=data, env=dict(variables), stdin=subprocess.DEVNULL, stdout=output,
-                stderr=subprocess.STDOUT, pass_fds=tuple(descriptors), start_new_session=True,
+                call, executable=folder / PROCESS_NAME, cwd=data, env=dict(variables),
+                stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT,
+                pass_fds=tuple(descriptors), start_new_session=True,
             )  # fmt: skip
         except OSError as error:
             raise GameFailed(f"{call[0]} does not run: {error.strerror}") from error
