@@ -91,6 +91,19 @@ def test_nothing_stays_behind(kind, number, tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.usefixtures("game")
+def test_open_races_hold_no_descriptors():
+    """A race has a copy of each module; 100 races of ten cars would pass the usual limit."""
+    gym.make(TORCS, opponents=["inferno", "bt"]).close()
+    before = descriptors()
+    envs = [gym.make(TORCS, opponents=["inferno", "bt"]) for _ in range(4)]
+    for env in envs:
+        env.reset(seed=0)
+    assert descriptors() == before
+    for env in envs:
+        env.close()
+
+
 if __name__ == "__main__":
     for kind, number in ((by_resets, 100_000), (by_races, 1000), (by_vectors, 300)):
         memory, files, maps = kind(number)

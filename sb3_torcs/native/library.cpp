@@ -135,8 +135,9 @@ FILE* open_file(const char* path, const char* mode) {
     // the game's folder. Its own folders may have that name, too.
     const std::string name = path;
     const std::size_t common = name.rfind("/data/tracks/");
-    return common == std::string::npos ? nullptr
-                                       : fopen((current->data + name.substr(common + 1)).c_str(), mode);
+    return common == std::string::npos
+               ? nullptr
+               : fopen((current->data + name.substr(common + 1)).c_str(), mode);
 }
 
 int make_directory(const char*, unsigned) {
@@ -348,6 +349,15 @@ constexpr const char* NO_MAP = "failed to map segment";  // as the loader says i
     throw Error(error, path + " will not load: " + reason + remedy);
 }
 
+// The loader takes libraries of one name for one library, and a descriptor's number is used again.
+// So the copies are counted, in binary digits that mean nothing in a path.
+std::string name_of_copy(int descriptor) {
+    static std::uint32_t copies = 0;
+    std::string name = "/proc/self/fd";
+    for (std::uint32_t rest = ++copies; rest > 0; rest /= 2) name += rest % 2 ? "/./" : "/";
+    return name + "/" + std::to_string(descriptor);
+}
+
 void* open_copy(const std::string& path, const std::string& folder, const char* error) {
     std::vector<char> bytes = read_library(path, error);
     forget_needs(bytes, folder);
@@ -361,15 +371,10 @@ void* open_copy(const std::string& path, const std::string& folder, const char* 
         }
         done += static_cast<std::size_t>(written);
     }
-    // The descriptor stays open. The loader knows libraries by their names, and a number that is
-    // used again would name two libraries.
-    const std::string name = "/proc/self/fd/" + std::to_string(copy);
-    void* handle = dlopen(name.c_str(), RTLD_NOW | RTLD_LOCAL);
-    if (!handle) {
-        const std::string reason = loader_message();
-        close(copy);
-        refuse_copy(path, error, reason);
-    }
+    void* handle = dlopen(name_of_copy(copy).c_str(), RTLD_NOW | RTLD_LOCAL);
+    const std::string reason = handle ? "" : loader_message();
+    close(copy);  // what is loaded stays
+    if (!handle) refuse_copy(path, error, reason);
     return handle;
 }
 
