@@ -47,6 +47,11 @@ def test_a_gap_is_the_time_since_the_leader_was_there():
     assert told == [["", ""], ["", ""], ["", ""], ["", "+0.06"]]
 
 
+def test_the_gap_of_a_car_that_stands_grows():
+    told = gaps(footage([(0.0, -4.0), *[(4.0 * n, 2.0) for n in range(1, 5)]]), laps=1)
+    assert [texts[1] for texts in told[1:]] == ["+0.02", "+0.06", "+0.10", "+0.14"]
+
+
 def test_who_is_laps_behind_is_told_laps():
     told = gaps(footage([(0.0, -10.0), (150.0, 49.0), (290.0, 49.0)]), laps=5)
     assert [texts[1] for texts in told] == ["", "+1 LAP", "+2 LAPS"]

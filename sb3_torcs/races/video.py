@@ -179,8 +179,8 @@ def gaps(footage: Footage, laps: int) -> list[list[str]]:
     """
     Say at each moment how far each car is behind the leader, as boards do.
 
-    A gap is the time since the leader was where the car is now. It is final when the car has
-    finished.
+    A gap is the time since the leader was where the car is now, so it grows while the car stands.
+    It is final when the car has finished.
 
     :param footage: of the race
     :param laps: of the race
@@ -236,7 +236,8 @@ def _gap(slot: int, moment: Moment, number: int, drives: _Drives) -> str:
         behind = driven[leader] - driven[slot]
     if behind >= 1.0:
         return "+1 LAP" if behind < 2.0 else f"+{int(behind)} LAPS"
-    return f"+{drives.when(slot, way) - drives.when(leader, way):.2f}"
+    now = drives.when(slot, way) if moment.finished[slot] else drives.times[number]
+    return f"+{now - drives.when(leader, way):.2f}"
 
 
 def _colours(cars: int, followed: int) -> list[Colour]:
