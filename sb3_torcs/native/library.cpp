@@ -203,7 +203,10 @@ int print_character(int character) { return character; }
 void print_error(const char* text) { print("%s: %s", text, strerror(errno)); }
 
 [[noreturn]] void leave(int) {
-    throw Error("BackendUnavailable", "the game gave up: " + printed());
+    const std::string reason = printed();
+    throw Error("BackendUnavailable",
+                "the game gave up: " +
+                    (reason.empty() ? "its code, or a robot's, ended without a message" : reason));
 }
 
 [[noreturn]] void leave_by_abort() { leave(1); }
