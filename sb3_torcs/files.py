@@ -172,6 +172,7 @@ def whole_file(
     """
     if path.is_dir():
         raise OutputNotWritable(f"cannot write '{path}': it is a folder; {advice}")
+    path = Path(os.path.realpath(path))  # a symbolic link stays, and its target is written
     aside = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
     try:
         try:

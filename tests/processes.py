@@ -22,7 +22,9 @@ def children() -> set[int]:
     """Games and displays that this process has started, by whatever test, and that still run."""
     call = ["ps", "--ppid", str(os.getpid()), "-o", "pid=,comm="]
     listed = subprocess.run(call, capture_output=True, text=True, check=False).stdout
-    return {int(pid) for pid in re.findall(rf"^ *(\d+) (?:{PROCESS_NAME}|Xvfb)\b", listed, re.MULTILINE)}
+    return {
+        int(pid) for pid in re.findall(rf"^ *(\d+) (?:{PROCESS_NAME}|Xvfb)\b", listed, re.MULTILINE)
+    }
 
 
 def runs(pid):

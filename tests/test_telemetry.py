@@ -232,7 +232,8 @@ def test_what_is_no_drive_is_told(tmp_path, oval):
     (lambda frame: frame.assign(speed_x=float("nan")), "column speed_x has rows without a number"),
     (lambda frame: frame.assign(x=float("inf")), "column x has rows without a number"),
     (lambda frame: frame.iloc[::-1], "out of order"),
-    (lambda frame: frame.assign(driver=7), "world is no text"),
+    (lambda frame: frame.assign(driver=7), "world is no text that a terminal can show"),
+    (lambda frame: frame.assign(driver="\x1b[31mana"), "a terminal can show"),
     (lambda frame: frame.assign(lap_time=None), "column lap_time holds no numbers"),
     (lambda frame: frame.assign(steering="left"), "column steering holds no numbers"),
 ])  # fmt: skip

@@ -202,8 +202,9 @@ def _damage(frame: pd.DataFrame) -> str | None:
     """Say what keeps rows from being drives, if anything does."""
     if frame[list(LABELS)].isna().any(axis=None):
         return "it does not say of each row who drove where"
-    if not all(isinstance(told, str) for name in LABELS[:-1] for told in frame[name].unique()):
-        return "a driver, track, car or world is no text"
+    labels = [label for name in LABELS[:-1] for label in frame[name].unique()]
+    if not all(isinstance(label, str) and label.isprintable() for label in labels):
+        return "a driver, track, car or world is no text that a terminal can show"
     numbers = frame[list(COLUMNS)].select_dtypes("number")
     for name in COLUMNS:
         if name not in numbers:
