@@ -23,6 +23,7 @@ from unittest.mock import patch
 import gymnasium as gym
 import pytest
 from gymnasium.utils.env_checker import check_env as check_gymnasium
+from lint import assert_none, nodes, source, tracked, tree
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -310,8 +311,6 @@ def inline(page):
     return re.findall(r"`((?:sb3-torcs|make) [^`…]+)`", text)
 
 
-SHOWN = [(page.stem, line) for page in PAGES for line in commands(page)]
-MENTIONED = [(page.stem, line) for page in PAGES for line in inline(page)]
 SETUP = configparser.ConfigParser()
 SETUP.read(ROOT / "setup.cfg", "utf-8")
 EXTRAS = SETUP.options("options.extras_require")
@@ -333,7 +332,7 @@ def parsed(monkeypatch):
         try:
             cli.main(words)
         except SystemExit:
-            pytest.fail(f"sb3-torcs {shlex.join(words)} does not parse")
+            raise AssertionError("does not parse") from None
         return found[-1]
 
     return read
@@ -358,9 +357,34 @@ def parsed_by_the_zoo(words, monkeypatch):
     return caught.value.args[0]
 
 
-@pytest.mark.parametrize(("page", "line"), SHOWN)
-def test_a_command_in_the_docs_parses_and_names_what_exists(page, line, parsed, monkeypatch):
+def faults_of_commands(commands_in, check_line):
+    """The command lines of all pages that fail a check, each distinct one checked once."""
+    checked = {}
+    for page in PAGES:
+        for line in commands_in(page):
+            if line not in checked:
+                try:
+                    checked[line] = check_line(line)
+                except Exception as error:
+                    checked[line] = error
+            if checked[line] is not None:
+                yield f"{where(page, line)}: `{line}`: {checked[line]!r}"
+
+
+def where(page, text):
+    """The page and the first line of it that holds a text, or the beginning of one."""
+    for number, line in enumerate(source(page).splitlines(), 1):
+        if text.partition("\\")[0][:60].rstrip() in line:
+            return f"{page.relative_to(ROOT)}:{number}"
+    return f"{page.relative_to(ROOT)}"
+
+
+def test_commands_in_the_docs_parse_and_name_what_exists(parsed, monkeypatch):
     monkeypatch.chdir(ROOT)
+    assert_none(faults_of_commands(commands, functools.partial(check_shown, parsed, monkeypatch)))
+
+
+def check_shown(parsed, monkeypatch, line):
     match shlex.split(line, comments=True):
         case ["sb3-torcs", *words]:
             check(parsed(words), monkeypatch)
@@ -387,11 +411,14 @@ def test_a_command_in_the_docs_parses_and_names_what_exists(page, line, parsed, 
         case ["python3", "-m", "venv", ".venv"] | ["source", ".venv/bin/activate"]:
             pass
         case other:
-            pytest.fail(f"{other} is nothing that a test knows")
+            raise AssertionError(f"{other} is nothing that a test knows")
 
 
-@pytest.mark.parametrize(("page", "line"), MENTIONED)
-def test_a_command_in_the_text_parses(page, line, parsed):
+def test_commands_in_the_text_parse(parsed):
+    assert_none(faults_of_commands(inline, functools.partial(check_mentioned, parsed)))
+
+
+def check_mentioned(parsed, line):
     match shlex.split(line):
         case ["sb3-torcs", "evaluate" | "compare" | "watch" | "compete" | "study" | "report"
               | "optimize-lap" | "race"]:  # fmt: skip
@@ -473,7 +500,7 @@ def names_in(pattern):
     """Names of one form that the pages' texts hold, each once a page."""
     for page in PAGES:
         matches = [re.fullmatch(pattern, text) for text in dict.fromkeys(spoken(page))]
-        yield from ((page.stem, next(filter(None, m.groups()), m[0])) for m in matches if m)
+        yield from ((page, next(filter(None, m.groups()), m[0])) for m in matches if m)
 
 
 @functools.cache
@@ -481,9 +508,7 @@ def defined():
     """Names of all classes, functions and constants, in Python and in C++."""
     kinds, names = (ast.ClassDef, ast.FunctionDef), set()
     for path in PACKAGE.rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
-            if isinstance(node, kinds):
-                names.add(node.name)
+        names |= {node.name for node in nodes(path) if isinstance(node, kinds)}
     for path in (PACKAGE / "native").rglob("*.h"):
         names |= set(re.findall(r"(?:class|struct) (\w+)", path.read_text("utf-8")))
     return names
@@ -504,43 +529,41 @@ def known_flags():
     return known
 
 
-@functools.cache
-def tracked():
-    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, check=True, capture_output=True)
-    return "".join(f"/{name}\n" for name in listed.stdout.decode().splitlines())
-
-
 def is_there(name):
     """Whether a file, or a folder that ends with a slash; NAME stands for any."""
     ending = "" if name.endswith("/") else "$"
     pattern = "/" + re.escape(name).replace("NAME", r"[\w-]+") + ending
-    return bool(re.search(pattern, tracked(), re.M)) or Path(name).name in WRITTEN
+    return (
+        bool(re.search(pattern, "".join(f"/{file}\n" for file in tracked()), re.M))
+        or Path(name).name in WRITTEN
+    )
 
 
-@pytest.mark.parametrize(("page", "name"), sorted(set(names_in(FILE))))
-def test_a_file_that_the_docs_name_is_there(page, name):
-    assert is_there(name)
+def unknown(pattern, exists):
+    return [f"{where(page, name)}: {name}" for page, name in names_in(pattern) if not exists(name)]
 
 
-@pytest.mark.parametrize(("page", "name"), sorted(set(names_in(DOTTED))))
-def test_a_dotted_path_in_the_docs_imports(page, name):
-    assert resolved(name) is not None
+def imports(name):
+    """Whether a dotted path names a module, or something in one."""
+    try:
+        return pkgutil.resolve_name(name) is not None
+    except (AttributeError, ImportError):
+        return False
 
 
-def resolved(name):
-    """What a dotted path names: a module, or something in one."""
-    return pkgutil.resolve_name(name)
-
-
-@pytest.mark.parametrize(("page", "name"), sorted(set(names_in(NAME))))
-def test_a_class_or_function_that_the_docs_name_exists(page, name):
-    assert name in NOT_IN_THE_PACKAGE | defined()
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_a_flag_in_the_docs_is_one_of_a_command(page):
-    said = {flag for text in spoken(page) for flag in re.findall(r"(?<!\S)--[a-z][\w-]*", text)}
-    assert said <= known_flags()
+def test_what_the_docs_name_is_there():
+    """Files, dotted paths, classes, functions and flags."""
+    named, flags = NOT_IN_THE_PACKAGE | defined(), known_flags()
+    assert_none(unknown(FILE, is_there))
+    assert_none(unknown(DOTTED, imports))
+    assert_none(unknown(NAME, named.__contains__))
+    assert_none(
+        f"{where(page, flag)}: {flag}"
+        for page in PAGES
+        for text in spoken(page)
+        for flag in re.findall(r"(?<!\S)--[a-z][\w-]*", text)
+        if flag not in flags
+    )
 
 
 def test_names_that_are_not_there_would_be_found(tmp_path, monkeypatch):
@@ -548,12 +571,11 @@ def test_names_that_are_not_there_would_be_found(tmp_path, monkeypatch):
     page = tmp_path / "page.md"
     page.write_text("`sb3_torcs.nothing`, `NoSuchClass`, `no_such()`, `--no-flag`, `no/file.py`")
     monkeypatch.setattr(sys.modules[__name__], "PAGES", [page])
-    assert [is_there(name) for _, name in names_in(FILE)] == [False]
-    assert [name for _, name in names_in(NAME)] == ["NoSuchClass", "no_such"]
-    assert not {"NoSuchClass", "no_such"} & defined()
-    assert "--no-flag" not in known_flags()
-    with pytest.raises(AttributeError):
-        resolved(*[name for _, name in names_in(DOTTED)])
+    monkeypatch.setattr(sys.modules[__name__], "ROOT", tmp_path)
+    assert unknown(FILE, is_there) == ["page.md:1: no/file.py"]
+    assert unknown(DOTTED, imports) == ["page.md:1: sb3_torcs.nothing"]
+    missing = unknown(NAME, defined().__contains__)
+    assert missing == ["page.md:1: NoSuchClass", "page.md:1: no_such"]
 
 
 # ------------------------------------------------------------------------------ links, docstrings
@@ -565,22 +587,24 @@ def slug(heading):
     return kept.replace(" ", "-")
 
 
-LINKS = [
-    (page, target)
-    for page in [*PAGES, *PACKAGE.glob("agents/*/README.md")]
-    for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text("utf-8"))
-    if not target.startswith(("http://", "https://"))
-]
+def lost_links(page):
+    for number, line in enumerate(source(page).splitlines(), 1):
+        for target in re.findall(r"\]\(([^)\s]+)\)", line):
+            if not target.startswith(("http://", "https://")) and not leads_somewhere(page, target):
+                yield f"{page.relative_to(ROOT)}:{number}: {target}"
 
 
-@pytest.mark.parametrize(("page", "target"), LINKS, ids=lambda part: getattr(part, "stem", part))
-def test_a_local_link_leads_somewhere(page, target):
+def leads_somewhere(page, target):
     name, _, anchor = target.partition("#")
     path = (page.parent / name) if name else page
-    assert path.exists()
-    if anchor:
-        headings = re.findall(r"^#+ (.*)$", path.read_text("utf-8"), re.M)
-        assert anchor in map(slug, headings)
+    if not anchor or not path.exists():
+        return path.exists()
+    return anchor in map(slug, re.findall(r"^#+ (.*)$", source(path), re.M))
+
+
+def test_local_links_lead_somewhere():
+    pages = [*PAGES, *PACKAGE.glob("agents/*/README.md")]
+    assert_none(fault for page in pages for fault in lost_links(page))
 
 
 def test_the_pictures_are_small_enough_for_a_first_look():
@@ -589,26 +613,26 @@ def test_the_pictures_are_small_enough_for_a_first_look():
     assert [p.name for p in pictures if p.stat().st_size > most.get(p.suffix, 0)] == []
 
 
-def undocumented(node, where):
-    """Public definitions below a module or class that have no docstring."""
+def undocumented(node):
+    """Public definitions in a module or class that have no docstring."""
     definitions = (ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
     for child in node.body:
         if not isinstance(child, definitions) or child.name.startswith("_"):
             continue
         if ast.get_docstring(child) is None:
-            yield f"{where}.{child.name}"
+            yield child.lineno, child.name
         if isinstance(child, ast.ClassDef):
-            yield from undocumented(child, f"{where}.{child.name}")
+            yield from undocumented(child)
 
 
-@pytest.mark.parametrize(
-    "path", sorted(PACKAGE.rglob("*.py")), ids=lambda path: str(path.relative_to(PACKAGE))
-)
-def test_everything_public_has_a_docstring(path):
-    tree = ast.parse(path.read_text("utf-8"))
-    if tree.body:
-        assert ast.get_docstring(tree), f"{path} has no docstring"
-    assert list(undocumented(tree, path.stem)) == []
+def test_everything_public_has_a_docstring():
+    paths = [path for path in sorted(PACKAGE.rglob("*.py")) if tree(path).body]
+    assert [path for path in paths if not ast.get_docstring(tree(path))] == []
+    assert_none(
+        f"{path.relative_to(ROOT)}:{line}: {name}"
+        for path in paths
+        for line, name in undocumented(tree(path))
+    )
 
 
 if __name__ == "__main__":

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import re
-import subprocess
-from pathlib import Path
 
 import pytest
+from lint import ROOT, assert_none, source, tracked
 
-ROOT = Path(__file__).parent.parent
 ABOUT_WORDS = {"docs/glossary.md", "tests/test_glossary.py"}
 NOT_OURS = {"LICENSE"}
 RECORDS = re.compile(r"sb3_torcs/agents/[\w-]+/(args|config)\.yml")  # what a training has stored
@@ -49,13 +47,12 @@ RAM = re.compile(  # whole files that are about it
 
 
 def tracked_texts():
-    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, check=True, capture_output=True)
-    for name in listed.stdout.decode().splitlines():
+    for name in tracked():
         path = ROOT / name
         if name in ABOUT_WORDS | NOT_OURS or RECORDS.match(name) or not path.is_file():
             continue
         if path.suffix in ENDINGS:
-            yield name
+            yield name, source(path)
 
 
 def misnamed(text, name="sb3_torcs/cli/watch.py"):
@@ -74,9 +71,13 @@ def misnamed(text, name="sb3_torcs/cli/watch.py"):
     return found
 
 
-@pytest.mark.parametrize("name", list(tracked_texts()))
-def test_everybody_uses_the_words_of_the_glossary(name):
-    assert not misnamed(f"{name}\n{(ROOT / name).read_text(encoding='utf-8')}", name)
+def test_everybody_uses_the_words_of_the_glossary():
+    """In the names of files, too."""
+    assert_none(
+        fault
+        for name, text in tracked_texts()
+        for fault in [*misnamed(name, name), *misnamed(text, name)]
+    )
 
 
 @pytest.mark.parametrize(
