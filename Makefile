@@ -35,6 +35,9 @@ test: ## get all it takes, check format, lint and types, and run every test
 	@tools/run-beside "$(MAKE) check-codestyle" "$(MAKE) lint" "$(MAKE) type" -- \
 	  $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal --durations=10
 
+test-rare: native game browser ## run the tests that take long and rarely find anything
+	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m rare
+
 install: $(STAMP) ## put everything but the engine into .venv/
 
 $(STAMP): setup.cfg pyproject.toml constraints.txt
@@ -59,7 +62,7 @@ browser: ## get Chromium, in which tests open the pages, if it is not here
 	@tools/get-packages browser
 
 pytest: native game browser ## run the tests that do not train
-	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m 'not slow'
+	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m 'not slow and not rare'
 
 lock: install ## choose the newest versions that go together, for constraints.txt
 	@{ echo "# Made by make lock: the versions that make and CI take, for Python 3.11 to 3.14"; \
@@ -117,5 +120,5 @@ commit-checks: format lint type ## what to run before a commit
 clean: ## remove .venv/ and what was built; trainings stay
 	rm -rf build dist *.egg-info sb3_torcs/*.so $(VENV)
 
-.PHONY: help demo test install native game browser pytest lock test-newest test-oldest \
+.PHONY: help demo test test-rare install native game browser pytest lock test-newest test-oldest \
   check-machines wheels sanitize bench format check-codestyle lint type commit-checks clean

@@ -66,13 +66,14 @@ def test_evaluate_drives_an_agent_as_it_was_trained(monkeypatch, capsys):
     assert "ended by laps" in capsys.readouterr().out
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_broken_tracks_are_refused_or_drive_what_is_written(monkeypatch, capsys, tmp_path):
     run(monkeypatch, "fuzz_tracks.py", "--tracks", "12", "--workers", "1", "--keep", str(tmp_path))
     assert re.search(r"^Torcs-v0: 12 files: ", capsys.readouterr().out, re.MULTILINE)
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.rare
 @pytest.mark.usefixtures("game")
 def test_foresight_leaves_hits_out(monkeypatch, capsys):
     """One lap, from the last place."""
@@ -92,6 +93,7 @@ def test_a_racer_is_trained_alone_and_against_robots(monkeypatch, capsys, tmp_pa
     assert racer.name == "model"
 
 
+@pytest.mark.rare
 def test_a_careful_racer_goes_on_without_the_decay(monkeypatch, tmp_path, game):
     careful, racer = (str(tmp_path / name) for name in ("careful", "racer"))
     costs = ["--robots=1", "--races=2", "--sliding=0.5"]
@@ -104,7 +106,11 @@ def test_a_careful_racer_goes_on_without_the_decay(monkeypatch, tmp_path, game):
         assert policy.optimizer.param_groups[0]["weight_decay"] == expected
 
 
-@pytest.mark.parametrize("driver", ["ppo-aalborg", "ppo-any-road", "ppo-post"])
+@pytest.mark.parametrize("driver", [
+    "ppo-any-road",
+    pytest.param("ppo-aalborg", marks=pytest.mark.rare),
+    pytest.param("ppo-post", marks=pytest.mark.rare),
+])  # fmt: skip
 def test_a_racer_goes_on_from_a_driver_that_never_saw_a_car(
     driver, monkeypatch, capsys, tmp_path, game
 ):
@@ -121,7 +127,9 @@ def test_a_racer_goes_on_from_a_driver_that_never_saw_a_car(
     assert driver_record(tmp_path / "model.zip").env_kwargs["sensors"] == [*sees, "rivals"]
 
 
-@pytest.mark.parametrize("ancestor", ["ppo-any-road", "ppo-racer"])
+@pytest.mark.parametrize("ancestor", [
+    "ppo-racer", pytest.param("ppo-any-road", marks=pytest.mark.rare),
+])  # fmt: skip
 def test_a_racer_races_against_its_ancestor(ancestor, monkeypatch, tmp_path, game):
     """Which drives alone, and has no value function, or races; both are kept but for an update."""
     budget = ["--ancestor", ancestor, "--values=1", "--robots=1", "--races=2"]
@@ -194,6 +202,7 @@ def test_a_specialist_of_a_student_learns_its_value_function_anew(monkeypatch, t
     assert all(value.isfinite().all() for value in weights.values())
 
 
+@pytest.mark.rare
 def test_a_student_that_sees_less_goes_on_learning_on_its_tracks_together(
     monkeypatch, capsys, tmp_path, game
 ):
@@ -273,12 +282,13 @@ def test_students_for_any_road_learn_from_the_models_of_the_study(asked):
 
 def test_tracks_are_driven_and_compared_with_robots(tmp_path, game):
     program = [sys.executable, EXAMPLES / "evaluate_tracks.py", "ppo-everywhere", "--jobs=1"]
-    words = ["--track", "michigan", "g-track-1", "aalborg", "--without", "aalborg"]
+    words = ["--track", "g-track-1", "michigan", "aalborg", "--without", "aalborg"]
     done = subprocess.run([*program, *words], capture_output=True, text=True, check=True)
     assert re.search(r"^michigan +3 ", done.stdout, re.MULTILINE)
     assert "ppo-everywhere: completes 2 of 2, 2 without damage; median gap" in done.stdout
 
 
+@pytest.mark.rare
 def test_on_a_random_road_the_robots_drive_first(monkeypatch, tmp_path, game):
     run(monkeypatch, "random_roads.py", str(tmp_path), "--number", "1")
     (road,) = tmp_path.iterdir()
@@ -356,6 +366,7 @@ def test_the_scripted_driver_laps_a_track(monkeypatch, capsys):
     assert out.endswith("ended by laps\n")
 
 
+@pytest.mark.rare
 def test_the_soak_of_robots_finds_nothing():
     words = "--robots inferno,bt --tracks alpine-1,dirt-1 --starts 3 --seconds 2 --together"
     program = [sys.executable, TOOLS / "soak_robots.py", *words.split(), "--processes", "1"]

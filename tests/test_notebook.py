@@ -30,7 +30,7 @@ def outputs(notebook):
     ]
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 @pytest.mark.usefixtures("game")
 def test_the_notebook_puts_out_what_it_keeps(tmp_path, monkeypatch):
     """A cell with an error would stop it."""

@@ -106,7 +106,7 @@ def wanted():
         for name, folder in folders.items()
         for pattern in ("*.py", "*.pyi", *data.get(name, ()))
         for path in folder.glob(pattern)
-        if path.is_file() and path.parent.name != "__pycache__"
+        if path.is_file() and "__pycache__" not in path.parts
     }
 
 

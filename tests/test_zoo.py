@@ -313,7 +313,7 @@ def zoo_script(*words):
     return subprocess.run(command, capture_output=True, text=True)
 
 
-@pytest.mark.slow
+@pytest.mark.rare
 def test_the_script_for_videos_knows_our_environments(tmp_path):
     """It has no --gym-packages."""
     run = tmp_path / "ddpg" / "TorcsLite-v0_1"
@@ -326,9 +326,8 @@ def test_the_script_for_videos_knows_our_environments(tmp_path):
     assert video.stat().st_size > 1000
 
 
-@pytest.mark.parametrize("words", [[], ["no_such"], ["../x"]])
-def test_another_script_is_told(words):
-    done = zoo_script(*words)
+def test_another_script_is_told():
+    done = zoo_script("../x")
     assert done.returncode == 1
     assert done.stderr.startswith("the RL Zoo has no script '")
     assert "it has enjoy, " in done.stderr
