@@ -12,7 +12,7 @@ from selenium import webdriver
 from selenium.webdriver.chrome.service import Service
 from selenium.webdriver.common.actions.action_builder import ActionBuilder
 
-PATIENCE = 60.0  # [s] for a page to be ready, on a busy machine
+PATIENCE = 600.0  # [s] for a page to be ready, on a busy machine
 WIDE, NARROW = (1440, 900), (390, 844)  # a desk, a phone
 
 

@@ -6,7 +6,7 @@ import contextlib
 import time
 from pathlib import Path
 
-from processes import runs
+from processes import PATIENCE, runs
 
 
 def traces(name):
@@ -18,7 +18,7 @@ def traces(name):
 
 def left_behind(display):
     """Its files, unless another server has its number by now, or is giving it back."""
-    end = time.monotonic() + 10.0
+    end = time.monotonic() + PATIENCE
     while traces(display.name):
         lock = Path(f"/tmp/.X{display.name[1:]}-lock")
         with contextlib.suppress(OSError, ValueError):

@@ -70,7 +70,7 @@ def python(code: str, *words: str, cwd: Path | None = None, **environment: str) 
     """Run code in a process of its own, so that its crash is a failed test with all it said."""
     done = subprocess.run(
         [sys.executable, "-X", "faulthandler", "-c", code, *words],
-        capture_output=True, text=True, timeout=100, check=False, cwd=cwd,
+        capture_output=True, text=True, check=False, cwd=cwd,
         env={**os.environ, **environment},
     )  # fmt: skip
     assert done.returncode == 0, f"exit status {done.returncode}\n{done.stdout}\n{done.stderr}"

@@ -11,7 +11,6 @@ import shlex
 import signal
 import subprocess
 import sys
-import time
 import types
 
 import gymnasium as gym
@@ -20,6 +19,7 @@ import pytest
 import yaml
 from fake_game import write_game
 from made_agents import copied_agent
+from processes import Program
 from stable_baselines3 import DDPG
 from stable_baselines3.common.callbacks import BaseCallback
 
@@ -115,7 +115,7 @@ def test_help_loads_nothing_heavy():
     assert loaded_by("--help") & heavy == set()
 
 
-@pytest.mark.parametrize("closed", [">&-", "2>&-", "<&-", ">&- 2>&- <&-"])
+@pytest.mark.parametrize("closed", [">&-", "2>&- <&-"])
 def test_a_closed_stream_ends_nothing(closed, tmp_path):
     done = subprocess.run(
         f"{sys.executable} -m sb3_torcs.cli tracks --json aalborg --plot line.png {closed}",
@@ -185,11 +185,8 @@ def said_with(encoding, text):
 @pytest.mark.parametrize(
     ("encoding", "text", "expected"),
     [
-        ("utf-8", "90° m² → é", "90° m² → é".encode()),
-        ("ascii", "90° m² → é … 赤", b"90 deg m2 -> e ... \\u8d64"),
-        ("latin-1", "90° →", b"90\xb0 ->"),
-        ("utf-8", "a\udcffb", b"a\xffb"),
-        ("ascii", "a\udcffb", b"a\xffb"),
+        ("utf-8", "90° → é a\udcffb", "90° → é ".encode() + b"a\xffb"),
+        ("ascii", "90° m² → é … 赤 a\udcffb", b"90 deg m2 -> e ... \\u8d64 a\xffb"),
     ],
 )
 def test_any_terminal_takes_any_text(encoding, text, expected):
@@ -234,8 +231,7 @@ def test_a_training_in_a_folder_that_is_not_utf8(capfd, tmp_path):
     status, _, err = run(capfd, *words)
     assert status == 2
     assert "whose name is not UTF-8; give another folder: --tensorboard DIR" in err
-    command = [sys.executable, "-m", "sb3_torcs.cli", *words, "--tensorboard", str(tmp_path / "t")]
-    assert subprocess.run(command, capture_output=True).returncode == 0
+    assert run(capfd, *words, "--tensorboard", str(tmp_path / "t"))[0] == 0
     assert models.find_model(f"{folder}/ddpg/TorcsLite-v0_1").name == "best_model.zip"
 
 
@@ -975,52 +971,28 @@ def test_an_interrupted_training_keeps_what_it_learned_and_says_how_to_go_on(cap
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("by", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    "by", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.rare)]
+)
 def test_a_training_in_processes_that_is_ended_from_outside_keeps_what_it_learned(tmp_path, by):
     """The terminal interrupts all its processes; who reads what it says may be gone before."""
     conf_file = write_config(tmp_path, n_envs=2, n_timesteps=10**6)
     words = ["--conf-file", conf_file, "--folder", str(tmp_path / "logs"), "--eval-freq", "200"]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "sb3_torcs.cli", "train", *words, "--", "--vec-env", "subproc"],
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True,
-    )  # fmt: skip
+    words += ["--", "--vec-env", "subproc"]
     folder = tmp_path / "logs" / "ddpg" / "TorcsLite-v0_1"
-    try:
-        while not (folder / "best_model.zip").is_file():
-            assert process.poll() is None, process.stdout.read()
-            time.sleep(0.1)
-        process.stdout.close()
-        (os.killpg if by == signal.SIGINT else os.kill)(process.pid, by)
-        process.wait(60)
-    finally:
-        process.kill()
-        process.wait()
+    reader, writer = os.pipe()
+    with Program.of_ours("train", *words, stdout=writer, start_new_session=True) as program:
+        os.close(writer)
+        program.wait_for((folder / "best_model.zip").is_file)
+        os.close(reader)
+        (os.killpg if by == signal.SIGINT else os.kill)(program.pid, by)
+        program.end()
     assert models.saved_timesteps(folder / "TorcsLite-v0.zip") >= 200
     assert models.find_model(folder, prefer_last=True).name == "TorcsLite-v0.zip"
 
 
-@pytest.mark.slow
-def test_a_training_that_is_killed_leaves_no_temporary_file(tmp_path):
-    scratch = tmp_path / "scratch"
-    scratch.mkdir()
-    conf_file = write_config(tmp_path, n_timesteps=10**6)
-    words = ["--conf-file", conf_file, "--folder", str(tmp_path / "logs"), "--eval-freq", "200"]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "sb3_torcs.cli", "train", *words],
-        stdout=subprocess.DEVNULL, env={**os.environ, "TMPDIR": str(scratch)},
-    )  # fmt: skip
-    try:
-        while not list((tmp_path / "logs").glob("ddpg/*/best_model.zip")):
-            assert process.poll() is None
-            time.sleep(0.1)
-    finally:
-        process.kill()
-        process.wait()
-    assert list(scratch.iterdir()) == []
-
-
-@pytest.mark.parametrize("by", [signal.SIGINT, signal.SIGTERM])
-def test_a_training_that_a_signal_has_ended_says_which(monkeypatch, capsys, tmp_path, by):
+def test_a_training_that_a_signal_has_ended_says_which(monkeypatch, capsys, tmp_path):
+    by = signal.SIGTERM
     run = training_run.Run(tmp_path, 80, 100, by, tmp_path / "TorcsLite-v0.zip", {})
     monkeypatch.setattr("sb3_torcs.cli.train.train_run", lambda _: run)
     status = main(["train", "--algo", "ddpg"])

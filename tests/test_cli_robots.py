@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 import os
 import signal
-import subprocess
 import sys
-import time
 import types
 
 import pytest
 from fake_game import write_game
+from processes import Program
 
 from sb3_torcs.agents.robots import race
 from sb3_torcs.cli import main
@@ -62,16 +61,11 @@ class TestByTheGame:
             "laps": [{"time": time, "damage": 0} for time in times],
         }  # fmt: skip
 
-    @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-    def test_a_polite_kill_ends_the_game_too(self, game, number, tmp_path):
+    def test_a_polite_kill_ends_the_game_too(self, game, tmp_path):
         words = ["robots", "inferno", "--track", "aalborg", "--laps", "5000", "--game"]
-        command = [sys.executable, "-m", "sb3_torcs.cli", *words]
-        process = subprocess.Popen(command, env={**os.environ, "TMPDIR": str(tmp_path)})
-        while not list(tmp_path.glob("*/words")):
-            assert process.poll() is None, "it ended before it could be killed"
-            time.sleep(0.05)
-        process.send_signal(number)
-        assert process.wait(30.0) == 128 + number
+        with Program.of_ours(*words, env={**os.environ, "TMPDIR": str(tmp_path)}) as program:
+            program.wait_for(lambda: list(tmp_path.glob("*/words")))
+            assert program.end(signal.SIGHUP) == 128 + signal.SIGHUP
         assert list(tmp_path.iterdir()) == []
 
     def test_a_practice_as_a_table(self, game, capsys):

@@ -8,10 +8,9 @@ import signal
 import socket
 import subprocess
 import sys
-import time
-from pathlib import Path
 
 import pytest
+from processes import PATIENCE, gone, processes_of
 from third_party import ThirdParty
 
 from sb3_torcs.cli import main
@@ -19,7 +18,8 @@ from sb3_torcs.torcs.display import VirtualDisplay
 
 pytestmark = pytest.mark.usefixtures("game")
 
-PATIENCE = 60.0  # [s]
+
+STARTED = []  # the commands of a test
 
 
 def free_ports(number=1):
@@ -41,30 +41,27 @@ def free_ports(number=1):
 
 @pytest.fixture
 def folder(tmp_path):
-    """Where everything private goes; nothing may be left in it."""
+    """Where everything private goes; nothing may be left in it, and no command runs on."""
     yield tmp_path
+    for process in STARTED:
+        process.kill()
+        process.communicate()
+    STARTED.clear()
     assert list(tmp_path.glob("sb3-torcs-*")) == []
 
 
 def serve(folder, port, *words, **variables):
     call = [sys.executable, "-m", "sb3_torcs.cli", "serve", "--port", str(port), *words]
-    return subprocess.Popen(
+    STARTED.append(subprocess.Popen(
         call, env={**os.environ, "TMPDIR": str(folder), **variables}, text=True,
         stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-    )  # fmt: skip
+    ))  # fmt: skip
+    return STARTED[-1]
 
 
 def games_of(folder):
     """Processes of the game that run in a folder."""
-    found = []
-    for path in Path("/proc").glob("[0-9]*/cmdline"):
-        try:
-            text = path.read_bytes()
-        except OSError:
-            continue
-        if b"torcs-bin" in text and os.fsencode(folder) in text:
-            found.append(int(path.parent.name))
-    return found
+    return processes_of(folder, b"torcs-bin")
 
 
 def test_no_process_is_ended_by_pkill_torcs(folder):
@@ -128,7 +125,7 @@ def test_two_clients_race_against_a_robot(folder):
     assert sorted(names) == sorted([one.address, other.address, "inferno:3"])
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
 def test_whatever_ends_it_nothing_is_left(folder, number):
     port = free_ports()
     process = serve(folder, port, "--wait")
@@ -140,14 +137,11 @@ def test_whatever_ends_it_nothing_is_left(folder, number):
         _, err = process.communicate(timeout=PATIENCE)
         if number != signal.SIGKILL:
             assert client.last() == b"***shutdown***\0"
-        ends = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGKILL: -9}
-        assert process.returncode == ends[number]
+        assert process.returncode == (130 if number == signal.SIGINT else -9)
         if number == signal.SIGINT:
             assert "sb3-torcs: interrupted" in err
-    deadline = time.monotonic() + PATIENCE  # a game without its owner ends itself
-    while (games_of(folder) or list(folder.iterdir())) and time.monotonic() < deadline:
-        time.sleep(0.1)
-    assert games_of(folder) == []
+    # A game without its owner ends itself.
+    assert gone(lambda: games_of(folder), lambda: list(folder.iterdir()))
 
 
 def test_a_client_that_thinks_too_long_loses_ticks_and_is_told(folder):
@@ -166,8 +160,7 @@ def test_a_client_that_thinks_too_long_loses_ticks_and_is_told(folder):
     assert ticks > client.answers
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_what_was_driven_until_it_is_ended_is_told(folder, number):
+def test_what_was_driven_until_it_is_ended_is_told(folder):
     port = free_ports(2)
     words = ("--track", "a-speedway", "--drivers", "2", "--robots", "inferno", "--laps", "9")
     process = serve(folder, port, *words, "--wait")
@@ -177,7 +170,7 @@ def test_what_was_driven_until_it_is_ended_is_told(folder, number):
         for _ in range(100):
             one.drive(1)
             other.drive(1)
-        process.send_signal(number)
+        process.send_signal(signal.SIGTERM)
         out, _ = process.communicate(timeout=PATIENCE)
         assert one.last() == other.last() == b"***shutdown***\0"
     assert re.search(rf"scr_server 0: {one.address}: 10\d control ticks, 0 late", out)

@@ -9,7 +9,7 @@ import sys
 
 import pytest
 from displays import traces
-from processes import gone_within, runs
+from processes import PATIENCE, gone, runs
 
 from sb3_torcs.errors import BackendUnavailable, DisplayUnavailable
 from sb3_torcs.torcs.display import VirtualDisplay, find_display
@@ -71,7 +71,7 @@ class TestTheVirtualDisplay:
         """A server ends with its last client, be it one that only looks whether it is there."""
         with VirtualDisplay(SIZE) as display:
             os.kill(display.pid, signal.SIGKILL)
-            assert gone_within(10, lambda: runs(display.pid))
+            assert gone(lambda: runs(display.pid))
             number, written = os.pipe()
             call = ["Xvfb", display.name, "-terminate", "-displayfd", str(written)]
             heir = subprocess.Popen(call, stderr=subprocess.DEVNULL, pass_fds=(written,))
@@ -84,7 +84,7 @@ class TestTheVirtualDisplay:
             assert traces(display.name)
         finally:
             heir.terminate()
-            heir.wait(10)
+            heir.wait(PATIENCE)
 
     def test_it_goes_with_the_process_that_has_it(self):
         code = (
@@ -97,7 +97,7 @@ class TestTheVirtualDisplay:
         with subprocess.Popen(call, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as owner:
             name, pid = owner.stdout.readline().decode().split()
             owner.kill()
-        assert gone_within(10, lambda: runs(pid), lambda: traces(name))
+        assert gone(lambda: runs(pid), lambda: traces(name))
 
     def test_without_the_program_the_error_says_what_to_type(self, monkeypatch, tmp_path):
         monkeypatch.setenv("PATH", str(tmp_path))

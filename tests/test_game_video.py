@@ -15,7 +15,7 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 from displays import left_behind, traces
-from processes import gone_within, runs
+from processes import gone, runs
 from recordings import FPS, LAP, SIZE, recorded, saved
 
 from sb3_torcs.errors import (
@@ -220,4 +220,4 @@ class TestFaults:
             pid, folder, server, name = owner.stdout.readline().decode().split()
             owner.kill()
         left = [lambda: runs(pid), Path(folder).exists, lambda: runs(server), lambda: traces(name)]
-        assert gone_within(10, *left)
+        assert gone(*left)

@@ -15,7 +15,6 @@ import sys
 import warnings
 from functools import partial
 from pathlib import Path
-from time import monotonic, sleep
 
 import gymnasium as gym
 import imageio_ffmpeg
@@ -23,7 +22,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env as check_gymnasium
 from gymnasium.wrappers import AddRenderObservation, RecordVideo
-from processes import children
+from processes import children, gone
 from stable_baselines3.common.env_checker import check_env as check_sb3
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecVideoRecorder
 
@@ -73,7 +72,7 @@ def shot(frame):
 # ---- What a picture shows -----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("size", [(160, 120), (333, 217), (640, 480)])
+@pytest.mark.parametrize("size", [(333, 217), (640, 480)])
 def test_a_picture_has_the_size_that_was_asked_for(size):
     env = make(render_size=size)
     env.reset(seed=1)
@@ -100,7 +99,10 @@ def test_a_picture_follows_the_car(env):
     assert np.abs(shot(later) - shot(at_first)).mean() > 3.0
 
 
-@pytest.mark.parametrize("view", VIEWS)
+@pytest.mark.parametrize("view", [
+    view if view in ("behind", "tv") else pytest.param(view, marks=pytest.mark.rare)
+    for view in VIEWS
+])  # fmt: skip
 def test_a_picture_shows_this_moment_and_nothing_before_it(view):
     """Neither camera nor needles lag behind, and no smoke, marks or dents stay."""
     env = make(view=view, opponents=("inferno",))  # a director would cut to it
@@ -381,10 +383,7 @@ def traces(env, before):
 
 
 def wait_until_gone(paths):
-    end = monotonic() + 20.0
-    while any(path.exists() for path in paths) and monotonic() < end:
-        sleep(0.05)
-    assert [path for path in paths if path.exists()] == []
+    assert gone(*(path.exists for path in paths)), paths
 
 
 def test_nothing_runs_before_the_first_picture():
@@ -430,9 +429,7 @@ def test_a_killed_owner_leaves_nothing(tmp_path):
         "print(children, env._viewer._game.folder, flush=True)\n"
         "os.kill(os.getpid(), signal.SIGKILL)\n"
     )
-    run = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
-    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     *pids, folder = run.stdout.split()
     assert len(pids) == 2, run.stderr
     wait_until_gone([Path(f"/proc/{pid}") for pid in pids] + [Path(folder)])

@@ -9,7 +9,6 @@ import random
 import resource
 import shlex
 import signal
-import subprocess
 import sys
 import time
 from contextlib import nullcontext
@@ -18,7 +17,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import yaml
-from processes import raise_in_c
+from processes import Program, raise_in_c
 from rl_zoo3.exp_manager import ExperimentManager
 from stable_baselines3 import DDPG, PPO
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
@@ -399,26 +398,26 @@ def whole(folder):
 
 
 @pytest.mark.slow
-def test_a_training_that_was_killed_goes_on(tmp_path):
+@pytest.mark.parametrize("kills", [1, pytest.param(4, marks=pytest.mark.rare)])
+def test_a_training_that_was_killed_goes_on(tmp_path, kills):
     """At any moment, also while it saves: with a large buffer it does little else."""
-    rng, resumed = random.Random(0), []
-    for number in range(1, 4):
+    rng, resumed = random.Random(kills), []
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    for number in range(1, kills + 1):
         words = words_of(tmp_path, n_timesteps=10**6, buffer_size=200_000)
-        command = [sys.executable, "-m", "sb3_torcs.cli", *words, *resumed, "--eval-freq", "40"]
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+        words = [*words, *resumed, "--eval-freq", "40"]
         folder = run_folder(tmp_path, number)
-        while not (folder / REPLAY_BUFFER).is_file():
-            assert process.poll() is None, process.stderr.read()
-            time.sleep(0.05)
-        time.sleep(rng.uniform(0.0, 1.0))
-        process.kill()
-        process.communicate()
-        assert process.returncode == -signal.SIGKILL
+        with Program.of_ours(*words, env={**os.environ, "TMPDIR": str(scratch)}) as program:
+            program.wait_for((folder / REPLAY_BUFFER).is_file)
+            time.sleep(rng.uniform(0.0, 1.0))
+            assert program.end(signal.SIGKILL) == -signal.SIGKILL
+        assert list(scratch.iterdir()) == []
         assert whole(folder) >= 40
         resumed = ["--resume", str(folder)]
     words = words_of(tmp_path, buffer_size=200_000)
     assert main([*words, *resumed, "--timesteps", "30"]) == 0
-    assert models.saved_timesteps(run_folder(tmp_path, 4) / "TorcsLite-v0.zip") == 30
+    assert models.saved_timesteps(run_folder(tmp_path, kills + 1) / "TorcsLite-v0.zip") == 30
 
 
 class Interrupted:

@@ -193,7 +193,7 @@ def test_a_server_that_ends_is_noticed_at_once():
 
 def test_a_server_that_falls_silent_is_given_up_in_time():
     with Loopback() as server:
-        client = client_of(server, patience=0.3, pause=0.05)
+        client = client_of(server, patience=2.0, pause=0.05)
         client.identify()
         message = client.receive()
         server.say = lambda message: None
@@ -205,10 +205,10 @@ def test_a_server_that_falls_silent_is_given_up_in_time():
 
 def test_a_race_that_somebody_pauses_is_waited_for():
     with Loopback() as server:
-        client = client_of(server, patience=0.1, silence=60.0, pause=0.02)
+        client = client_of(server, patience=1.0, silence=60.0, pause=0.02)
         client.identify()
         message = client.receive()
-        say, until = server.say, time.monotonic() + 0.5
+        say, until = server.say, time.monotonic() + 2.0
         server.say = lambda message: say(message) if time.monotonic() > until else None
         answer(client, message)
         assert client.receive() != message

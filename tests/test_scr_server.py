@@ -29,7 +29,7 @@ from sb3_torcs.torcs.race_setup import RaceSetup
 from sb3_torcs.torcs.starting_list import AGENT
 from sb3_torcs.tracks.trial import check_track
 
-PATIENCE = 20.0  # [s] for an answer on a busy machine
+PATIENCE = 600.0  # [s] for an answer on a busy machine
 INIT = "SCR(init " + " ".join(str(angle) for angle in range(-90, 91, 10)) + ")"
 STAND = "(accel 0)(brake 1)(gear 0)(steer 0)"  # as cars do before a start
 DRIVER = ("scr_server", 0)
@@ -947,7 +947,7 @@ class TestLostAndDoubled:
 
 class TestDeadline:
     def test_answers_that_are_missing_are_counted(self, serve):
-        process, client = serve(deadline=0.5, track="michigan", laps=1)
+        process, client = serve(deadline=2.0, track="michigan", laps=1)
         client.identify()
         drive(client, client.receive(), 100)
         for _ in range(3):
@@ -983,10 +983,10 @@ class TestDeadline:
 
     def test_who_was_late_once_does_not_lag_behind(self, serve):
         """A client that answers state after state, and does not say which."""
-        process, client = serve(deadline=0.2)
+        process, client = serve(deadline=2.0)
         client.identify()
         state = client.receive()
-        time.sleep(0.3)
+        time.sleep(2.2)
         for _ in range(20):
             before, state = state, client.ask(STAND)
             time.sleep(0.005)
@@ -1024,7 +1024,7 @@ from sb3_torcs.scr.server import open_ports, start_server
 sockets = open_ports(1)
 game = start_server(find_game(), RaceSetup("aalborg", [("scr_server", 0)]), sockets)
 print(game.pid, game.folder, sockets[0].getsockname()[1], flush=True)
-time.sleep(60)
+time.sleep(600)
 """
 
 

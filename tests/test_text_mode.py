@@ -193,8 +193,8 @@ class TestMisbehaviour:
 
     def test_a_game_that_hangs_is_stopped(self, play):
         code = "import time\nprint('waiting', flush=True)\ntime.sleep(60)"
-        with pytest.raises(GameTimeout, match=r"within 0\.5 s and was stopped; .* said: waiting"):
-            play(code, timeout=0.5)
+        with pytest.raises(GameTimeout, match=r"within 5 s and was stopped; .* said: waiting"):
+            play(code, timeout=5.0)
 
     def test_a_game_that_crashes_gives_its_last_lines(self, play):
         code = "import os\nfor n in range(20): print('line', n, flush=True)\nos.abort()"

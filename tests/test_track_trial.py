@@ -5,13 +5,12 @@ from __future__ import annotations
 import os
 import re
 import signal
-import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+from processes import Program, gone, runs
 
 from sb3_torcs.backends.lite.backend import LiteBackend
 from sb3_torcs.backends.native import NativeBackend
@@ -109,28 +108,14 @@ def test_a_loader_that_never_ends_is_an_error(broken, monkeypatch):
         NativeBackend(path)
 
 
-@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGKILL])
 def test_a_signal_ends_the_wait_and_leaves_no_process(broken, end):
     code = "import sys; from sb3_torcs.backends.native import NativeBackend as N; N(sys.argv[1])"
-    waiting = subprocess.Popen(
-        [sys.executable, "-c", code, str(hanging(broken))], stderr=subprocess.DEVNULL
-    )
-    children = Path(f"/proc/{waiting.pid}/task/{waiting.pid}/children")
-    while not (trial := children.read_text().split()):
-        time.sleep(0.01)
-    waiting.send_signal(end)
-    waiting.wait(60)
-    assert waiting.returncode in (-end, 1)
-    while _runs(int(trial[0])):
-        time.sleep(0.01)  # for ever, if it stays
-
-
-def _runs(pid):
-    """Whether a process computes; a zombie does not."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except FileNotFoundError:
-        return False
+    with Program(sys.executable, "-c", code, str(hanging(broken))) as waiting:
+        children = Path(f"/proc/{waiting.pid}/task/{waiting.pid}/children")
+        (trial,) = waiting.wait_for(lambda: children.read_text().split())
+        assert waiting.end(end) in (-end, 1)
+    assert gone(lambda: runs(int(trial)))
 
 
 @pytest.mark.parametrize("spoil", [crashing, hanging])

@@ -85,7 +85,7 @@ def assert_same(one, other, where=""):
         assert one == other, f"{where}: {one} != {other}"
 
 
-def wait_until(true, seconds=30.0):
+def wait_until(true, seconds=600.0):
     """The system takes a moment to forget a thread that has ended."""
     end = time.monotonic() + seconds
     while not true():

@@ -15,7 +15,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from processes import gone_within, runs
+from processes import PATIENCE, gone, runs
 from viewers import ESCAPE, LAP, SIZE, Viewer, shown
 
 from sb3_torcs.errors import GameFailed, GameIncomplete, InvalidOption
@@ -124,14 +124,14 @@ class TestTheWindow:
             Viewer(display.name) as viewer,
         ):
             first = viewer.wait_for_a_race()
-            for _ in range(600):
+            for _ in range(12_000):
                 time.sleep(0.05)
                 if np.abs(viewer.look() - first).mean() > 10:  # the car drives
                     break
             else:
                 raise AssertionError("nothing moves")
             viewer.press(ESCAPE)
-            process.wait(20)
+            process.wait(PATIENCE)
             assert list((process.folder / "results" / "race").glob("*.xml"))
 
     def test_closing_it_ends_the_race(self, game):
@@ -142,14 +142,14 @@ class TestTheWindow:
         ):
             viewer.wait_for_a_race()
             viewer.close_window()
-            process.wait(20)
+            process.wait(PATIENCE)
             assert list((process.folder / "results" / "race").glob("*.xml"))
 
     def test_without_a_display_it_says_so(self, game):
         window = Window(SIZE, display=":2999")
         with GameProcess(game, LAP, check=check_track, **window_arguments(game, window)) as process:
             with pytest.raises(GameFailed, match="failed to open display ':2999'"):
-                process.wait(20)
+                process.wait(PATIENCE)
 
     def test_it_removes_no_folder_but_its_own(self, game, tmp_path):
         precious = tmp_path / "precious"
@@ -161,18 +161,18 @@ class TestTheWindow:
             arguments["environment"] |= gone
             with GameProcess(game, LAP, check=check_track, **arguments) as process:
                 with pytest.raises(GameFailed, match="exit status 1"):
-                    process.wait(20)
+                    process.wait(PATIENCE)
                 assert process.folder.exists()
         assert precious.exists()
 
     def test_it_goes_with_the_process_that_started_it(self):
         with race_of_another_process() as (owner, game, display, folder):
             owner.kill()
-        assert gone_within(10, lambda: runs(game), folder.exists, lambda: runs(display))
+        assert gone(lambda: runs(game), folder.exists, lambda: runs(display))
 
     def test_it_goes_with_a_session_that_ends(self):
         """The display first, and the process that started the game just after it."""
         with race_of_another_process() as (owner, game, display, folder):
             os.kill(display, signal.SIGTERM)
             owner.kill()
-        assert gone_within(10, lambda: runs(game), folder.exists)
+        assert gone(lambda: runs(game), folder.exists)

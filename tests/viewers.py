@@ -79,7 +79,7 @@ class Viewer:
 
     def wait_for_a_race(self):
         """Wait for a picture with the sky above the road."""
-        for _ in range(600):
+        for _ in range(12_000):
             picture = self.look()
             if picture[:60].mean() > 120 > picture[-60:].mean() > 30:
                 return picture

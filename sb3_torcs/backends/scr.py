@@ -52,7 +52,7 @@ __all__ = ["ScrBackend"]
 
 MAX_PORT = 65535
 HOST = "127.0.0.1"
-PATIENCE = 60.0  # [s] with a game of our own, which also has to load on a busy machine
+PATIENCE = 300.0  # [s] with a game of our own, which also has to load on a busy machine
 PATIENCE_WITH_OTHERS = 10.0  # [s] with a server that should be there already
 SILENCE = 600.0  # [s] of a server elsewhere: the race waits for all clients; somebody may pause it
 PAUSE = 0.02  # [s] before an action is said again to our own server, which knows it again

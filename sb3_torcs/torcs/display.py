@@ -20,9 +20,9 @@ __all__ = ["INSTALL", "PROGRAM", "VirtualDisplay", "find_display"]
 
 PROGRAM = "Xvfb"
 INSTALL = "`sb3-torcs install-torcs --video`, or: `sudo apt install xvfb`"
-PATIENCE = 20.0  # [s] for a server to start on a busy machine
+PATIENCE = 120.0  # [s] for a server to start on a busy machine
 GRACE = 5.0  # [s] for a server to end
-ANSWER_TIME = 5.0  # [s] for a server to greet
+ANSWER_TIME = 30.0  # [s] for a server to greet
 FIRST_TCP_PORT = 6000
 SOCKETS = Path("/tmp/.X11-unix")
 GREETING = b"l\0\x0b\0\0\0" + bytes(6)  # little endian, protocol 11.0, no password

@@ -12,7 +12,7 @@ from sb3_torcs.torcs.process import game_environment
 __all__ = ["missing_libraries"]
 
 
-PATIENCE = 30.0  # [s] on a busy machine
+PATIENCE = 120.0  # [s] on a busy machine
 
 
 def missing_libraries(game: Game) -> list[str]:
