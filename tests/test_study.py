@@ -9,23 +9,23 @@ import math
 import os
 import shutil
 import signal
-import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 
 import pytest
 import yaml
+from processes import Program, processes_of
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_torcs.cli import main
 from sb3_torcs.cli.study import Board
 from sb3_torcs.errors import RayUnavailable, StudyError
+from sb3_torcs.signals import handlers_kept
 from sb3_torcs.studies import runner as study_module
 from sb3_torcs.studies.config import FIELDS, read_study
 from sb3_torcs.studies.report import write_report
-from sb3_torcs.studies.runner import MARK, PRIVATE, SESSION, run_study, run_trial
+from sb3_torcs.studies.runner import MARK, PRIVATE, SESSION, run_study, run_trial, with_patience
 from sb3_torcs.studies.storage import StudyFolder
 
 CLOCKS = ("wall_s", "cpu_s")
@@ -62,7 +62,7 @@ def results(folder):
 
 
 @pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory):
+def undisturbed_folder(tmp_path_factory):
     """The same study without Ray: one trial after the other, in this process."""
     folder = tmp_path_factory.mktemp("undisturbed")
     study = read_study(study_file(folder))
@@ -70,7 +70,12 @@ def undisturbed(tmp_path_factory):
     store.begin()
     for trial in study.trials:
         run_trial(trial, store, lambda row: None)
-    return results(folder / "out")
+    return folder / "out"
+
+
+@pytest.fixture(scope="module")
+def undisturbed(undisturbed_folder):
+    return results(undisturbed_folder)
 
 
 def test_the_table_has_every_evaluation_of_every_trial(undisturbed):
@@ -288,17 +293,15 @@ def test_what_was_lost_of_a_folder_is_told(begun, capsys):
     assert "small-nets-seed0' has lost its checkpoint-*; remove" in capsys.readouterr().err
 
 
-@pytest.mark.slow
-def test_a_damaged_checkpoint_is_told_once(begun, capsys):
+def test_a_damaged_checkpoint_is_told_once(begun):
+    """As a row: at an error of a worker Tune would try again."""
     study, store = begun
-    handlers = [signal.getsignal(number) for number in HANDLED]
-    assert main(["study", str(study.path), "--folder", str(store.path)]) == 1
-    # Tune leaves its own behind, which would swallow the next Ctrl-C of this process.
-    assert [signal.getsignal(number) for number in HANDLED] == handlers
-    out = capsys.readouterr().out
-    assert "small-nets-seed0 failed: its checkpoint cannot be read (" in out
-    assert "remove the folder small-nets-seed0 of the study" in out
-    assert "1 of 2 agents trained and measured" in out
+    reports = []
+    study_module._run_or_tell(study.trials[0], store, reports.append)
+    (report,) = reports
+    assert report["phase"] == "failed"
+    assert "its checkpoint cannot be read (" in report["error"]
+    assert "remove the folder small-nets-seed0 of the study" in report["error"]
 
 
 @pytest.mark.parametrize(
@@ -394,130 +397,151 @@ def short_folder(monkeypatch):
         yield folder
 
 
-@pytest.mark.slow
-def test_a_lost_machine_costs_one_interval_at_most_and_changes_no_result(
-    undisturbed, tmp_path, short_folder
-):
-    """Two machines, one trial on each; the second is killed in mid-study."""
+@pytest.fixture
+def cluster(short_folder):
+    """Starts Ray for a study to join, with its head in this process."""
     from ray.cluster_utils import Cluster
 
-    study = read_study(study_file(tmp_path))
-    node = {"num_cpus": 1, "include_dashboard": False, "temp_dir": short_folder}
-    cluster = Cluster(initialize_head=True, head_node_args=node)
-    second = cluster.add_node(**node)
-    reports = []
+    started = []
+
+    def start(**head):
+        node = {"num_cpus": 1, "include_dashboard": False, "temp_dir": short_folder}
+        arguments = {"initialize_head": True, "head_node_args": {**node, **head}}
+        started.append(with_patience(lambda: Cluster(**arguments)))
+        return started[0], lambda: with_patience(lambda: started[0].add_node(**node))
+
+    with handlers_kept(*HANDLED):
+        yield start
+        for each in started:
+            each.shutdown()
+
+
+@pytest.mark.slow
+def test_a_killed_study_loses_a_machine_too_and_ends_as_if_undisturbed(
+    undisturbed, tmp_path, short_folder, cluster
+):
+    """
+    It goes on from what it has stored: first nothing is left of its processes, then one of two
+    machines is lost with a trial on each.
+    """
+    words = words_of(tmp_path, "--jobs", "2")
+    with Program.of_ours(*words, env={**os.environ, "TMPDIR": short_folder}) as program:
+        program.wait_for(lambda: seeds_so_far(tmp_path / "out"))
+        assert program.end(signal.SIGKILL) == -signal.SIGKILL
+    scratch = Path((tmp_path / "out" / SESSION).read_text())
+    assert scratch.is_dir()
+    assert len(results(tmp_path / "out")) < len(undisturbed)
+
+    head, add_node = cluster()
+    second = add_node()
+    handlers = [signal.getsignal(number) for number in HANDLED]
+    reports, running, trained = [], set(), set()
 
     def watch(trial, row):
+        if row.get("state") == "running":
+            running.add(trial.seed)
         if "phase" in row:
             reports.append((trial.seed, row["phase"], row["decisions"]))
-        if second in cluster.worker_nodes and len({seed for seed, *_ in reports}) == 2:
-            cluster.remove_node(second, allow_graceful=False)
+            trained.update({trial.seed} & running)
+        if len(trained) == 2 and second in head.worker_nodes:
+            head.remove_node(second, allow_graceful=False)
 
-    try:
-        run_study(study, tmp_path / "out", address=cluster.address, progress=watch)
-        assert second not in cluster.worker_nodes
-    finally:
-        cluster.shutdown()
+    run_study(read_study(tmp_path / "tiny.yml"), tmp_path / "out", address=head.address,
+              progress=watch)  # fmt: skip
+    assert second not in head.worker_nodes
     assert results(tmp_path / "out") == undisturbed
     assert sorted(seed for seed, phase, _ in reports if phase == "final") == [0, 1]
     assert len(reports) == len(set(reports))  # no evaluation was done twice
-
-
-@pytest.mark.slow
-def test_the_ray_of_another_study_is_not_joined(begun, short_folder):
-    from ray.cluster_utils import Cluster
-
-    node = {"num_cpus": 1, "include_dashboard": False, "temp_dir": short_folder}
-    cluster = Cluster(initialize_head=True, head_node_args={**node, "resources": {PRIVATE: 1}})
-    try:
-        with pytest.raises(RayUnavailable, match="belongs to another study, and ends with it"):
-            run_study(begun[0], begun[1].path, address=cluster.address)
-    finally:
-        cluster.shutdown()
-
-
-@pytest.mark.slow
-def test_a_killed_study_goes_on_with_the_same_command_and_leaves_nothing(
-    undisturbed, tmp_path, short_folder, monkeypatch, capsys
-):
-    monkeypatch.setenv("TMPDIR", short_folder)
-    monkeypatch.setattr(tempfile, "tempdir", short_folder)
-    words = ["study", str(study_file(tmp_path)), "--folder", str(tmp_path / "out"), "--jobs", "2"]
-    command = [sys.executable, "-m", "sb3_torcs.cli", *words]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    try:
-        while not seeds_so_far(tmp_path / "out") >= {"0", "1"}:
-            assert process.poll() is None, "it ended before it could be killed"
-            time.sleep(0.05)
-    finally:
-        process.send_signal(signal.SIGKILL)
-        process.wait()
-    session = Path((tmp_path / "out" / SESSION).read_text())
-    assert session.is_dir()
-    before = results(tmp_path / "out")
-    assert len(before) < len(undisturbed)
-    capsys.readouterr()
-
-    assert main([*words, "--json"]) == 0
-    said = json.loads(capsys.readouterr().out)
-    assert {(line["seed"], line["state"]) for line in said["trials"]} == {(0, "done"), (1, "done")}
-    assert results(tmp_path / "out") == undisturbed
-    assert os.listdir(short_folder) == ["ray"]
-    assert (
-        str(session)
-        not in subprocess.run(
-            ["ps", "-eo", "args"], capture_output=True, text=True, check=True
-        ).stdout
-    )
+    # Tune leaves its own behind, which would swallow the next Ctrl-C of this process.
+    assert [signal.getsignal(number) for number in HANDLED] == handlers
+    assert not scratch.exists()
+    assert not processes_of(scratch)
     assert not (tmp_path / "out" / SESSION).exists()
     assert not list((tmp_path / "out").rglob("*checkpoint-*"))
 
-    # There is nothing left to do, and Ray is not started; killed after the last result, it has left
-    # its temporary files.
-    session.mkdir()
-    (session / MARK).touch()
-    (tmp_path / "out" / SESSION).write_text(str(session))
-    assert main(words) == 0
+
+def test_a_study_that_has_ended_starts_no_ray(undisturbed_folder, tmp_path, monkeypatch, capsys):
+    """Killed after the last result, it has left its temporary files."""
+    monkeypatch.setattr(study_module, "_ray", None)
+    shutil.copytree(undisturbed_folder, tmp_path / "out")
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    (scratch / MARK).touch()
+    (tmp_path / "out" / SESSION).write_text(str(scratch))
+    assert main([*words_of(tmp_path), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert {(line["seed"], line["state"]) for line in said["trials"]} == {(0, "done"), (1, "done")}
+    assert not scratch.exists()
+    assert main(words_of(tmp_path)) == 0
     assert "2 of 2 agents" in capsys.readouterr().out
-    assert not session.exists()
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_ctrl_c_keeps_everything_and_says_how_to_go_on(tmp_path, number):
+@pytest.mark.parametrize(
+    ("number", "whole_group"),
+    [
+        (signal.SIGINT, False),
+        pytest.param(signal.SIGTERM, False, marks=pytest.mark.rare),
+        # As of `timeout`. Ray's processes have it, too, and Ray would wait for them without end.
+        pytest.param(signal.SIGTERM, True, marks=pytest.mark.rare),
+    ],
+)
+def test_a_signal_keeps_everything_and_the_study_says_how_to_go_on(
+    tmp_path, short_folder, number, whole_group
+):
     """Also while a trial still waits for its turn."""
-    words = ["study", str(study_file(tmp_path)), "--folder", str(tmp_path / "out"), "--jobs", "1"]
-    command = [sys.executable, "-m", "sb3_torcs.cli", *words]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    while not seeds_so_far(tmp_path / "out"):
-        assert process.poll() is None, "it ended before it could be interrupted"
-        time.sleep(0.05)
-    process.send_signal(number)
-    out, err = process.communicate(timeout=60)
-    assert process.returncode == 128 + number, err
-    assert "0 of 2 agents trained and measured" in out
-    assert f"go on with:\n  sb3-torcs {' '.join(words)}" in out
-    assert "Traceback" not in err
-    assert not (tmp_path / "out" / SESSION).exists()
-
-
-@pytest.mark.slow
-def test_a_signal_to_the_whole_group_ends_it_too(tmp_path, short_folder):
-    """As of `timeout`. Ray's processes have it, too, and Ray would wait for them without end."""
-    words = ["study", str(study_file(tmp_path)), "--folder", str(tmp_path / "out"), "--jobs", "1"]
-    command = [sys.executable, "-m", "sb3_torcs.cli", *words]
-    process = subprocess.Popen(
-        command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True,
-        start_new_session=True, env={**os.environ, "TMPDIR": short_folder},
-    )  # fmt: skip
-    while not seeds_so_far(tmp_path / "out"):
-        assert process.poll() is None, "it ended before it could be interrupted"
-        time.sleep(0.05)
-    os.killpg(process.pid, signal.SIGTERM)
-    _, err = process.communicate(timeout=90)
-    assert process.returncode == 143, err
+    words = words_of(tmp_path, "--jobs", "1")
+    variables = {**os.environ, "TMPDIR": short_folder}
+    with Program.of_ours(*words, env=variables, start_new_session=True) as program:
+        program.wait_for(lambda: seeds_so_far(tmp_path / "out"))
+        (os.killpg if whole_group else os.kill)(program.pid, number)
+        status = program.end()
+        out, err = program.printed()
+    assert status == 128 + number, err
+    if not whole_group:
+        assert "0 of 2 agents trained and measured" in out
+        assert f"go on with:\n  sb3-torcs {' '.join(words)}" in out
+        assert "Traceback" not in err
     assert not (tmp_path / "out" / SESSION).exists()
     assert list(Path(short_folder).glob("st-*")) == []
+
+
+@pytest.mark.rare
+def test_the_ray_of_another_study_is_not_joined(begun, cluster):
+    head, _ = cluster(resources={PRIVATE: 1})
+    with pytest.raises(RayUnavailable, match="belongs to another study, and ends with it"):
+        run_study(begun[0], begun[1].path, address=head.address)
+
+
+@pytest.mark.rare
+def test_where_a_damaged_folder_is_removed_the_same_command_goes_on(
+    undisturbed, begun, tmp_path, capsys
+):
+    assert main(words_of(tmp_path, "--jobs", "2")) == 1
+    out = capsys.readouterr().out
+    assert "small-nets-seed0 failed: its checkpoint cannot be read (" in out
+    shutil.rmtree(begun[1].of(begun[0].trials[0]))
+    assert main(words_of(tmp_path, "--jobs", "2")) == 0
+    assert results(tmp_path / "out") == undisturbed
+
+
+def test_ray_is_started_again_where_the_machine_was_too_busy():
+    attempts = []
+
+    def start():
+        attempts.append(len(attempts))
+        if len(attempts) < 3:
+            raise Exception("The current node timed out during startup.")
+        return "started"
+
+    assert with_patience(start) == "started"
+    assert attempts == [0, 1, 2]
+    with pytest.raises(ValueError, match="wrong"):
+        with_patience(lambda: int("wrong"))
+
+
+def words_of(folder, *words):
+    return ["study", str(study_file(folder)), "--folder", str(folder / "out"), *words]
 
 
 def seeds_so_far(folder):

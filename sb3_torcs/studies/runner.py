@@ -48,6 +48,7 @@ REPLACED = [
 ]
 """Signals whose handlers Ray replaces; Windows has no SIGUSR1."""
 GRACE = 20.0  # [s] that Ray has to end after SIGTERM
+STARTS = 10  # attempts: Ray gives its own processes 15 s, too little on a busy machine
 PRIVATE = "sb3_torcs_study"  # a resource that marks a Ray that was started by a study
 FAILED = "failed"  # the phase of a row with an error instead of a race
 
@@ -59,10 +60,12 @@ QUIET = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
     "RAY_CHDIR_TO_TRIAL_DIR": "0",
+    "RAY_worker_register_timeout_seconds": "600",
     "TUNE_DISABLE_AUTO_CALLBACK_LOGGERS": "1",
     "TUNE_WARN_THRESHOLD_S": "1000000",
 }
-"""Ray shall phone nobody, write no logs of its own, and leave the working folder alone."""
+"""Ray shall phone nobody, write no logs of its own, and leave the working folder alone.
+Its workers may take long to start."""
 
 
 IMPATIENT = {"RAY_NUM_REDIS_GET_RETRIES": "1"}
@@ -236,11 +239,14 @@ def _ray(
         try:
             (scratch / MARK).touch()
             session.write_text(str(scratch), encoding="utf-8")
-            ray.init(**options)
-        except (OSError, RuntimeError, ValueError) as error:
+            if address is None:
+                with_patience(lambda: ray.init(**options))
+            else:
+                ray.init(**options)
+        except Exception as error:  # what it waited for in vain is of no other class
             raise RayUnavailable(
-                f"Ray does not start in '{scratch}' ({error}); is there room, and the path short? "
-                "Otherwise choose another folder: TMPDIR=/tmp"
+                f"Ray does not start in '{scratch}' ({error}); is there room, is the path short, "
+                "and is the machine not too busy? Otherwise choose another folder: TMPDIR=/tmp"
                 if address is None
                 else f"no Ray cluster at '{address}' ({error}); start one with `ray start --head` "
                 "and give the address that it prints, or leave --address out"
@@ -258,6 +264,22 @@ def _ray(
         enough.cancel()
         _remove_folder(scratch)
         session.unlink(missing_ok=True)
+
+
+def with_patience(start: Callable[[], Any]) -> Any:
+    """
+    Start Ray, again if its own processes were not there in time.
+
+    :param start: starts it
+    :return: what that returns
+    """
+    for _ in range(STARTS - 1):
+        try:
+            return start()
+        except Exception as error:
+            if "timed out" not in str(error).lower():
+                raise
+    return start()
 
 
 def _end(enough: threading.Timer) -> None:

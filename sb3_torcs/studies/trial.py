@@ -71,6 +71,7 @@ class Training:
         try:
             self._load(checkpoint)
         except Exception as error:  # a broken file can raise anything
+            self.close()
             raise StudyError(
                 f"its checkpoint cannot be read ({type(error).__name__}: {error}); remove the "
                 f"folder {trial.name} of the study to begin that agent anew"
