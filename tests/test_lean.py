@@ -1,6 +1,7 @@
 """The core imports little, does without the extras, and runs where there is no POSIX."""
 
 import ast
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -145,7 +146,7 @@ def test_the_core_does_without_the_extras(tmp_path, game):
     assert (tmp_path / "line.png").is_file()
 
 
-@pytest.mark.parametrize(("words", "package"), [
+NEEDS = [
     (["train"], "rl_zoo3"),
     (["bench"], "rl_zoo3"),
     (["evaluate", "scripted", "--video", "a.mp4"], "imageio_ffmpeg"),
@@ -158,18 +159,50 @@ def test_the_core_does_without_the_extras(tmp_path, game):
     (["report", "."], "plotly"),
     (["study", "a.yml"], "ray"),
     (["-c", "import sb3_torcs; sb3_torcs.parallel_env"], "pettingzoo"),
-])  # fmt: skip
-def test_what_needs_an_extra_says_which_to_type(words, package, tmp_path):
+]
+EACH_IN_A_FORK = """
+import json, os, pathlib, stable_baselines3
+for number, words in enumerate(json.loads(sys.argv[1])):
+    folder = pathlib.Path(str(number))
+    folder.mkdir()
+    if os.fork() == 0:
+        for stream, name in ((1, "out"), (2, "err")):
+            os.dup2(os.open(f"{number}.{name}", os.O_CREAT | os.O_WRONLY), stream)
+        os.chdir(folder)
+        exec(words[1]) if words[0] == "-c" else sys.exit(main(words))
+        sys.exit(0)
+    print(os.waitstatus_to_exitcode(os.wait()[1]))
+"""
+"""Stable-Baselines3 takes seconds to load, so that it is loaded once."""
+
+
+@pytest.fixture(scope="module")
+def answers(tmp_path_factory):
+    """What each of ``NEEDS`` ends with: exit status, standard output and error, files."""
+    folder = tmp_path_factory.mktemp("needs")
+    said = json.dumps([words for words, _ in NEEDS])
+    _, out, err = python(WITHOUT_EXTRAS + EACH_IN_A_FORK, folder, said)
+    assert err == ""
+    texts = [[(folder / f"{n}.{name}").read_text() for name in ("out", "err")]
+             for n in range(len(NEEDS))]  # fmt: skip
+    return [
+        (int(status), *text, list((folder / str(n)).iterdir()))
+        for n, (status, text) in enumerate(zip(out.split(), texts, strict=True))
+    ]
+
+
+@pytest.mark.parametrize("number", range(len(NEEDS)))
+def test_what_needs_an_extra_says_which_to_type(answers, number):
     """In one line, before anything is driven."""
-    run = f"sys.exit(main({words}))" if words[0] != "-c" else words[1]
-    status, out, err = python(WITHOUT_EXTRAS + run, tmp_path)
+    words, package = NEEDS[number]
+    status, out, err, written = answers[number]
     last = err.splitlines()[-1]
     assert status != 0
     assert out == ""
     assert last.endswith(f'; type: pip install "sb3-torcs[{EXTRAS[package]}]"')
     assert package in last.lower() or package == "ray"
     assert len(err.splitlines()) == 1 or words[0] == "-c"
-    assert list(tmp_path.iterdir()) == []
+    assert written == []
 
 
 def test_a_missing_package_that_no_extra_brings_stays_an_error_of_python():
@@ -295,6 +328,7 @@ sys.exit(main({[*words, "--", "--hyperparams", "n_steps:32"]}))
     assert "learned from" in out
 
 
+@pytest.mark.rare
 def test_an_agent_competes_over_the_network_where_there_is_no_posix(tmp_path):
     """A server that is not there ends it with a line."""
     code = (
