@@ -53,7 +53,6 @@ __all__ = [
     "UnknownCar",
     "UnknownRewardTerm",
     "UnknownRobot",
-    "WorkerLost",
     "ZooConfigError",
     "check_extras",
     "ends_in_a_line",
@@ -212,10 +211,6 @@ class RayUnavailable(Sb3TorcsError, RuntimeError):
 
 class TrainingDiverged(Sb3TorcsError, ArithmeticError):
     """A model that learns computes no numbers any more."""
-
-
-class WorkerLost(Sb3TorcsError, RuntimeError):
-    """A process that drives cars of a training has ended."""
 
 
 class PackageMissing(Sb3TorcsError, ImportError):

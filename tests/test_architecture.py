@@ -23,7 +23,7 @@ from lint import assert_none, nodes, source, tree
 PACKAGE = Path(__file__).parent.parent / "sb3_torcs"
 FILES = sorted(PACKAGE.rglob("*.py"))
 
-OLDER_PLACES = {PACKAGE / name for name in ("agents/model_writing.py", "progress.py", "zoo.py")}
+OLDER_PLACES = {PACKAGE / name for name in ("agents/model_writing.py", "progress.py")}
 
 MAX_MODULES = 16  # at the top of the package
 MAX_FOLDERS = 17  # of Python there; beside them native/, the C++
@@ -46,7 +46,7 @@ FLOORS = (
     {"callbacks", "evaluation", "races"},
     {"training"},
     {"bench", "studies"},
-    {"cli", "progress", "rl_zoo", "zoo"},
+    {"cli", "progress", "rl_zoo"},
 )
 VOCABULARY = {"actions", "car", "rewards", "rivals", "sensors"}
 PURE_FILES = ("tracks/track.py", "tracks/generator.py", "scr/protocol.py")
@@ -274,7 +274,7 @@ def test_each_folder_of_python_is_installed():
     "sb3_torcs.policies.SplitHeadPolicy", "sb3_torcs.policies.export_actor",
     "sb3_torcs.agents.model_writing.RecordCallback", "sb3_torcs.callbacks.RecordCallback",
     "sb3_torcs.agents.model_writing.write_driver",
-    "sb3_torcs.progress.RacingProgressCallback", "sb3_torcs.zoo.UninterruptedWorker",
+    "sb3_torcs.progress.RacingProgressCallback",
     "sb3_torcs.tracks.load_track", "sb3_torcs.evaluation.evaluate",
 ])  # fmt: skip
 def test_what_files_and_people_name_stays_importable(path):
@@ -356,9 +356,8 @@ def test_one_file_knows_the_cluster():
     assert_none(forbidden(FILES, {"ray"}, lazy_too=False))
 
 
-def test_one_file_starts_the_zoo():
-    zoo = {"rl_zoo3.train", "rl_zoo3.exp_manager"}
-    assert_none(forbidden(all_but({"training/manager.py"}), zoo))
+def test_no_file_needs_the_zoo():
+    assert_none(forbidden(FILES, {"rl_zoo3"}))
 
 
 def test_worlds_know_nothing_of_agents():

@@ -27,7 +27,7 @@ from sb3_torcs import __version__
 from sb3_torcs.agents import ScriptedDriver, models
 from sb3_torcs.agents.saved import record as model_record
 from sb3_torcs.bench.stages import KEYS
-from sb3_torcs.cli import VERBS, common, doctor, evaluate, main, requirements, train
+from sb3_torcs.cli import VERBS, common, doctor, evaluate, main, requirements
 from sb3_torcs.errors import BackendUnavailable, InvalidOption, OutputNotWritable, ZooConfigError
 from sb3_torcs.evaluation import protocol as evaluation
 from sb3_torcs.evaluation import recording
@@ -67,6 +67,7 @@ def write_config(tmp_path, **changes):
 
 def options(tmp_path, **changes):
     conf_file = write_config(tmp_path, **changes.pop("entry_changes", {}))
+    changes = {"env": "TorcsLite-v0", **changes}
     return TrainOptions(conf_file=conf_file, folder=tmp_path / "logs", **changes)
 
 
@@ -227,7 +228,8 @@ def test_the_game_loads_a_track_whose_path_is_not_utf8(capfd, game, tmp_path):
 def test_a_training_in_a_folder_that_is_not_utf8(capfd, tmp_path):
     """TensorBoard takes none, and says so in a traceback."""
     folder = str(tmp_path / NOT_UTF8)
-    words = ["train", "--conf-file", write_config(tmp_path), "--folder", folder, "--no-progress"]
+    words = ["train", "--env", "TorcsLite-v0", "--conf-file", write_config(tmp_path)]
+    words += ["--folder", folder, "--no-progress"]
     status, _, err = run(capfd, *words)
     assert status == 2
     assert "whose name is not UTF-8; give another folder: --tensorboard DIR" in err
@@ -256,8 +258,7 @@ def test_a_name_that_is_too_long_is_told(capsys):
     assert err.endswith("; type a shorter name\n")
 
 
-def test_only_train_passes_words_on(capsys):
-    """For other verbs, what follows is no option, as in every command."""
+def test_what_follows_two_dashes_is_no_option(capsys):
     assert main(["tracks", "--", "-dash.xml"]) == 2
     assert "-dash.xml'" in capsys.readouterr().err
     assert main(["tracks", "--", "aalborg"]) == 0
@@ -791,14 +792,9 @@ def test_an_output_that_takes_no_more_is_told():
         ({"entry": "othr"}, "no entry 'othr'; did you mean 'other'?"),
         ({"resume": "none.zip"}, "there is no model 'none.zip'"),
         ({"algo": "dpg"}, "no algorithm 'dpg'; did you mean 'ddpg'?"),
-        ({"zoo_args": ("--log-folder", "x")}, "before -- there are --algo, --env, --timesteps"),
-        ({"zoo_args": ("-n20",)}, "'--n-timesteps' after -- is refused"),
-        ({"zoo_args": ("-conf", "b.yml")}, "'--conf-file' after -- is refused"),
-        ({"zoo_args": ("--save-freq", "5", "-uuid")}, "'--uuid' after -- is refused"),
-        ({"zoo_args": ("--hyperparams", "batchsize:8")}, "unknown key 'batchsize'"),
-        ({"zoo_args": ("--hyperparams", "callback:'x.Own'")}, "'callback' after -- is refused"),
-        ({"zoo_args": ("--hyperparams", "learning_rate:lin_1")}, "values are Python, e.g."),
-        ({"zoo_args": ("--env-kwargs", "trak:'oval'")}, "did you mean 'track'?"),
+        ({"hyperparams": {"batchsize": 8}}, "unknown key 'batchsize'"),
+        ({"hyperparams": {"learning_rate": "1e-3"}}, "expected a number"),
+        ({"env_kwargs": {"trak": "oval"}}, "did you mean 'track'?"),
     ],
 )
 def test_a_mistake_is_told_before_anything_starts(tmp_path, changes, message):
@@ -818,7 +814,7 @@ def test_an_algorithm_that_cannot_learn_here_is_told_and_leaves_no_run(tmp_path)
 def test_a_training_goes_on_in_the_environment_of_its_model(monkeypatch):
     """Where nothing else is said."""
     asked = []
-    monkeypatch.setattr(train, "train_run", lambda options: asked.append(options) or 1 / 0)
+    monkeypatch.setattr(training_run, "train_run", lambda options: asked.append(options) or 1 / 0)
     for words in (
         ["--resume", "ddpg-aalborg"],
         ["--resume", "ddpg-aalborg", "--env", "TorcsLite-v0", "--algo", "td3"],
@@ -827,7 +823,7 @@ def test_a_training_goes_on_in_the_environment_of_its_model(monkeypatch):
         with pytest.raises(ZeroDivisionError):
             main(["train", *words])
     assert [(options.env, options.algo) for options in asked] == [
-        ("Torcs-v0", "ddpg"), ("TorcsLite-v0", "td3"), ("TorcsLite-v0", "ddpg")
+        ("Torcs-v0", "ddpg"), ("TorcsLite-v0", "td3"), ("Torcs-v0", "ddpg")
     ]  # fmt: skip
 
 
@@ -846,43 +842,10 @@ def test_numbers_of_steps_have_to_be_positive(capsys):
     assert "expected a whole number >= 1" in capsys.readouterr().err
 
 
-def test_the_words_for_the_zoo_say_what_was_asked():
-    asked = TrainOptions(eval_episodes=2, seed=7)
-    training = {"track": "aalborg", "start": "random", "max_episode_steps": 200, "laps": 2}
-    words = training_run._zoo_words(asked, 100000, {"env_kwargs": training})
-    pairs = dict(itertools.pairwise(words))
-    assert (pairs["--seed"], pairs["--eval-freq"], pairs["--eval-episodes"]) == ("7", "2500", "2")
-    assert (pairs["--num-threads"], pairs["--device"]) == ("1", "cpu")
-    assert words[words.index("--eval-env-kwargs") + 1 :] == ["track:'aalborg'", "laps:2"]
-
-
 def test_an_evaluation_comes_no_sooner_than_an_update():
-    asked = TrainOptions(algo="ppo")
-    for entry, freq in (({"n_steps": 128, "n_envs": 64}, "8192"), ({}, "2048")):
-        words = training_run._zoo_words(asked, 1500, {**entry, "env_kwargs": {}})
-        assert words[words.index("--eval-freq") + 1] == freq
-
-
-def test_the_evaluation_is_on_the_track_that_the_zoo_s_own_words_name(monkeypatch, tmp_path):
-    asked = []
-    noted = lambda _, words, *rest: asked.extend(words) or 1 / 0  # noqa: E731
-    monkeypatch.setattr(training_run, "_run_zoo", noted)
-    with pytest.raises(ZeroDivisionError):
-        training_run.train(options(tmp_path, zoo_args=("--env-kwargs", "track:'corkscrew'")))
-    assert asked[asked.index("--eval-env-kwargs") + 1] == "track:'corkscrew'"
-
-
-def test_the_command_that_goes_on_means_the_same_options():
-    asked = TrainOptions(
-        entry="as the post", timesteps=5, seed=3, progress=False, zoo_args=("--save-freq", "2")
-    )
-    words = shlex.split(training_run._command(asked))
-    assert words[:2] == ["sb3-torcs", "train"]
-    assert words[-3:] == ["--", "--save-freq", "2"]
-    assert words[2:-3] == [
-        "--entry", "as the post", "--timesteps", "5", "--seed", "3", "--no-progress",
-    ]  # fmt: skip
-    assert training_run._command(TrainOptions(trust=True)) == "sb3-torcs train --seed 0 --trust"
+    for entry, steps in (({"n_steps": 128, "n_envs": 64}, 8192), ({}, 2048)):
+        assert training_run._rollout("ppo", entry) == steps
+    assert training_run._rollout("ddpg", {}) == 0
 
 
 @pytest.mark.parametrize(("name", "value", "least"), [
@@ -904,30 +867,22 @@ def test_pictures_that_cannot_be_written_leave_no_other_folder(tmp_path):
     assert not list(tmp_path.glob("logs*"))
 
 
-def test_the_pictures_come_after_the_entry_s_callbacks_and_the_bar_before(tmp_path):
-    pictures = tmp_path / "pictures"
-    asked = TrainOptions(pictures=pictures)
-    drawn = {"sb3_torcs.callbacks.LinePicturesCallback": {"folder": str(pictures)}}
-    assert training_run._with_display(asked, "own.Callback") == [
-        "sb3_torcs.callbacks.RacingProgressCallback", "own.Callback", drawn
-    ]  # fmt: skip
-    assert pictures.is_dir()
-    assert training_run._command(asked) == f"sb3-torcs train --seed 0 --pictures {pictures}"
-
-
 @pytest.mark.slow
 def test_a_training_leaves_models_and_logs(capsys, tmp_path):
     words = ["--conf-file", write_config(tmp_path), "--folder", str(tmp_path / "logs")]
-    words += ["--track", "alpine-1", "--seed", "1", "--", "--save-freq", "30"]
+    words += ["--track", "alpine-1", "--seed", "1", "--env", "TorcsLite-v0"]
     status, out, err = run(capsys, "train", *words)
     folder = tmp_path / "logs" / "ddpg" / "TorcsLite-v0_1"
     assert status == 0
     assert "100% 60/60 timesteps" in err
     assert f"best model by evaluation: {folder / 'best_model.zip'}" in out
     assert models.saved_timesteps(folder / "TorcsLite-v0.zip") == 60
-    assert (folder / "rl_model_30_steps.zip").is_file()
+    assert {path.name for path in folder.iterdir()} == {
+        "0.monitor.csv", "TorcsLite-v0", "TorcsLite-v0.zip", "best_model.zip", "evaluations.npz",
+        "replay_buffer.pkl",
+    }  # fmt: skip
     assert list((tmp_path / "logs" / "tensorboard").rglob("events.*")) != []
-    for name in ("best_model.zip", "TorcsLite-v0.zip", "rl_model_30_steps.zip"):
+    for name in ("best_model.zip", "TorcsLite-v0.zip"):
         elsewhere = (folder / name).rename(tmp_path / name)  # a file tells by itself
         record = models.training_record(elsewhere)
         elsewhere.rename(folder / name)
@@ -955,13 +910,12 @@ def test_an_interrupted_training_keeps_what_it_learned_and_says_how_to_go_on(cap
     callback = {f"{__name__}.InterruptingCallback": {"at": 40}}
     conf_file = write_config(tmp_path, callback=[callback])
     words = ["--conf-file", conf_file, "--folder", str(tmp_path / "logs"), "--no-progress"]
-    status, out, err = run(capsys, "train", *words)
+    status, out, err = run(capsys, "train", "--env", "TorcsLite-v0", *words)
     last_model = tmp_path / "logs" / "ddpg" / "TorcsLite-v0_1" / "TorcsLite-v0.zip"
     assert status == 130
     assert "saving what was learned" in err
     assert models.saved_timesteps(last_model) == 40
     (command,) = [line for line in out.splitlines() if "--resume" in line]
-    assert "--timesteps 20" in command
     status, out, _ = run(capsys, *shlex.split(command)[1:])
     folder = last_model.parent.with_name("TorcsLite-v0_2")
     assert (status, "learned from 20 of 20" in out) == (0, True)
@@ -974,34 +928,47 @@ def test_an_interrupted_training_keeps_what_it_learned_and_says_how_to_go_on(cap
 @pytest.mark.parametrize(
     "by", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.rare)]
 )
-def test_a_training_in_processes_that_is_ended_from_outside_keeps_what_it_learned(tmp_path, by):
-    """The terminal interrupts all its processes; who reads what it says may be gone before."""
-    conf_file = write_config(tmp_path, n_envs=2, n_timesteps=10**6)
+def test_a_training_that_is_ended_from_outside_keeps_what_it_learned(tmp_path, by):
+    """The reader of what it prints may have ended before."""
+    conf_file = write_config(tmp_path, n_timesteps=10**6)
     words = ["--conf-file", conf_file, "--folder", str(tmp_path / "logs"), "--eval-freq", "200"]
-    words += ["--", "--vec-env", "subproc"]
     folder = tmp_path / "logs" / "ddpg" / "TorcsLite-v0_1"
     reader, writer = os.pipe()
-    with Program.of_ours("train", *words, stdout=writer, start_new_session=True) as program:
+    with Program.of_ours("train", "--env", "TorcsLite-v0", *words, stdout=writer) as program:
         os.close(writer)
         program.wait_for((folder / "best_model.zip").is_file)
         os.close(reader)
-        (os.killpg if by == signal.SIGINT else os.kill)(program.pid, by)
-        program.end()
+        program.end(by)
     assert models.saved_timesteps(folder / "TorcsLite-v0.zip") >= 200
     assert models.find_model(folder, prefer_last=True).name == "TorcsLite-v0.zip"
+
+
+@pytest.mark.slow
+def test_a_training_that_is_killed_leaves_no_temporary_file(tmp_path):
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    conf_file = write_config(tmp_path, n_timesteps=10**6)
+    words = ["--conf-file", conf_file, "--folder", str(tmp_path / "logs"), "--eval-freq", "200"]
+    variables = {**os.environ, "TMPDIR": str(scratch)}
+    with Program.of_ours("train", "--env", "TorcsLite-v0", *words, env=variables) as program:
+        program.wait_for(lambda: list((tmp_path / "logs").glob("ddpg/*/best_model.zip")))
+        program.end(signal.SIGKILL)
+    assert list(scratch.iterdir()) == []
 
 
 def test_a_training_that_a_signal_has_ended_says_which(monkeypatch, capsys, tmp_path):
     by = signal.SIGTERM
     run = training_run.Run(tmp_path, 80, 100, by, tmp_path / "TorcsLite-v0.zip", {})
-    monkeypatch.setattr("sb3_torcs.cli.train.train_run", lambda _: run)
+    monkeypatch.setattr(training_run, "train_run", lambda _: run)
     status = main(["train", "--algo", "ddpg"])
     assert (status, "go on with:" in capsys.readouterr().out) == (128 + by, True)
 
 
 @pytest.mark.slow
 def test_the_shipped_hyperparameters_train(tmp_path):
-    run_folder = training_run.train(TrainOptions(timesteps=150, folder=tmp_path, progress=False))
+    run_folder = training_run.train(
+        TrainOptions(env="TorcsLite-v0", timesteps=150, folder=tmp_path, progress=False)
+    )
     assert (run_folder / "best_model.zip").is_file()
 
 
@@ -1209,11 +1176,6 @@ def test_a_seed_that_numpy_does_not_take_is_refused(capsys, verb, seed, message)
     assert f"'{seed}': expected a whole number {message}" in capsys.readouterr().err
 
 
-def test_a_training_without_environments_for_evaluations_is_refused(capsys, tmp_path):
-    words = ["train", "--timesteps", "100", "--folder", str(tmp_path), "--", "--n-eval-envs", "0"]
-    assert run(capsys, *words) == (2, "", "sb3-torcs: --n-eval-envs is 0; expected at least 1\n")
-
-
 @pytest.mark.parametrize(("wrapper", "says"), [
     ("TransformReward", "an env_wrapper does not go around the car (TransformReward.__init__() "),
     ("TransformReward", "; give its arguments below its dotted path"),
@@ -1223,7 +1185,8 @@ def test_a_wrapper_that_cannot_be_used_is_told_with_its_entry(capsys, tmp_path, 
     file = tmp_path / "own.yml"
     path = f"gymnasium.wrappers.{wrapper}"
     file.write_text(f"TorcsLite-v0: {{n_timesteps: 60, policy: MlpPolicy, env_wrapper: {path}}}\n")
-    words = ["train", "--algo", "sac", "--conf-file", str(file), "--folder", str(tmp_path / "logs")]
+    words = ["train", "--algo", "sac", "--env", "TorcsLite-v0", "--conf-file", str(file)]
+    words += ["--folder", str(tmp_path / "logs")]
     status, _, err = run(capsys, *words)
     assert (status, err.count("\n")) == (2, 1)
     assert f"{file}, entry 'TorcsLite-v0': " in err

@@ -1,6 +1,5 @@
 """What a training keeps, whatever ends it."""
 
-import argparse
 import concurrent.futures
 import errno
 import os
@@ -12,30 +11,24 @@ import signal
 import sys
 import time
 from contextlib import nullcontext
-from types import SimpleNamespace
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import yaml
 from processes import Program, raise_in_c
-from rl_zoo3.exp_manager import ExperimentManager
-from stable_baselines3 import DDPG, PPO
-from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
+from stable_baselines3 import DDPG
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.save_util import load_from_pkl
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
-from toy import ToyRace
 
 from sb3_torcs.agents import models
 from sb3_torcs.agents.saved.record import STATISTICS
+from sb3_torcs.callbacks.driven_line import LineRecorder
 from sb3_torcs.cli import main
-from sb3_torcs.errors import InvalidOption, TrainingDiverged
-from sb3_torcs.training import manager as zoo_training
-from sb3_torcs.training.keeping import (
-    REPLAY_BUFFER,
-    UNFINISHED,
-    KeepCallback,
-    WholeFiles,
-)
+from sb3_torcs.errors import TrainingDiverged
+from sb3_torcs.training.keeping import REPLAY_BUFFER, UNFINISHED, Keeper, WholeFiles
+from sb3_torcs.training.run import Run, TrainOptions, _explained, _new_run
+from sb3_torcs.training.trial import Recipe, Training
 
 ENTRY = {
     "n_timesteps": 60, "policy": "MlpPolicy", "learning_starts": 20, "buffer_size": 1000,
@@ -48,8 +41,8 @@ def words_of(tmp_path, **changes):
     """Words of a training with a tiny network."""
     conf_file = tmp_path / "own.yml"
     conf_file.write_text(yaml.safe_dump({"TorcsLite-v0": {**ENTRY, **changes}}))
-    folder = str(tmp_path / "logs")
-    return ["train", "--conf-file", str(conf_file), "--folder", folder, "--no-progress"]
+    words = ["--conf-file", str(conf_file), "--folder", str(tmp_path / "logs"), "--no-progress"]
+    return ["train", "--env", "TorcsLite-v0", *words]
 
 
 def run_folder(tmp_path, number=1):
@@ -105,121 +98,151 @@ def test_what_is_not_whole_never_comes_to_its_place(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-# The callback
+# What a run saves
 
 
-def keeper(folder, every=5):
-    return KeepCallback(WholeFiles(folder), "last", every)
+def training_of(tmp_path, algo="ddpg", **changes):
+    """A training that has not begun, and what saves it."""
+    entry = {**ENTRY, "n_timesteps": 12, **changes}
+    recipe = Recipe(algo, "TorcsLite-v0", entry, 0, 5, ())
+    folder = tmp_path / "TorcsLite-v0_1"
+    folder.mkdir()
+    training = Training(recipe, exact=False)
+    return training, Keeper(training, folder)
 
 
-def tiny(env=None, algorithm=DDPG, **kwargs):
-    env = env or ToyRace()
-    return algorithm("MlpPolicy", env, policy_kwargs={"net_arch": [4]}, device="cpu", **kwargs)
+def kept(keeper):
+    return models.saved_timesteps(keeper.files.folder / "TorcsLite-v0.zip")
+
+
+PPO = {
+    "n_timesteps": 8, "policy": "MlpPolicy", "n_steps": 4, "batch_size": 4,
+    "policy_kwargs": {"net_arch": [4]},
+}  # fmt: skip
+
+
+def ppo(tmp_path, **changes):
+    recipe = Recipe("ppo", "TorcsLite-v0", {**PPO, **changes}, 0, 4, ())
+    folder = tmp_path / "TorcsLite-v0_1"
+    folder.mkdir()
+    training = Training(recipe, exact=False)
+    return training, Keeper(training, folder)
+
+
+class EachStep(BaseCallback):
+    """Does something after each timestep."""
+
+    def __init__(self, do):
+        super().__init__()
+        self.do = do
+
+    def _on_step(self):
+        self.do()
+        return True
 
 
 def test_the_model_is_kept_with_its_replay_buffer(tmp_path):
-    model = tiny(buffer_size=50)
-    model.learn(12, callback=keeper(tmp_path))
-    assert models.saved_timesteps(tmp_path / "last.zip") == 10
-    kept = load_from_pkl(tmp_path / REPLAY_BUFFER)
-    assert kept.size() == 9  # SB3 stores a timestep after the callbacks
-    np.testing.assert_array_equal(kept.actions[:9], model.replay_buffer.actions[:9])
-
-
-def test_files_of_others_are_at_their_place_after_the_call_that_wrote_them(tmp_path):
-    callback = KeepCallback(WholeFiles(tmp_path), "last", 50, others=[3])
-    checkpoints = CheckpointCallback(3, str(callback.files.aside))
-    tiny(buffer_size=50).learn(7, callback=[checkpoints, callback])
-    assert {file.name for file in tmp_path.glob("*.zip")} == {
-        "rl_model_3_steps.zip",
-        "rl_model_6_steps.zip",
-    }
+    training, keeper = training_of(tmp_path, n_timesteps=10)
+    keeper.learn([])
+    assert kept(keeper) == 10
+    buffer = load_from_pkl(keeper.files.folder / REPLAY_BUFFER)
+    assert buffer.size() == 10
+    np.testing.assert_array_equal(buffer.actions, training.model.replay_buffer.actions)
 
 
 def test_a_signal_whose_exception_was_lost_ends_the_training_with_the_next_timestep(tmp_path):
+    training, keeper = training_of(tmp_path)
     signals = []
-    callback = KeepCallback(WholeFiles(tmp_path), "last", 50, interrupts=signals)
-    model = tiny(buffer_size=50).learn(3, callback=callback)
-    signals.append(signal.SIGTERM)
-    with pytest.raises(KeyboardInterrupt):
-        model.learn(3, callback=callback, reset_num_timesteps=False)
-    assert model.num_timesteps == 4
+
+    def interrupt():
+        if training.model.num_timesteps == 3:
+            signals.append(signal.SIGTERM)
+
+    training.callbacks.append(EachStep(interrupt))
+    keeper.learn(signals)
+    assert kept(keeper) == training.model.num_timesteps == 3
 
 
 def test_a_rollout_that_was_not_learned_from_does_not_count(tmp_path):
-    callback, counted = keeper(tmp_path), []
-    callback._on_step = lambda: counted.append(callback.keep() or kept(tmp_path)) or True
-    model = tiny(algorithm=PPO, n_steps=4, batch_size=4).learn(10, callback=callback)
-    assert counted == [0, 0, 0, 0, 4, 4, 4, 4, 8, 8, 8, 8]
-    callback.keep()
-    assert kept(tmp_path) == model.num_timesteps == 12
-
-
-def kept(folder):
-    return models.saved_timesteps(folder / "last.zip")
+    training, keeper = ppo(tmp_path)
+    counted = []
+    training.callbacks.append(EachStep(lambda: counted.append(keeper.keep() or kept(keeper))))
+    keeper.learn([])
+    assert counted == [0, 0, 0, 0, 4, 4, 4, 4]
+    assert kept(keeper) == training.model.num_timesteps == 8
 
 
 def test_statistics_are_kept_where_the_zoo_looks_for_them(tmp_path):
-    env = VecNormalize(DummyVecEnv([ToyRace]))
-    tiny(env, PPO, n_steps=8, batch_size=8).learn(8, callback=keeper(tmp_path))
-    statistics = pickle.loads((tmp_path / "last" / STATISTICS).read_bytes())
-    assert statistics.obs_rms.count == pytest.approx(6.0001)  # the first reset and five timesteps
-    assert not (tmp_path / REPLAY_BUFFER).exists()
-
-
-def test_keeping_changes_nothing_of_what_is_learned(tmp_path):
-    learned = [
-        tiny(buffer_size=50, seed=1, learning_starts=4).learn(20, callback=callback)
-        for callback in (None, keeper(tmp_path))
-    ]
-    one, other = (model.policy.parameters() for model in learned)
-    assert all(mine.equal(theirs) for mine, theirs in zip(one, other, strict=True))
+    _, keeper = ppo(tmp_path, normalize=True)
+    keeper.learn([])
+    file = keeper.files.folder / "TorcsLite-v0" / STATISTICS
+    assert pickle.loads(file.read_bytes()).obs_rms.count == pytest.approx(9.0001)
+    assert not (keeper.files.folder / REPLAY_BUFFER).exists()
 
 
 def test_a_full_disk_leaves_the_files_of_before(tmp_path, monkeypatch):
-    model, callback = tiny(buffer_size=50), keeper(tmp_path)
-    model.learn(5, callback=callback)
-    before = (tmp_path / REPLAY_BUFFER).read_bytes()
+    training, keeper = training_of(tmp_path)
+    keeper.learn([])
+    file = keeper.files.folder / REPLAY_BUFFER
+    before = file.read_bytes()
 
     def half(file):
         file.write(before[:100])
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(model, "save_replay_buffer", half)
+    monkeypatch.setattr(training.model, "save_replay_buffer", half)
     with pytest.raises(OSError, match="No space left"):
-        callback.keep()
-    assert (tmp_path / REPLAY_BUFFER).read_bytes() == before
-    assert [file.name for file in callback.files.unfinished()] == [REPLAY_BUFFER]
+        keeper.keep()
+    assert file.read_bytes() == before
+    assert [begun.name for begun in keeper.files.unfinished()] == [REPLAY_BUFFER]
     monkeypatch.undo()
-    callback.keep()
-    assert callback.files.unfinished() == []
+    keeper.keep()
+    assert keeper.files.unfinished() == []
 
 
 def test_a_model_that_has_diverged_does_not_replace_a_good_one(tmp_path):
-    callback = keeper(tmp_path)
-    callback.init_callback(tiny(buffer_size=50))
-    callback.keep()
-    (model,) = tmp_path.glob("*.zip")
+    training, keeper = training_of(tmp_path)
+    keeper.learn([])
+    (model,) = keeper.files.folder.glob("*.zip")
     before = model.read_bytes()
-    next(callback.model.policy.parameters()).data[0, 0] = np.nan
-    with pytest.raises(TrainingDiverged, match="after 0 timesteps its model computes no numbers"):
-        callback.keep()
+    next(training.model.policy.parameters()).data[0, 0] = np.nan
+    with pytest.raises(TrainingDiverged, match="after 12 timesteps its model computes no numbers"):
+        keeper.keep()
     assert model.read_bytes() == before
 
 
-@pytest.mark.slow
-def test_the_best_model_counts_as_kept_where_the_last_one_had_no_room(
-    capsys, tmp_path, monkeypatch
+@pytest.mark.parametrize(("times", "saved"), [(1, True), (2, False)])
+def test_only_a_second_interrupt_ends_the_saving_of_what_was_learned(
+    tmp_path, capsys, monkeypatch, times, saved
 ):
-    def full(self):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    training, keeper = training_of(tmp_path)
+    keep = keeper.keep
 
-    monkeypatch.setattr(KeepCallback, "keep", full)
-    assert main([*words_of(tmp_path), "--eval-freq", "30"]) == 2
-    said = capsys.readouterr().err
-    best = run_folder(tmp_path) / "best_model.zip"
-    assert f"kept: '{best}', 30 of 60 timesteps; make room" in said
-    assert "--timesteps 30 " in said
+    def interrupt():
+        if training.model.num_timesteps == 3:
+            raise KeyboardInterrupt
+
+    def interrupted():
+        for _ in range(times):
+            signal.raise_signal(signal.SIGINT)
+        keep()
+
+    training.callbacks.append(EachStep(interrupt))
+    monkeypatch.setattr(keeper, "keep", interrupted)
+    with nullcontext() if saved else pytest.raises(KeyboardInterrupt):
+        keeper.learn([])
+    assert list(keeper.files.folder.glob("*.zip")) != [] if saved else True
+    assert "Ctrl-C once more drops it" in capsys.readouterr().err
+    assert not keeper.files.aside.exists()
+
+
+def test_the_best_model_counts_as_kept_where_the_last_one_had_no_room(tmp_path):
+    Keeper(training_of(tmp_path)[0], tmp_path / "TorcsLite-v0_1").learn([])
+    best = (tmp_path / "TorcsLite-v0_1" / "TorcsLite-v0.zip").rename(tmp_path / "best_model.zip")
+    run = Run(tmp_path, 0, 60, None, tmp_path / "TorcsLite-v0.zip", {})
+    error = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    said = str(_explained(error, run, TrainOptions()))
+    assert f"kept: '{best}', 12 of 60 timesteps; make room" in said
     assert f"--resume {best}" in said
 
 
@@ -231,16 +254,10 @@ def test_a_training_that_diverges_is_told(tmp_path, capfd):
         "TorcsLite-v0: {n_timesteps: 4000, n_steps: 64, policy: MlpPolicy, learning_rate: 1.0e+9}"
     )
     words = ["--algo", "ppo", "--conf-file", str(file), "--folder", str(tmp_path / "logs")]
-    assert main(["train", "--no-progress", *words]) == 2
+    assert main(["train", "--env", "TorcsLite-v0", "--no-progress", *words]) == 2
     last = capfd.readouterr().err.strip().splitlines()[-1]
     assert last.startswith("sb3-torcs: the training has diverged: after ")
     assert last.endswith("nothing was kept yet; lower the learning_rate, and start again")
-
-
-@pytest.mark.parametrize("every", [0, -1, 1.5, True])
-def test_the_interval_is_a_number_of_calls(tmp_path, every):
-    with pytest.raises(InvalidOption, match=r"every is .*; expected a whole number >= 1"):
-        keeper(tmp_path, every)
 
 
 # The training
@@ -248,9 +265,8 @@ def test_the_interval_is_a_number_of_calls(tmp_path, every):
 
 def test_trainings_that_begin_at_once_get_folders_of_their_own(tmp_path):
     def begin(_):
-        words = argparse.Namespace()
-        manager = zoo_training.Manager(words, "ddpg", "TorcsLite-v0", str(tmp_path), entry={})
-        return manager.save_path
+        with _new_run(tmp_path / "ddpg", "TorcsLite-v0") as folder:
+            return folder
 
     with concurrent.futures.ThreadPoolExecutor(4) as pool:
         assert len(set(pool.map(begin, range(4)))) == 4
@@ -286,10 +302,8 @@ def test_a_file_that_cannot_be_written_is_named_and_the_training_goes_on_from_wh
         ("OSError(28, 'No space left on device')", "cannot write '{folder}': No space left"),
         (
             "TrainingDiverged('no numbers')",
-            "(add: -- --hyperparams learning_rate:NUMBER), and go on",
+            "(add: --hyperparams learning_rate=NUMBER), and go on",
         ),
-        ("EOFError()", "a process with a car of the training has ended; kept: "),
-        ("ConnectionResetError(104, 'reset')", "a process with a car of the training has ended"),
     ],
 )
 def test_what_was_learned_until_an_error_is_kept(capsys, tmp_path, error, said):
@@ -316,71 +330,25 @@ def test_a_training_without_evaluations_is_kept_too(tmp_path):
         tmp_path, callback=[{f"{__name__}.RaisingCallback": {"at": 9, "error": "1/0"}}]
     )
     with pytest.raises(ZeroDivisionError):
-        main([*words, "--eval-freq", "-1"])
+        main([*words, "--eval-freq", "0"])
     assert models.saved_timesteps(run_folder(tmp_path) / "TorcsLite-v0.zip") == 9
     assert not (run_folder(tmp_path) / "best_model.zip").exists()
 
 
 def test_ctrl_c_before_the_first_timestep_leaves_no_folder(tmp_path, monkeypatch):
-    def interrupted(*_):
+    def interrupted(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(ExperimentManager, "create_callbacks", interrupted)
+    monkeypatch.setattr("sb3_torcs.training.run.Training", interrupted)
     assert main(words_of(tmp_path)) == 130
     assert list((tmp_path / "logs" / "ddpg").iterdir()) == []
 
 
 def test_the_environments_of_evaluations_are_closed(tmp_path, monkeypatch):
-    made, close = [], DummyVecEnv.close
-    closed = []
-    monkeypatch.setattr(DummyVecEnv, "__init__", noting(made, DummyVecEnv.__init__))
-    monkeypatch.setattr(DummyVecEnv, "close", noting(closed, close))
+    closed, close = [], gym.Wrapper.close
+    monkeypatch.setattr(LineRecorder, "close", lambda self: closed.append(self) or close(self))
     assert main([*words_of(tmp_path), "--eval-freq", "30"]) == 0
-    assert len(made) >= 2
-    assert {id(each) for each in made} == {id(each) for each in closed}
-
-
-def noting(calls, method):
-    def noted(self, *arguments):
-        calls.append(self)
-        return method(self, *arguments)
-
-    return noted
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:Argument ``multivariate``")  # of the zoo's sampler
-def test_the_zoo_may_search_hyperparameters(capsys, tmp_path):
-    """That leaves reports and no model."""
-    search = ["-optimize", "--n-trials", "1", "--n-evaluations", "1", "--no-optim-plots"]
-    assert main([*words_of(tmp_path, n_timesteps=30), "--", *search]) == 0
-    (report,) = (tmp_path / "logs" / "ddpg").glob("report_*.csv")
-    assert f"its reports: {report.with_name('report_*.csv')}" in capsys.readouterr().out
-
-
-def test_a_search_that_the_zoo_cannot_make_is_told(capsys, tmp_path):
-    words = [*words_of(tmp_path, n_timesteps=30), "--algo", "crossq", "--", "-optimize"]
-    assert main(words) == 2
-    assert "cannot search hyperparameters of crossq; it can of: a2c" in capsys.readouterr().err
-    assert list((tmp_path / "logs" / "crossq").iterdir()) == []
-
-
-def test_a_search_that_was_ended_before_its_first_trial_is_told(monkeypatch, tmp_path):
-    def nothing(self):
-        raise ValueError("No trials are completed yet.")
-
-    monkeypatch.setattr(ExperimentManager, "hyperparameters_optimization", nothing)
-    words = argparse.Namespace()
-    manager = zoo_training.Manager(words, "ddpg", "TorcsLite-v0", str(tmp_path / "logs"), entry={})
-    with pytest.raises(InvalidOption, match="no trial of the search has ended"):
-        manager.hyperparameters_optimization()
-
-
-def test_the_zoo_reads_the_words_of_the_training_not_those_of_the_process(capsys, monkeypatch):
-    monkeypatch.setattr(sys, "argv", ["own.py", "--own"])
-    with pytest.raises(SystemExit):
-        zoo_training.train("ddpg", "TorcsLite-v0", {}, ["--n-timesteps", "many"], [])
-    assert "rl_zoo3.train: error: argument -n/--n-timesteps: invalid" in capsys.readouterr().err
+    assert len(closed) == 1
 
 
 def whole(folder):
@@ -418,29 +386,3 @@ def test_a_training_that_was_killed_goes_on(tmp_path, kills):
     words = words_of(tmp_path, buffer_size=200_000)
     assert main([*words, *resumed, "--timesteps", "30"]) == 0
     assert models.saved_timesteps(run_folder(tmp_path, kills + 1) / "TorcsLite-v0.zip") == 30
-
-
-class Interrupted:
-    """A keeper that is interrupted while it saves."""
-
-    def __init__(self, times):
-        self.times, self.done = times, False
-
-    def keep(self):
-        for _ in range(self.times):
-            signal.raise_signal(signal.SIGINT)
-        self.done = True
-
-
-@pytest.mark.parametrize(("times", "saved"), [(0, True), (1, True), (2, False)])
-def test_only_a_second_interrupt_ends_the_saving_of_what_was_learned(
-    tmp_path, capsys, times, saved
-):
-    manager = zoo_training.Manager.__new__(zoo_training.Manager)
-    manager.files, manager.keeper = WholeFiles(tmp_path), Interrupted(times)
-    manager.files.aside.mkdir()
-    with nullcontext() if saved else pytest.raises(KeyboardInterrupt):
-        manager.save_trained_model(SimpleNamespace())
-    assert manager.keeper.done is saved
-    assert ("Ctrl-C once more drops it" in capsys.readouterr().err) is (times > 0)
-    assert not manager.files.aside.exists()

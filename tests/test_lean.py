@@ -147,8 +147,6 @@ def test_the_core_does_without_the_extras(tmp_path, game):
 
 
 NEEDS = [
-    (["train"], "rl_zoo3"),
-    (["bench"], "rl_zoo3"),
     (["evaluate", "scripted", "--video", "a.mp4"], "imageio_ffmpeg"),
     (["evaluate", "scripted", "--telemetry", "a.parquet"], "pyarrow"),
     (["evaluate", "scripted", "--report", "a.html"], "plotly"),

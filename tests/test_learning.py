@@ -19,7 +19,9 @@ def test_the_shipped_ddpg_drives_further_after_a_seventh_of_its_training(tmp_pat
     otherwise and learns another way.
     """
     folder = train(
-        TrainOptions(timesteps=16_000, seed=0, folder=tmp_path, eval_freq=16_000, progress=False)
+        TrainOptions(
+            env="TorcsLite-v0", timesteps=16_000, folder=tmp_path, eval_freq=16_000, progress=False
+        )
     )
     distances = []
     for path in sorted(folder.glob("*.monitor.csv")):

@@ -4,7 +4,6 @@ import sys
 import types
 
 import pytest
-from rl_zoo3.utils import ALGOS
 from stable_baselines3 import SAC
 
 from sb3_torcs.agents import models
@@ -21,17 +20,14 @@ def sbx(monkeypatch):
     base = types.SimpleNamespace(BaseJaxPolicy=SAC.policy_aliases["MlpPolicy"])
     monkeypatch.setitem(sys.modules, "sbx", types.SimpleNamespace(SAC=SAC))
     monkeypatch.setitem(sys.modules, "sbx.common.policies", base)
-    yield
-    ALGOS.pop("sbx_sac", None)
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("sbx")
 def test_it_trains_by_the_shipped_entry(capsys, tmp_path):
-    words = ["train", "--algo", "sbx_sac", "--timesteps", "40", "--no-progress"]
-    assert (
-        main([*words, "--folder", str(tmp_path), "--", "--hyperparams", "learning_starts:20"]) == 0
-    )
+    words = ["train", "--algo", "sbx_sac", "--env", "TorcsLite-v0", "--timesteps", "40"]
+    words += ["--hyperparams", "learning_starts=20", "--no-progress", "--folder", str(tmp_path)]
+    assert main(words) == 0
     out = capsys.readouterr().out
     assert out.rstrip().endswith("--env TorcsLite-v0 --track aalborg --trust")
     record = models.training_record(tmp_path / "sbx_sac" / "TorcsLite-v0_1" / "TorcsLite-v0.zip")

@@ -11,7 +11,8 @@ from sb3_torcs.cli import main
 from sb3_torcs.errors import StudyError
 from sb3_torcs.evaluation.protocol import Episode
 from sb3_torcs.studies.config import read_study
-from sb3_torcs.studies.trial import Training, _row, final_row
+from sb3_torcs.studies.rows import final_row
+from sb3_torcs.training.trial import Training
 
 CLOCKS = ("wall_s", "cpu_s")
 TINY = {
@@ -182,7 +183,7 @@ def test_evaluations_drive_one_car_of_several(tmp_path, monkeypatch):
     cars = ["car1-trb1", "car2-trb1"]
     built = []
     monkeypatch.setattr(
-        "sb3_torcs.studies.trial.race_environment",
+        "sb3_torcs.training.trial.race_environment",
         lambda env_id, env_kwargs, track, **_: built.append(env_kwargs["car"]) or 1 / 0,
     )
     wanted = trial(tmp_path, {"env_kwargs": {"car": cars}}, env="Torcs-v0")
@@ -190,8 +191,7 @@ def test_evaluations_drive_one_car_of_several(tmp_path, monkeypatch):
         final_row(wanted, tmp_path / "best_model.zip", "aalborg", {"end": "laps"})
     race = Episode(1, [80.0], 2587.5, "laps", 0.0, 0.0)
     assert built == ["car1-trb1"]
-    times = dict.fromkeys(("decisions", "episodes", "wall_s", "cpu_s", "kept"))
-    assert _row(wanted, "final", "aalborg", race, times)["ladder"]
+    assert wanted.row("aalborg", race)["ladder"]
 
 
 def test_the_model_that_is_kept_is_the_best_by_the_protocol(tmp_path, monkeypatch):
@@ -202,7 +202,8 @@ def test_the_model_that_is_kept_is_the_best_by_the_protocol(tmp_path, monkeypatc
         return Episode(len(times), list(times), distance, end, 0.0, 0.0)
 
     drives = iter([race(50.0), race(40.0), race(60.0), race(9.0, [9, 8, 8]), race(9.0, [9, 9, 9])])
-    monkeypatch.setattr(Training, "_race", lambda self, track: next(drives))
+    monkeypatch.setattr(Training, "_drive", lambda self, track: [next(drives)])
+    monkeypatch.setattr(Training, "_show", lambda self, races: None)
     training = Training(trial(tmp_path, TINY, n_timesteps=400))
     training.run(lambda: None)
     training.close()

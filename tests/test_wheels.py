@@ -211,8 +211,6 @@ main()
 ONLY_OF_AN_EXTRA = [
     "sb3_torcs.envs.parallel_env",
     "sb3_torcs.rendering.encoder",
-    "sb3_torcs.studies.trial",
-    "sb3_torcs.training.manager",
 ]
 
 

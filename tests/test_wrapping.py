@@ -169,8 +169,7 @@ def test_what_cannot_be_put_around_is_told(path, error, says):
 
 
 def test_what_only_ends_or_writes_down_a_training_is_left_out():
-    names = ["gymnasium.wrappers.TimeLimit", "sb3_torcs.training.zoo.UninterruptedWorker"]
-    entry = {"env_wrapper": [{names[0]: {"max_episode_steps": 3}}, names[1]]}
+    entry = {"env_wrapper": [{"gymnasium.wrappers.TimeLimit": {"max_episode_steps": 3}}]}
     with lite(max_episode_steps=9) as env:
         (race,) = evaluate(wrapped(env, entry), ModelDriver(PPO("MlpPolicy", env, device="cpu")))
     assert race.end == "time_limit"

@@ -9,7 +9,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from sb3_torcs.errors import ends_in_a_line
 from sb3_torcs.evaluation.protocol import RACE_LAPS, evaluate, race_environment
 from sb3_torcs.training import zoo
-from sb3_torcs.training.manager import build
+from sb3_torcs.training.build import build
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--algo", default="ppo", help="default: ppo")
@@ -51,7 +51,7 @@ def main() -> None:
     th.set_num_threads(1)
     entry = zoo.read_entry(zoo.config_file(args.algo), args.env)
     for seed in range(args.seeds):
-        model, callbacks, _ = build(args.algo, args.env, entry, seed=seed)
+        model, callbacks = build(args.algo, args.env, entry, seed=seed)
         races = Races(race_environment(args.env, entry["env_kwargs"]), args.every, args.limit)
         model.learn(entry["n_timesteps"], callback=CallbackList([*callbacks, races]))
         print(f"seed {seed}: first lap {races.first}; {RACE_LAPS} laps {races.three}", flush=True)

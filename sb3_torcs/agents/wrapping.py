@@ -25,7 +25,7 @@ TRUSTED_PACKAGES = ("sb3_torcs", "gymnasium", "stable_baselines3", "sb3_contrib"
 
 LEFT_OUT = {
     "Monitor", "NormalizeReward", "OrderEnforcing", "PassiveEnvChecker", "RecordEpisodeStatistics",
-    "RecordVideo", "TimeLimit", "UninterruptedWorker",
+    "RecordVideo", "TimeLimit",
 }  # fmt: skip
 """Wrappers that end or write down a training, and change nothing that is seen or done."""
 

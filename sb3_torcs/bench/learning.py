@@ -93,7 +93,7 @@ def training_rate(steps: int) -> Figures:
 
 def _learn(env_id: str, steps: int) -> _TimedCallbacks:
     """Learn with a short warm-up and a small replay buffer, on one core."""
-    from sb3_torcs.training.manager import build
+    from sb3_torcs.training.build import build
     from sb3_torcs.training.zoo import config_file, read_entry
 
     entry = read_entry(config_file("ddpg"), env_id)
@@ -102,7 +102,7 @@ def _learn(env_id: str, steps: int) -> _TimedCallbacks:
     entry.update(n_timesteps=start + steps)
     entry["callback"] = [own for own in entry["callback"] if AT_THE_BEGINNING not in own]
     with cores.at_most(1), one_thread():
-        model, chosen, _ = build("ddpg", env_id, entry)
+        model, chosen = build("ddpg", env_id, entry)
         env = _TimedVecEnv(model.env)
         model.env = env
         callbacks = _TimedCallbacks(chosen, env, start)

@@ -49,9 +49,9 @@ class _Training:
     """
 
     def __init__(self, entry: dict[str, Any], plain: bool) -> None:
-        from sb3_torcs.training.manager import build
+        from sb3_torcs.training.build import build
 
-        self.model, self.callbacks, _ = build("ppo", ENTRY, entry)
+        self.model, self.callbacks = build("ppo", ENTRY, entry)
         self.model.set_logger(Logger(None, []))  # SB3's own leaves an empty folder behind
         self.made = self.model.get_env()
         if plain:

@@ -7,6 +7,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -16,7 +17,7 @@ from sb3_torcs.agents.rollout import drive
 from sb3_torcs.car import CarState
 from sb3_torcs.tracks.track import Track
 
-__all__ = ["DrivenLine", "drive_lap", "line_image"]
+__all__ = ["DrivenLine", "LineRecorder", "drive_lap", "line_image"]
 
 
 class DrivenLine(NamedTuple):
@@ -68,6 +69,37 @@ class _FirstOf:
         return self._model.predict(observation, state, self._begun, deterministic)
 
 
+class LineRecorder(gym.Wrapper[Any, Any, Any, Any]):
+    """
+    Records the line of the first lap of an episode.
+
+    :param env: a racing environment
+    """
+
+    def reset(self, **arguments: Any) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode and its line."""
+        self._cars: list[CarState] = []
+        self._lap_time: float | None = None
+        return self.env.reset(**arguments)
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Step, and record where the car is."""
+        result = self.env.step(action)
+        if self._lap_time is None:
+            self._cars.append(result[4]["car"])
+            self._lap_time = result[4]["lap_time"] or None
+        return result
+
+    def line(self) -> DrivenLine:
+        """Return the line of the present episode."""
+        return _line(self.get_wrapper_attr("track"), self._cars, self._lap_time)
+
+
+def _line(track: Track, cars: list[CarState], lap_time: float | None) -> DrivenLine:
+    x, y, speed = np.array([(car.x, car.y, car.speed_x) for car in cars]).T
+    return DrivenLine(track, x, y, speed, cars[-1].distance_raced, lap_time)
+
+
 def drive_lap(model: BaseAlgorithm, env: VecEnv, limit: int = 1500) -> DrivenLine:
     """
     Drive one lap, deterministically.
@@ -85,8 +117,7 @@ def drive_lap(model: BaseAlgorithm, env: VecEnv, limit: int = 1500) -> DrivenLin
         lap_time = step.info["lap_time"]
         if lap_time:
             break
-    x, y, speed = np.array([(car.x, car.y, car.speed_x) for car in cars]).T
-    return DrivenLine(first.track, x, y, speed, cars[-1].distance_raced, lap_time or None)
+    return _line(first.track, cars, lap_time or None)
 
 
 def line_image(line: DrivenLine) -> npt.NDArray[np.uint8]:

@@ -10,10 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_torcs.callbacks.driven_line import DrivenLine
-from sb3_torcs.callbacks.metrics import DrivingMetricsCallback
 from sb3_torcs.callbacks.progress import RacingProgressCallback, spoken_moment
 from sb3_torcs.callbacks.tree import callbacks_in
 from sb3_torcs.car import is_number
@@ -71,9 +70,8 @@ class LinePicturesCallback(BaseCallback):
     Draw lines that are driven after evaluations, and write a table of all evaluations.
 
     It writes ``001.png``, ``002.png``, ... and ``laps.csv`` into the folder; a resumed training
-    continues the series. The first evaluation and the first whole lap are always drawn. The lines
-    come from the :class:`~sb3_torcs.callbacks.DrivingMetricsCallback` of the same training. If a
-    file cannot be written later, the series ends with a warning, but the training continues.
+    continues the series. The first evaluation and the first whole lap are always drawn. If a file
+    cannot be written later, the series ends with a warning, but the training continues.
 
     :param folder: is made when the training begins, which is an ``OutputNotWritable`` if it cannot
         be written
@@ -91,12 +89,6 @@ class LinePicturesCallback(BaseCallback):
 
     def _on_training_start(self) -> None:
         callbacks = list(callbacks_in(self.locals.get("callback")))
-        needed = DrivingMetricsCallback, EvalCallback
-        if not all(any(isinstance(item, kind) for item in callbacks) for kind in needed):
-            raise InvalidOption(
-                f"{type(self).__name__} draws what DrivingMetricsCallback drives after "
-                "evaluations; add sb3_torcs.callbacks.DrivingMetricsCallback and an EvalCallback"
-            )
         self._progress = [item for item in callbacks if isinstance(item, RacingProgressCallback)]
         self._begun, self._first = time.monotonic(), self.model.num_timesteps
         self._due = -math.inf  # [s] since then

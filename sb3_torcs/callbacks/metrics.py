@@ -32,6 +32,7 @@ __all__ = [
     "ENDS",
     "MONITOR_KWARGS",
     "DrivingMetricsCallback",
+    "LineListener",
     "mean_q",
 ]
 
@@ -243,7 +244,10 @@ class DrivingMetricsCallback(BaseCallback):
         same = (callback for callback in others if isinstance(callback, DrivingMetricsCallback))
         first = next(same, self)
         listening: list[LineListener] = [
-            callback for callback in others if isinstance(callback, LineListener)
+            callback
+            for callback in others
+            if isinstance(callback, LineListener)
+            and not isinstance(callback, DrivingMetricsCallback)
         ]
         self.listeners = listening if first is self else []  # each line once
         self._evaluations = [
@@ -326,22 +330,31 @@ class DrivingMetricsCallback(BaseCallback):
                 self._record_line(evaluation.eval_env)
 
     def _record_line(self, env: VecEnv) -> None:
-        formats = self.logger.output_formats
-        shown = self.line and any(isinstance(f, TensorBoardOutputFormat) for f in formats)
-        if not (shown or self.listeners):
+        if not (self._shows_lines() or self.listeners):
             return
         chance = copy.deepcopy(env.get_attr("np_random"))
         line = drive_lap(self.model, env, self.line_timesteps)
         for index, generator in enumerate(chance):  # so that later evaluations are unchanged
             env.set_attr("np_random", generator, index)
+        for listener in (self, *self.listeners):
+            listener.take_line(line)
+        # Dump at once, as EvalCallback does: the next row may come much later.
+        self.logger.dump(self.num_timesteps)
+
+    def _shows_lines(self) -> bool:
+        formats = self.logger.output_formats
+        return self.line and any(isinstance(f, TensorBoardOutputFormat) for f in formats)
+
+    def take_line(self, line: DrivenLine) -> None:
+        """
+        Log the line of an evaluation.
+
+        :param line: that was driven
+        """
         if line.lap_time is not None:
             best = self.best_evaluation_lap_time or math.inf
             self.best_evaluation_lap_time = min(line.lap_time, best)
             self.logger.record("driving/evaluation_lap_time", line.lap_time)
-        for listener in self.listeners:
-            listener.take_line(line)
-        if shown:
-            picture = line_image(line)
-            self.logger.record("driving/line", Image(picture, "HWC"), exclude=TEXT_FORMATS)
-        # Dump at once, as EvalCallback does: the next row may come much later.
-        self.logger.dump(self.num_timesteps)
+        if self._shows_lines():
+            picture = Image(line_image(line), "HWC")
+            self.logger.record("driving/line", picture, exclude=TEXT_FORMATS)

@@ -70,14 +70,10 @@ def _name_process() -> None:
 
 def _parsed(words: list[str]) -> argparse.Namespace | None:
     """Read the command line. Without a verb, print the help and return ``None``."""
-    # Other verbs read what follows as argparse does: names that may begin with a dash.
-    passes_on = words[:1] == ["train"] and "--" in words
-    split = words.index("--") if passes_on else len(words)
     parser, verbs = _parser()
     if words:
         parser.check_verb(words[0], verbs)
-    args = parser.parse_args(words[:split])
-    args.zoo_args = words[split + 1 :]
+    args = parser.parse_args(words)
     if args.verb is None:
         parser.print_help()
         return None

@@ -77,11 +77,10 @@ def run(args: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from sb3_torcs.bench.stages import KEYS, stages
-    from sb3_torcs.errors import InvalidOption, check_extras
+    from sb3_torcs.errors import InvalidOption
 
     if not 0.0 < args.seconds < math.inf:
         raise InvalidOption(f"--seconds is {args.seconds:g}; expected more than 0, e.g. 30")
-    check_extras("to measure trainings", "rl_zoo3")
     figures: dict[str, float | None] = dict.fromkeys(KEYS)
     measurements = stages(args.seconds)
     with (

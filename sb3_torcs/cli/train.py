@@ -1,26 +1,28 @@
-"""``sb3-torcs train``: train with the RL Zoo and the shipped hyperparameters."""
+"""``sb3-torcs train``: train an agent by an entry of a hyperparameter file."""
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
 import shlex
-import sys
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from sb3_torcs.cli.common import positive, seed
+from sb3_torcs.cli.common import positive, seed, setting
 from sb3_torcs.signals import EXIT_STATUS
-from sb3_torcs.training.run import Run, TrainOptions, going_on, train_run
+
+if TYPE_CHECKING:
+    from sb3_torcs.training.run import Run, TrainOptions
 
 __all__ = ["add_parser", "run"]
 
-
 EPILOG = """\
-Arguments after -- go to the RL Zoo unchanged, and override ours:
-  sb3-torcs train --timesteps 20000 -- --save-freq 5000 --hyperparams batch_size:64
+Values are YAML:
+  sb3-torcs train --hyperparams batch_size=128 learning_rate=lin_0.001
+  sb3-torcs train --env-kwargs track=forza sensors=[base,line]
 
 Ctrl-C saves the model and prints the command that continues the training. A kill or a full disk
-loses at most what was learned since the last evaluation.
+loses at most what was learned since the last evaluation. TensorBoard shows the training while it
+runs: tensorboard --logdir logs/tensorboard
 """
 
 
@@ -30,9 +32,9 @@ def add_parser(subparsers: Any) -> None:
     """
     parser = subparsers.add_parser(
         "train",
-        help="train an agent with the RL Zoo and the shipped hyperparameters",
-        description="Train an agent with the RL Zoo and the shipped hyperparameters, which are "
-        "checked before anything starts.",
+        help="train an agent by the shipped hyperparameters or your own",
+        description="Train an agent by an entry of a hyperparameter file, which is checked before "
+        "anything starts.",
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -42,11 +44,27 @@ def add_parser(subparsers: Any) -> None:
         help="ddpg (default), td3, sac, a2c or ppo; with SBX also sbx_sac; others of the zoo with "
         "a --conf-file",
     )
-    add("--env", metavar="ID", help="Torcs-v0, or by default TorcsLite-v0")
+    add("--env", metavar="ID", help="Torcs-v0 (default), or TorcsLite-v0, which needs no game")
     add("--entry", metavar="NAME", help='block of the hyperparameter file, e.g. "as the post"; '
         "default: the one called as --env")  # fmt: skip
     add("--conf-file", metavar="FILE", help="hyperparameter file; default: the shipped one")
     add("--track", metavar="T", help="track; default: the entry's; `sb3-torcs tracks` lists them")
+    add(
+        "--hyperparams",
+        nargs="+",
+        type=setting,
+        default=(),
+        metavar="NAME=VALUE",
+        help="values that replace those of the entry",
+    )
+    add(
+        "--env-kwargs",
+        nargs="+",
+        type=setting,
+        default=(),
+        metavar="NAME=VALUE",
+        help="arguments of the environment that replace those of the entry",
+    )
     add(
         "--timesteps",
         type=positive,
@@ -68,7 +86,7 @@ def add_parser(subparsers: Any) -> None:
         type=positive,
         default=1,
         metavar="N",
-        help="episodes per evaluation; default: 1",
+        help="races per track and evaluation; default: 1",
     )
     add(
         "--resume",
@@ -80,8 +98,7 @@ def add_parser(subparsers: Any) -> None:
     add(
         "--trust",
         action="store_true",
-        help="accept a model without a record, and evaluate Python in the strings of the "
-        "hyperparameter file: only if you trust their author",
+        help="resume a model without a record: only if you trust its author",
     )
     add("--progress", action=argparse.BooleanOptionalAction, default=True, help="progress bar")
     add("--pictures", metavar="DIR", help="draw the line of an evaluation lap about once a minute")
@@ -93,15 +110,11 @@ def run(args: argparse.Namespace) -> int:
     :param args: from the command line
     :return: the exit status
     """
-    names = [field.name for field in dataclasses.fields(TrainOptions)]
-    values = {name: getattr(args, name) for name in names}
-    values.update(_trained_before(args), zoo_args=tuple(args.zoo_args))
-    options = TrainOptions(**values)
-    if args.entry is not None and args.env is None and args.resume is None:
-        print(
-            f"learning in {options.env}, which needs no game; --env Torcs-v0 is the game itself",
-            file=sys.stderr,
-        )
+    from sb3_torcs.training.run import TrainOptions, train_run
+
+    values = {field.name: getattr(args, field.name) for field in dataclasses.fields(TrainOptions)}
+    settings = {name: dict(values[name]) for name in ("hyperparams", "env_kwargs")}
+    options = TrainOptions(**{**values, **settings, **_trained_before(args)})
     result = train_run(options)
     print("\n".join(_closing_words(options, result)))
     return 0 if result.signal is None else EXIT_STATUS + result.signal
@@ -110,6 +123,7 @@ def run(args: argparse.Namespace) -> int:
 def _trained_before(args: argparse.Namespace) -> dict[str, str]:
     """Take algorithm and environment from the model to resume, unless they are given."""
     from sb3_torcs.agents.models import TrainingRecord, find_model, training_record
+    from sb3_torcs.training.run import TrainOptions
 
     record = TrainingRecord()
     if args.resume is not None:
@@ -123,9 +137,8 @@ def _trained_before(args: argparse.Namespace) -> dict[str, str]:
 def _closing_words(options: TrainOptions, result: Run) -> list[str]:
     """Name the files and the commands to type next."""
     from sb3_torcs.agents.saved.algorithm import SBX
+    from sb3_torcs.training.run import continuing_command
 
-    if result.last_model is None:
-        return [f"the RL Zoo has searched; its reports: {result.folder / 'report_*.csv'}"]
     learned = f"learned from {result.timesteps} of {result.wanted} timesteps"
     lines = [f"{learned}; folder: {result.folder}"]
     evaluated = result.best_model != result.last_model
@@ -134,7 +147,7 @@ def _closing_words(options: TrainOptions, result: Run) -> list[str]:
     if options.resume is not None:
         lines += [f"before that, which may be better still: {options.resume}"]
     if result.timesteps < result.wanted:
-        lines += ["go on with:", f"  {going_on(options, result)}"]
+        lines += ["go on with:", f"  {continuing_command(options, result)}"]
     words = ["sb3-torcs", "evaluate", str(result.best_model), "--env", options.env]
     track, car = (result.env_kwargs.get(name) for name in ("track", "car"))
     if track:

@@ -33,12 +33,13 @@ from sb3_torcs.errors import (
 from sb3_torcs.evaluation.protocol import GAME
 from sb3_torcs.files import listed, read_yaml
 from sb3_torcs.torcs.installation import find_game
-from sb3_torcs.torcs.track_names import RANDOM_TRACK, find_track
-from sb3_torcs.tracks.catalogue import CATEGORIES, load_track, tracks_of
+from sb3_torcs.torcs.track_names import find_track
+from sb3_torcs.tracks.catalogue import CATEGORIES, tracks_of
 from sb3_torcs.training import zoo
+from sb3_torcs.training.trial import Recipe, track_name
 from sb3_torcs.training.zoo_data import as_data
 
-__all__ = ["FIELDS", "Study", "Trial", "merged", "read_study", "slug", "track_name", "trial_name"]
+__all__ = ["FIELDS", "Study", "Trial", "merged", "read_study", "slug", "trial_name"]
 
 REQUIRED = ("name", "seeds", "eval_interval")
 SOURCE = (
@@ -60,33 +61,17 @@ FIELDS = (
 
 
 @dataclass(frozen=True)
-class Trial:
-    """One variant with one seed: everything that its training depends on."""
+class Trial(Recipe):
+    """One variant with one seed."""
 
     study: str
     variant: str
-    seed: int
-    algo: str  # as the zoo calls it
-    env_id: str
-    entry: dict[str, Any]  # of a hyperparameter file, changes applied
-    eval_interval: int  # timesteps
-    eval_tracks: tuple[str, ...]  # that choose the model
     final_tracks: tuple[str, ...]  # that the chosen model is measured on
 
     @property
     def name(self) -> str:
         """What its folder is called."""
         return trial_name(self.variant, self.seed)
-
-    @property
-    def budget(self) -> int:
-        """Timesteps to learn from."""
-        return int(self.entry["n_timesteps"])
-
-    @property
-    def env_kwargs(self) -> dict[str, Any]:
-        """Keyword arguments of the training's environment."""
-        return dict(self.entry.get("env_kwargs") or {})
 
     def recipe(self) -> dict[str, Any]:
         """Return everything that the training depends on."""
@@ -161,16 +146,6 @@ def merged(entry: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, An
         else:
             result[key] = copy.deepcopy(value)
     return result
-
-
-def track_name(track: str) -> str:
-    """
-    Return the name of a track in results.
-
-    :param track: name or path
-    :return: the name without category
-    """
-    return track if track == RANDOM_TRACK else load_track(track).name
 
 
 def trial_name(variant: str, seed: int) -> str:
@@ -286,8 +261,8 @@ def _trials(
         final_tracks = _united(eval_tracks, chosen)
     for seed in seeds:
         yield Trial(
-            slug(said["name"]), variant, seed, algo, env_id, copy.deepcopy(entry), interval,
-            eval_tracks, final_tracks,
+            algo, env_id, copy.deepcopy(entry), seed, interval, eval_tracks,
+            slug(said["name"]), variant, final_tracks,
         )  # fmt: skip
 
 

@@ -81,7 +81,8 @@ def run_trial(trial: Trial, store: Any, report: Callable[[dict[str, Any]], None]
         machine
     :param report: called with the newest row
     """
-    from sb3_torcs.studies.trial import Training, final_row
+    from sb3_torcs.studies.rows import final_row, rows_of_nothing, training_rows
+    from sb3_torcs.training.trial import Training
 
     files, over, missing = store.state(trial)
     if not over:
@@ -92,14 +93,15 @@ def run_trial(trial: Trial, store: Any, report: Callable[[dict[str, Any]], None]
             with tempfile.TemporaryDirectory() as scratch:
                 training.save(Path(scratch))
                 packed = {file.name: file.read_bytes() for file in Path(scratch).iterdir()}
-            store.put(trial, packed, training.rows)
-            report(training.rows[-1])
+            rows = training_rows(trial, training)
+            store.put(trial, packed, rows)
+            report(rows[-1])
 
         with contextlib.closing(training):
             try:
                 training.run(after_slice)
             except TrainingDiverged as error:
-                store.put_diverged(trial, str(error), training.rows_of_nothing())
+                store.put_diverged(trial, str(error), rows_of_nothing(trial, training))
                 report(store.rows(trial)[-1])
         files, _, missing = store.state(trial)
     chosen = [row for row in store.rows(trial) if row["phase"] == "train" and row["kept"]][-1]
@@ -173,7 +175,7 @@ def run_study(
 
 def _check_buildable(trial: Trial, file: Path) -> None:
     """Build the agent of a trial, so that wrong values are reported before any training."""
-    from sb3_torcs.studies.trial import Training
+    from sb3_torcs.training.trial import Training
 
     try:
         Training(trial).close()

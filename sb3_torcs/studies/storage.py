@@ -8,7 +8,7 @@
         recipe.yml                what the training depends on
         rows.json                 of the evaluations so far
         diverged.txt              why the training ended early, if it did
-        best_model.zip, …         what `sb3-torcs evaluate` reads
+        best_model.zip            what `sb3-torcs evaluate` reads
         checkpoint-000012/        to go on from; gone when the training is over
 """
 
@@ -25,10 +25,11 @@ from typing import Any
 
 import yaml
 
-from sb3_torcs.agents.saved.record import BEST_MODEL, STATISTICS
+from sb3_torcs.agents.saved.record import BEST_MODEL
 from sb3_torcs.errors import StudyError
 from sb3_torcs.files import lock, read_yaml, whole_file
-from sb3_torcs.studies.config import FIELDS, Study, Trial, track_name
+from sb3_torcs.studies.config import FIELDS, Study, Trial
+from sb3_torcs.training.trial import track_name
 
 __all__ = [
     "DIVERGED",
@@ -52,7 +53,6 @@ CHECKPOINT = "checkpoint-"
 GOING_ON = (
     "make room, or give another folder, and type the command again: what was written before is kept"
 )
-FOR_DRIVERS = (BEST_MODEL, STATISTICS, "config.yml", "args.yml")
 
 
 class StudyFolder:
@@ -234,9 +234,7 @@ class StudyFolder:
             except OSError:
                 shutil.rmtree(aside, ignore_errors=True)  # it may fill the disk
                 raise
-        for file in FOR_DRIVERS:
-            if file in files:
-                write_whole(folder / file, files[file])
+        write_whole(folder / BEST_MODEL, files[BEST_MODEL])
         write_whole(folder / ROWS, json.dumps(rows).encode())
         for old in before:
             shutil.rmtree(old, ignore_errors=True)

@@ -1,4 +1,4 @@
-"""Save a training while it learns, so that its files are complete however it ends.
+"""Files that are complete or not there, and models that are worth saving.
 
 Each file is written into a folder beside the others first, and moved when it is whole. So a kill, a
 power cut or a full disk leaves what was saved before.
@@ -9,24 +9,29 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-from sb3_torcs.agents.saved.record import STATISTICS
-from sb3_torcs.car import check_count
-from sb3_torcs.errors import OutputNotWritable, TrainingDiverged
+from sb3_torcs.agents.saved.record import BEST_MODEL, STATISTICS
+from sb3_torcs.callbacks.learning import end_changes
+from sb3_torcs.callbacks.progress import RacingProgressCallback
+from sb3_torcs.errors import InvalidOption, OutputNotWritable, TrainingDiverged
 from sb3_torcs.files import writable_folder
+from sb3_torcs.signals import counted_interrupts
+
+if TYPE_CHECKING:
+    from sb3_torcs.training.trial import Training
 
 __all__ = [
     "REPLAY_BUFFER",
     "SAVING",
-    "KeepCallback",
+    "Keeper",
     "WholeFiles",
     "check_healthy",
     "tensorboard_folder",
@@ -86,62 +91,56 @@ class WholeFiles:
         shutil.rmtree(self.aside, ignore_errors=True)
 
 
-class KeepCallback(BaseCallback):
+class Keeper:
     """
-    Save the last model while it learns, with everything that a training resumes from.
+    Saves a training into the folder of its run.
 
-    That is the replay buffer of an off-policy algorithm, and the statistics of ``VecNormalize``.
-    It also moves the files of the callbacks before it to their final paths.
-
-    :param files: folder of the run
-    :param name: of the model's file, without ``.zip``; and of the folder of the statistics
-    :param every: calls between two savings
-    :param others: calls between two files of each callback that writes aside, too
-    :param interrupts: signals so far: with one of them the training ends, also if Python has
-        ignored the ``KeyboardInterrupt`` that it raised, as it does in code that C calls
-    :param verbose: as in ``BaseCallback``
+    :param training: that learns
+    :param folder: of the run
     """
 
-    def __init__(
-        self,
-        files: WholeFiles,
-        name: str,
-        every: int,
-        others: Sequence[int] = (),
-        interrupts: Sequence[int] = (),
-        *,
-        verbose: int = 0,
-    ) -> None:
-        super().__init__(verbose)
-        check_count("every", every)
-        self.files = files
-        self.name = name
-        self.every = every
-        self._others = others
-        self._interrupts = interrupts
+    def __init__(self, training: Training, folder: Path) -> None:
 
-    def _init_callback(self) -> None:
-        (self.files.aside / self.name).mkdir(parents=True, exist_ok=True)
-        self._count()
+        self.training = training
+        self.name = folder.name.rpartition("_")[0]  # of the environment
+        self.files = WholeFiles(folder)
 
-    def _on_rollout_start(self) -> None:
-        self._count()
+    def learn(self, interrupts: list[int]) -> None:
+        """
+        Let the agent learn, and save it at the end.
 
-    def _on_training_end(self) -> None:
-        self._count()
+        A large replay buffer takes a minute: one Ctrl-C then ends nothing, but a second one does.
 
-    def _count(self) -> None:
-        """Note that the model has learned from all timesteps so far."""
-        self._learned_from = self.model.num_timesteps
-
-    def _on_step(self) -> bool:
-        if self._interrupts:
-            raise KeyboardInterrupt
-        if any(self.n_calls % other == 0 for other in self._others):
-            self.files.settle()
-        if self.n_calls % self.every == 0:
-            self.keep()
-        return True
+        :param interrupts: signals so far: with one of them the training ends
+        """
+        try:
+            with self._named_errors():
+                try:
+                    self.training.run(self.keep, interrupts)
+                    return
+                except KeyboardInterrupt:
+                    pass
+                except RuntimeError as error:
+                    # numba's, after a Ctrl-C that Python has ignored while it compiled
+                    if not interrupts or type(error) is not RuntimeError:
+                        raise
+                self._end_callbacks()
+                if self.training.model.num_timesteps:
+                    with counted_interrupts(1, SAVING):
+                        self.keep()
+        except Exception as error:
+            self._end_callbacks()
+            if self.training.model.num_timesteps == 0 and isinstance(error, InvalidOption):
+                shutil.rmtree(self.files.folder)  # a callback has refused to begin
+                raise
+            try:
+                with contextlib.suppress(OSError):
+                    self.keep()
+            except TrainingDiverged as diverged:
+                raise diverged from error
+            raise
+        finally:
+            self.files.close()
 
     def keep(self) -> None:
         """
@@ -152,30 +151,57 @@ class KeepCallback(BaseCallback):
         :raises TrainingDiverged: if the model computes no numbers any more, and would replace a
             good one
         """
-        check_healthy(self.model)
+        training, aside = self.training, self.files.aside
+        check_healthy(training.model)
         self.files.drop()
-        aside = self.files.aside
-        with (aside / f"{self.name}.zip").open("wb") as file, self._without_unfinished():
-            self.model.save(file)
-        statistics = self.model.get_vec_normalize_env()
-        if statistics is not None:
-            statistics.save(str(aside / self.name / STATISTICS))
+        (aside / self.name).mkdir(parents=True, exist_ok=True)
+        with self._without_unfinished():
+            (aside / f"{self.name}.zip").write_bytes(training.model_file())
+        if training.rows:
+            (aside / BEST_MODEL).write_bytes(training.best_model or b"")
+            self._write_evaluations(aside / "evaluations.npz")
+        if training.normalizer is not None:
+            training.normalizer.save(str(aside / self.name / STATISTICS))
         self.files.settle()
-        if getattr(self.model, "replay_buffer", None) is not None:
+        if getattr(training.model, "replay_buffer", None) is not None:
             with (aside / REPLAY_BUFFER).open("wb") as file:
-                self.model.save_replay_buffer(file)  # type: ignore[attr-defined]
+                training.model.save_replay_buffer(file)
             self.files.settle()
+
+    def _end_callbacks(self) -> None:
+        """Undo what callbacks changed for an update, and leave the terminal as it was."""
+        end_changes(self.training.model)
+        for callback in self.training.callbacks:
+            if isinstance(callback, RacingProgressCallback):
+                callback.on_training_end()
+
+    def _write_evaluations(self, file: Path) -> None:
+        """Write the table that SB3's ``EvalCallback`` writes."""
+        timesteps = np.unique([row["decisions"] for row in self.training.rows])
+        results = np.array([row["return"] for row in self.training.rows])
+        np.savez(file, timesteps=timesteps, results=results.reshape(len(timesteps), -1))
 
     @contextlib.contextmanager
     def _without_unfinished(self) -> Iterator[None]:
-        """Leave a rollout out of the model's count from which it has not learned yet."""
-        model, seen = self.model, self.model.num_timesteps
+        """Subtract a rollout from the model's count that it has not learned from yet."""
+        model, seen = self.training.model, self.training.model.num_timesteps
         if isinstance(model, OnPolicyAlgorithm):
-            model.num_timesteps = self._learned_from
+            model.num_timesteps = self.training.learned_from
         try:
             yield
         finally:
             model.num_timesteps = seen
+
+    @contextlib.contextmanager
+    def _named_errors(self) -> Iterator[None]:
+        """Add the file's name to the error of a file that cannot be written."""
+        try:
+            yield
+        except OSError as error:
+            if error.filename is None:
+                begun = [self.files.place(file) for file in self.files.unfinished()]
+                error.filename = str([*begun, self.files.folder][0])
+            raise
 
 
 def check_healthy(model: BaseAlgorithm) -> None:

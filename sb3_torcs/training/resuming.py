@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,16 +17,13 @@ from sb3_torcs.agents.saved.file import as_mismatch, saved_data
 from sb3_torcs.agents.wrapping import frames_of, normalizes
 from sb3_torcs.car import range_finder_angles
 from sb3_torcs.errors import ModelMismatch, ModelNotTrusted
-from sb3_torcs.files import listed, path_and_arguments
 from sb3_torcs.training.keeping import REPLAY_BUFFER
 from sb3_torcs.training.zoo_data import SCHEDULES, as_data, policy_arguments
 
 __all__ = ["check_resumable", "recorded_entry", "restore_statistics"]
 
 
-def recorded_entry(
-    model: Path, algo: str, env_id: str, without: Collection[str] = ()
-) -> dict[str, Any]:
+def recorded_entry(model: Path, algo: str, env_id: str) -> dict[str, Any]:
     """
     Take the entry that a model has learned by, for what is left of its training.
 
@@ -35,7 +32,6 @@ def recorded_entry(
     :param model: the file
     :param algo: that is to learn, as the zoo calls it
     :param env_id: of the environment in which it is to learn
-    :param without: dotted paths of callbacks and wrappers that are left out
     :return: the entry; of a script's model only ``env_kwargs``, and empty if nothing fits
     :raises ModelMismatch: if it cannot be read, or is of another algorithm
     """
@@ -45,10 +41,6 @@ def recorded_entry(
         return {}
     with as_mismatch(f"the hyperparameters in the record of '{model}' cannot be read", "give"):
         entry = as_data(record.hyperparameters)
-        for key in ("callback", "env_wrapper"):
-            if key in entry:
-                items = listed(entry[key])
-                entry[key] = [i for i in items if path_and_arguments(i)[0] not in without]
         if "n_timesteps" not in entry:
             return entry
         whole = int(float(entry["n_timesteps"]))

@@ -10,9 +10,7 @@ import contextlib
 import importlib
 import importlib.util
 import inspect
-import multiprocessing
 import os
-import signal
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -43,7 +41,6 @@ __all__ = [
     "TIME_LIMIT",
     "ZOO_KEYS",
     "Place",
-    "UninterruptedWorker",
     "check_entry",
     "check_env_kwargs",
     "check_racing",
@@ -78,21 +75,6 @@ TIME_LIMIT = "max_episode_steps"
 REQUIRED = ("n_timesteps", "policy")
 
 OURS = ("Torcs-v0", "TorcsLite-v0")
-
-
-class UninterruptedWorker(gym.Wrapper[Any, Any, Any, Any]):
-    """
-    Ignores Ctrl-C in a worker process, so that the training handles it.
-
-    The terminal interrupts all processes; if a worker ended, the training could not save its model.
-
-    :param env: any
-    """
-
-    def __init__(self, env: gym.Env[Any, Any]) -> None:
-        super().__init__(env)
-        if multiprocessing.parent_process() is not None:
-            signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 class Place(NamedTuple):
@@ -184,7 +166,7 @@ def read_entry(path: Path, name: str) -> Entry:
     return as_data(entries[name])
 
 
-def check_entry(entry: Entry, algo: str, env_id: str, place: Place, *, trust: bool = False) -> None:
+def check_entry(entry: Entry, algo: str, env_id: str, place: Place) -> None:
     """
     Make sure that every key of an entry is used.
 
@@ -192,11 +174,9 @@ def check_entry(entry: Entry, algo: str, env_id: str, place: Place, *, trust: bo
     :param algo: as the zoo calls it
     :param env_id: a registered environment
     :param place: where the entry stands
-    :param trust: let the zoo evaluate strings as Python
     :raises ZooConfigError: for the first mistake
     """
-    if not trust:
-        check_data(entry, str(place))
+    check_data(entry, str(place))
     try:
         algorithm = algorithm_class(algo)
     except InvalidOption as error:

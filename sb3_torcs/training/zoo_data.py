@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+from torch import nn
 from torch.nn.modules import activation
 
 from sb3_torcs.car import is_count, is_number
@@ -29,6 +30,7 @@ __all__ = [
     "check_numbers",
     "check_sight",
     "policy_arguments",
+    "policy_classes",
     "told_entries",
 ]
 
@@ -69,8 +71,8 @@ def check_data(entry: Mapping[str, Any], place: str) -> None:
             continue
         if key != "policy_kwargs" or isinstance(policy_arguments(entry), str):
             raise ZooConfigError(
-                f"{place}: the zoo would evaluate {key}, {entry[key]!r:.80}, as Python; write a "
-                "mapping, as in the shipped files, or train from a file of your own with --trust"
+                f"{place}: {key} is {entry[key]!r:.80}, which is code, and no code is evaluated; "
+                "write a mapping, as in the shipped files"
             )
 
 
@@ -301,6 +303,19 @@ def policy_arguments(entry: Mapping[str, Any]) -> Any:
         return _with_activations(value) if isinstance(value, str) else value
     except ValueError:
         return value
+
+
+def policy_classes(entry: Mapping[str, Any]) -> Any:
+    """
+    Read the ``policy_kwargs`` of a checked entry for the algorithm.
+
+    :param entry: of :func:`as_data`
+    :return: names and values, with activations as classes of PyTorch
+    """
+    arguments = policy_arguments(entry)
+    if isinstance(entry["policy_kwargs"], str) and isinstance(arguments.get("activation_fn"), str):
+        arguments["activation_fn"] = getattr(nn, arguments["activation_fn"])
+    return arguments
 
 
 def _with_activations(text: str) -> Any:
