@@ -24,15 +24,13 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from torch import nn
 from toy import ToyRace
 
-from sb3_torcs.bench.policy import PlainSplitHeadPolicy, measure, updater
+from sb3_torcs.bench.policy import updater
 from sb3_torcs.callbacks import GradientStepsCallback, LeanUpdatesCallback
 from sb3_torcs.callbacks.learning import end_changes
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.policies import SplitHeadPolicy
 from sb3_torcs.policies import updates as lean_updates
-from sb3_torcs.policies.fused import empty
 from sb3_torcs.policies.mirror import mirror_actions, mirror_image, mirror_observations
-from sb3_torcs.policies.optimizers import LeanAdam
 from sb3_torcs.policies.threads import two_threads
 from sb3_torcs.policies.updates import LeanUpdates, is_for
 from sb3_torcs.sensors import View
@@ -54,13 +52,6 @@ def make_model(algorithm=DDPG, policy="SplitHeadPolicy", **kwargs):
     )  # fmt: skip
     model.set_logger(Logger(None, []))
     return model
-
-
-def trained(policy, algorithm=DDPG, updates: int = 10, **policy_kwargs) -> dict[str, th.Tensor]:
-    """Parameters of all four networks after some updates, from the same start and data."""
-    model = updater(policy, 32, algorithm, **{"net_arch": SMALL, **policy_kwargs})
-    model.train(updates, 32)
-    return model.policy.state_dict()
 
 
 def assert_same(one: list[th.Tensor], two: list[th.Tensor]) -> None:
@@ -94,7 +85,7 @@ def test_a_head_bias_starts_without_half_brake():
 def test_the_heads_are_tanh_and_sigmoid_in_environment_units(heads):
     """tanh(z) or 2 sigmoid(z) - 1, then scaled by SB3; within float32."""
     model = make_model(heads=heads, init_std=1.0)
-    mu = model.actor.mu.plain()
+    mu = model.actor.mu
     with th.no_grad():
         z = th.as_tensor(OBSERVATIONS)
         for layer in mu.hidden:
@@ -108,15 +99,15 @@ def test_the_heads_are_tanh_and_sigmoid_in_environment_units(heads):
 
 def test_the_heads_start_from_the_given_deviation():
     """N(0, init_std); four standard errors of 1800 weights."""
-    weights = make_model(net_arch=None, init_std=0.5).actor.mu.plain().heads.weight
+    weights = make_model(net_arch=None, init_std=0.5).actor.mu.heads.weight
     assert weights.std().item() == pytest.approx(0.5, rel=4 / np.sqrt(2 * 1800))
-    assert not make_model().actor.mu.plain().heads.bias.any()
+    assert not make_model().actor.mu.heads.bias.any()
 
 
 def test_the_action_joins_the_critic_at_the_second_layer():
     """relu(W3 (W2 relu(W1 s) + Wa a)), written out."""
     critic = make_model().critic
-    (network,) = critic.plain()
+    (network,) = critic.networks
     state, action = th.rand(7, 29), th.rand(7, 3)
 
     def lin(layer, x):
@@ -159,7 +150,7 @@ def test_the_policy_trains_with_other_parts(kwargs):
 def test_layer_norm_is_in_the_hidden_layers_of_both_networks():
     """Two in the actor, and in the critic the first and the third layer."""
     policy = make_model(layer_norm=True).policy
-    for network in (policy.actor.mu.plain(), *policy.critic.plain()):
+    for network in (policy.actor.mu, *policy.critic.networks):
         assert sum(isinstance(module, nn.LayerNorm) for module in network.modules()) == 2
 
 
@@ -221,113 +212,6 @@ ALIKE = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("kwargs", ALIKE)
-@pytest.mark.parametrize("algorithm", [DDPG, TD3])
-def test_the_passes_by_hand_learn_as_the_plain_networks_do(algorithm, kwargs):
-    """Ten updates move a weight by 1e-2 or more; another order of sums, by a thousandth of that."""
-    plain, fused = (
-        trained(policy, algorithm, **{**kwargs, "init_std": 0.5})
-        for policy in (PlainSplitHeadPolicy, SplitHeadPolicy)
-    )
-    assert plain.keys() == fused.keys()
-    for name, weights in plain.items():
-        th.testing.assert_close(fused[name], weights, rtol=1e-5, atol=1e-5)
-
-
-@pytest.mark.parametrize("kwargs", ALIKE)
-def test_values_and_gradients_are_those_of_the_plain_networks(kwargs):
-    """The same weights and the same batch, in double precision."""
-    model = make_model(init_std=0.5, **kwargs)
-    policy = model.policy.double()
-    seen, actions = th.rand(7, 29).double(), th.rand(7, 3).double()
-    mu, networks = policy.actor.mu, policy.critic.plain()
-    plain = mu.plain().double()
-    th.testing.assert_close(mu(seen), plain(seen))
-    values = policy.critic(seen.float(), actions)
-    del values  # SB3 hands over single precision: the passes are called by themselves below
-    vectors = policy.critic.flat.view(len(networks), -1)
-    found = policy.critic.fused(vectors, seen, actions)
-    expected = [network.double()(seen, actions) for network in networks]
-    for one, two in zip(found, expected, strict=True):
-        th.testing.assert_close(one, two)
-    sum((value**2).sum() for value in found).backward()
-    sum((value**2).sum() for value in expected).backward()
-    (mu(seen) ** 2).sum().backward()
-    (plain(seen) ** 2).sum().backward()
-    for name, gradient in policy.critic.views(policy.critic.flat.grad):
-        number, _, rest = name.removeprefix("qf").partition(".")
-        th.testing.assert_close(gradient, networks[int(number)].get_parameter(rest).grad)
-    for name, gradient in mu.views(mu.flat.grad):
-        th.testing.assert_close(gradient, plain.get_parameter(name).grad)
-
-
-@pytest.mark.parametrize("layer_norm", [False, True])
-def test_the_gradients_by_hand_are_those_of_small_differences(layer_norm):
-    """PyTorch's own check, in double precision: of the weights, the features and the actions."""
-    kwargs = {"net_arch": [5, 4], "layer_norm": layer_norm, "n_critics": 2, "init_std": 0.5}
-    policy = make_model(**kwargs).policy.double()
-    generator = th.Generator().manual_seed(0)
-    seen, actions = (
-        th.rand(3, width, generator=generator, dtype=th.float64).requires_grad_()
-        for width in (29, 3)
-    )
-    vectors = policy.critic.flat.detach().view(2, -1).requires_grad_()
-    assert th.autograd.gradcheck(policy.critic.fused, (vectors, seen, actions))
-    assert th.autograd.gradcheck(policy.actor.mu.fused, (policy.actor.mu.flat, seen))
-    assert th.autograd.gradcheck(
-        lambda acted: policy.critic.fused.first(vectors, seen.detach(), acted), (actions,)
-    )
-
-
-def test_a_graph_that_is_kept_gives_the_same_gradient_again():
-    """What a pass writes to is used by later ones: the second time it has to pass anew."""
-    policy = make_model(n_critics=2, layer_norm=True).policy
-    seen, actions = th.rand(6, 29), th.rand(6, 3).requires_grad_()
-    loss = sum(value.sum() for value in policy.critic(seen, actions))
-    loss = loss + policy.actor(seen).sum() + policy.critic.q1_forward(seen, actions).sum()
-    inputs = [policy.critic.flat, policy.actor.mu.flat, actions]
-    first = th.autograd.grad(loss, inputs, retain_graph=True)
-    policy.critic(th.rand(6, 29), th.rand(6, 3))[0].sum().backward()
-    policy.actor(th.rand(6, 29)).sum().backward()
-    assert_same(first, th.autograd.grad(loss, inputs))
-
-
-@pytest.mark.parametrize("activation_fn", [nn.ELU, nn.ReLU])
-def test_where_the_passes_do_not_fit_the_plain_networks_compute(activation_fn, monkeypatch):
-    """
-    Another activation, or another device: the same values, and gradients by PyTorch.
-
-    The plain networks' matrices lie elsewhere in memory, by which some processors round products.
-    """
-    model = make_model(activation_fn=activation_fn, layer_norm=True, n_critics=2)
-    for part in (model.actor.mu, model.critic):
-        monkeypatch.setattr(part, "fused", None)
-    seen, actions = th.rand(6, 29), th.rand(6, 3).requires_grad_()
-    expected = [network(seen, actions) for network in model.critic.plain()]
-    for one, two in zip(model.critic(seen, actions), expected, strict=True):
-        th.testing.assert_close(one, two)
-    th.testing.assert_close(model.critic.q1_forward(seen, actions), expected[0])
-    th.testing.assert_close(model.actor(seen), model.actor.mu.plain()(seen))
-    model.learn(20)
-    assert model._n_updates > 0
-
-
-@pytest.mark.parametrize("layer_norm", [False, True])
-def test_the_actors_loss_gives_the_critic_no_gradient_and_the_action_the_same(layer_norm):
-    """What stock DDPG computes and then throws away."""
-    critic = make_model(layer_norm=layer_norm).critic
-    state = th.rand(7, 29)
-    actions = th.rand(7, 3)
-    one, two = actions.clone().requires_grad_(), actions.clone().requires_grad_()
-    value, expected = critic.q1_forward(state, one), critic(state, two)[0]
-    assert th.equal(value, expected)
-    (gradient,) = th.autograd.grad(value.sum(), one)
-    th.testing.assert_close(gradient, th.autograd.grad(expected.sum(), two)[0])
-    parameters = list(critic.parameters())
-    again = critic.q1_forward(state, th.rand(7, 3).requires_grad_()).sum()
-    assert th.autograd.grad(again, parameters, allow_unused=True) == (None,) * len(parameters)
-
-
 def test_adam_is_fused_unless_somebody_chose_its_kernel():
     """The default can be overridden, and other optimizers stay what they are."""
     assert make_model().actor.optimizer.defaults["fused"] is True
@@ -337,29 +221,6 @@ def test_adam_is_fused_unless_somebody_chose_its_kernel():
     weight_decay = {"weight_decay": 0.1}
     assert make_model(optimizer_kwargs=weight_decay).actor.optimizer.defaults["weight_decay"] == 0.1
     assert weight_decay == {"weight_decay": 0.1}
-
-
-@pytest.mark.parametrize("options", [{}, {"amsgrad": True, "lr": 0.1}, {"weight_decay": 0.1}])
-def test_lean_adam_is_the_fused_adam_but_for_rounding(options):
-    """Also over its own saved state, and for parameters without a gradient."""
-
-    def run(optimizer_class, **more):
-        used, unused = th.linspace(-1, 1, 50).requires_grad_(), th.ones(3).requires_grad_()
-        optimizer = optimizer_class([used, unused], **options, **more)
-        for step in range(6):
-            optimizer.zero_grad(set_to_none=step != 3)
-            ((used - 2) ** 4).sum().backward()
-            optimizer.step()
-            optimizer.load_state_dict(optimizer.state_dict())
-        return used.detach()
-
-    th.testing.assert_close(run(LeanAdam), run(th.optim.Adam, fused=True), rtol=1e-6, atol=1e-7)
-
-
-def test_lean_adam_obeys_a_closure():
-    """The interface of every optimizer."""
-    weight = th.ones(1, requires_grad=True)
-    assert LeanAdam([weight]).step(lambda: 7.0) == 7.0
 
 
 def test_the_critic_learns_at_its_own_rate():
@@ -628,15 +489,6 @@ def test_double_precision_learns_as_ever():
     assert not is_for(model)
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_work_spaces_begin_at_a_cache_line(dtype):
-    """Of any size; those that NumPy makes begin anywhere, and products take longer."""
-    made = [empty(*size, dtype=dtype) for size in [(1,), (7,), (3, 1001), (2, 65_537)] * 5]
-    assert {work.ctypes.data % 64 for work in made} == {0}
-    assert {work.dtype for work in made} == {np.dtype(dtype)}
-    assert made[2].shape == (3, 1001)
-
-
 @pytest.mark.parametrize(("make", "found"), [
     (lambda: SAC("MlpPolicy", ToyRace(), buffer_size=10), "by SAC with SACPolicy"),
     (lambda: DDPG("MlpPolicy", ToyRace(), buffer_size=10), "by DDPG with TD3Policy"),
@@ -658,6 +510,31 @@ def test_parts_that_lean_updates_do_not_know_learn_as_ever(kwargs):
         model.learn(20, callback=callback)
         assert model._n_updates > 0
     assert_same(*(list(model.policy.parameters()) for model in models))
+
+
+def test_the_parameters_are_given_back():
+    """Each has numbers of its own after the training, and Adam goes on where it was."""
+    model = make_model(ema_decay=0.9)
+    model.learn(20, callback=LeanUpdatesCallback())
+    for part in (model.actor, model.critic):
+        for own in part.parameters():
+            state = part.optimizer.state[own]
+            assert state["step"] == model._n_updates
+            for tensor in (own, state["exp_avg"], state["exp_avg_sq"]):
+                assert tensor.is_contiguous()
+                assert tensor.untyped_storage().nbytes() == 4 * tensor.numel()
+    assert model.actor.mu.lean is None
+    model.learn(10)
+
+
+def test_a_copy_decides_without_the_model_that_learns():
+    model = make_model()
+    updates = LeanUpdates(model)
+    assert deepcopy(model.actor.mu).lean is None
+    with th.no_grad():
+        lean = model.actor.mu(th.as_tensor(OBSERVATIONS))
+        updates.release()
+        th.testing.assert_close(model.actor.mu(th.as_tensor(OBSERVATIONS)), lean)
 
 
 def test_a_model_is_a_stock_one_whenever_it_may_be_saved(tmp_path):
@@ -753,38 +630,6 @@ def test_the_same_seed_makes_the_same_model(lean):
         assert th.equal(a, b)
 
 
-def test_files_know_each_parameter_by_its_own_name():
-    """What was saved before the parameters were one vector loads, and the other way round."""
-    plain, flat = (
-        updater(policy, 32, net_arch=SMALL, layer_norm=True, n_critics=2, init_std=0.5)
-        for policy in (PlainSplitHeadPolicy, SplitHeadPolicy)
-    )
-    plain.train(3, 32)
-    assert set(plain.policy.state_dict()) == set(flat.policy.state_dict())
-    assert plain.policy.state_dict()["critic.qf1.state1.weight"].shape == (16, 29)
-    flat.policy.load_state_dict(plain.policy.state_dict())
-    for ours, theirs in ((flat.actor, plain.actor), (flat.critic, plain.critic)):
-        state = theirs.optimizer.state_dict()
-        ours.optimizer.load_state_dict(deepcopy(state))
-        back = ours.optimizer.state_dict()
-        th.testing.assert_close(back["state"], state["state"], rtol=0, atol=0)
-        theirs.optimizer.load_state_dict(deepcopy(back))
-    for model in (plain, flat):
-        model.set_random_seed(3)
-        model.train(3, 32)
-    th.testing.assert_close(flat.policy.state_dict(), plain.policy.state_dict(), rtol=0, atol=1e-5)
-
-
-def test_a_file_of_another_network_is_refused():
-    """By the names of what does not fit and of what is missing."""
-    model = make_model()
-    state = model.actor.state_dict()
-    state["mu.heads.bias"] = th.zeros(4)
-    del state["mu.hidden.0.weight"]
-    with pytest.raises(RuntimeError, match=r"mu.hidden.0.weight[^$]*mu.heads.bias: \(4,\)"):
-        model.actor.load_state_dict(state)
-
-
 @pytest.mark.parametrize("algorithm", [DDPG, TD3])
 def test_a_loaded_model_goes_on_like_the_saved_one(tmp_path, algorithm):
     """Parameters, optimizer and its two rates: ten more updates end in the same bits."""
@@ -835,12 +680,3 @@ def test_the_alias_belongs_to_ddpg_and_td3_only():
     assert DDPG.policy_aliases["SplitHeadPolicy"] is SplitHeadPolicy
     assert TD3.policy_aliases["SplitHeadPolicy"] is SplitHeadPolicy
     assert "SplitHeadPolicy" not in PPO.policy_aliases
-
-
-def test_the_measurement_gives_two_rates():
-    """The number of threads is given back."""
-    threads = th.get_num_threads()
-    rates = measure(batch_size=8, seconds=0.2)
-    assert rates["policy_updates_per_s"] > 0
-    assert rates["policy_plain_updates_per_s"] > 0
-    assert th.get_num_threads() == threads

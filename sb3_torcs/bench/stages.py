@@ -9,7 +9,6 @@ from sb3_torcs.bench.drives import Figures
 from sb3_torcs.bench.environments import environments, resets
 from sb3_torcs.bench.learning import training_rate, training_share
 from sb3_torcs.bench.on_policy import ppo
-from sb3_torcs.bench.policy import measure
 from sb3_torcs.bench.updates import default_updates
 from sb3_torcs.bench.vec_env import race, vec_env
 from sb3_torcs.errors import BackendUnavailable
@@ -34,8 +33,6 @@ KEYS = (
     "scr_ticks_per_s",
     "scr_reset_ms",
     "game_frames_per_s",
-    "policy_updates_per_s",
-    "policy_plain_updates_per_s",
     "core_gflops",
     "ddpg_updates_per_s",
     "ddpg_update_gflop",
@@ -68,7 +65,6 @@ def stages(seconds: float) -> dict[str, Callable[[], Figures]]:
         "SCR": _where_it_is(lambda: scr.ticks(share)),
         "SCR resets": _where_it_is(scr.resets),
         "pictures": _where_it_is(scr.pictures),
-        "policy": lambda: measure(seconds=share),
         "updates": lambda: default_updates(share),
         "learning": _where_it_is(lambda: training_rate(max(int(400.0 * share), 100))),
         "PPO": _where_it_is(lambda: ppo(share)),

@@ -201,8 +201,10 @@ class LeanUpdatesCallback(WhileLearning):
 
     def __init__(self, *, verbose: int = 0) -> None:
         super().__init__(verbose)
+        self._updates: LeanUpdates | None = None  # of DDPG and TD3
 
     def _on_training_start(self) -> None:
+        self._release()  # SB3 does not end the callbacks of a training that an error has ended
         model = self.model
         split = isinstance(model, TD3) and isinstance(model.policy, SplitHeadPolicy)
         if not split and not isinstance(model, PPO):
@@ -226,7 +228,22 @@ class LeanUpdatesCallback(WhileLearning):
         if isinstance(model, PPO):
             return LeanPPO(model).train if ppo.is_for(model) else None
         assert isinstance(model, TD3)
-        return LeanUpdates(model).train if updates.is_for(model) else None
+        if self._updates is not None and not (
+            self._updates.model is model and updates.is_for(model) and self._updates.is_whole()
+        ):
+            self._release()
+        if self._updates is None and updates.is_for(model):
+            self._updates = LeanUpdates(model)
+        return None if self._updates is None else self._updates.train
+
+    def _on_training_end(self) -> None:
+        super()._on_training_end()
+        self._release()
+
+    def _release(self) -> None:
+        if self._updates is not None:
+            self._updates.release()
+            self._updates = None
 
     def _undo(self) -> None:
         if isinstance(vars(self.model.policy).get("forward"), LeanForward):

@@ -120,6 +120,11 @@ class ExactPolicy(BasePolicy):
 
     _exact: tuple[list[int], ExactDriver] | None = None
 
+    @property
+    def driver(self) -> nn.Module:
+        """The part of the policy that drives when ``predict`` is deterministic."""
+        return self
+
     def exact_driver(self) -> ExactDriver:
         """Return a copy of what drives when ``predict`` is deterministic."""
         raise NotImplementedError
@@ -129,7 +134,7 @@ class ExactPolicy(BasePolicy):
             return super()._predict(observation, deterministic)  # type: ignore[safe-super]
         versions = [
             number
-            for own in self.parameters()
+            for own in self.driver.parameters()
             for number in (id(own), own.data_ptr(), own._version)
         ]
         if self._exact is None or self._exact[0] != versions:
@@ -153,6 +158,6 @@ class ExactPolicy(BasePolicy):
         :param mode: ``True`` to train
         """
         if mode:
-            self._exact = None  # an update by a fused optimizer leaves the versions as they were
+            self._exact = None  # lean updates leave the versions as they were
         if mode != self.training:
             super().set_training_mode(mode)

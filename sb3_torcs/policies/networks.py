@@ -1,32 +1,26 @@
 """The networks of the original post, as parts of SB3's TD3 policy.
 
 The actor has one output function per actuator. The critic gets the action at the second hidden
-layer. :class:`SplitHeads` and :class:`LateActionQ` define what is computed. Where the hidden units
-are ReLU on the CPU, :mod:`sb3_torcs.policies.fused` computes it.
+layer. While :class:`~sb3_torcs.callbacks.LeanUpdatesCallback` is active,
+:mod:`sb3_torcs.policies.updates` computes the same.
 """
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, cast
+from typing import Any
 
 import torch as th
 from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.td3.policies import Actor
 from torch import nn
-from torch.func import functional_call
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
-
-from sb3_torcs.policies import fused
-from sb3_torcs.policies.flat import FlatParameters
 
 __all__ = [
     "HEAD_GAINS",
     "ActorAverage",
-    "FlatHeads",
     "LateActionCritic",
     "LateActionQ",
     "SplitHeadActor",
@@ -99,6 +93,8 @@ class SplitHeads(nn.Module):
             self.heads.bias.copy_(th.tensor(head_bias))
         gain = th.tensor([HEAD_GAINS[head] for head in heads])
         self.register_buffer("gain", gain, persistent=False)
+        self.lean: Callable[[th.Tensor], th.Tensor | None] | None = None
+        """Decides faster where no gradient is needed; returns ``None`` where it cannot."""
 
     def forward(self, features: th.Tensor) -> th.Tensor:
         """
@@ -107,53 +103,14 @@ class SplitHeads(nn.Module):
         :param features: (batch, features_dim)
         :return: (batch, actuators) in [-1, 1]
         """
+        if self.lean is not None and not th.is_grad_enabled():
+            actions = self.lean(features)
+            if actions is not None:
+                return actions
         x = features
         for layer in self.hidden:
             x = self.activation(layer(x))
         return th.tanh(self.gain * self.heads(x))
-
-
-class FlatHeads(FlatParameters):
-    """
-    :class:`SplitHeads` with their parameters in one vector.
-
-    :param plain: the heads; they are left alone
-    """
-
-    gain: th.Tensor
-
-    def __init__(self, plain: SplitHeads) -> None:
-        super().__init__()
-        self._plain = (plain,)  # in a tuple, of which PyTorch does not see the parameters
-        self.adopt(dict(plain.named_parameters()))
-        self.register_buffer("gain", plain.gain.clone(), persistent=False)
-        layers = [cast(Layer, layer) for layer in (*plain.hidden, plain.heads)]
-        sizes = (layers[0].in_features, *(layer.out_features for layer in layers))
-        norm = layers[0].norm is not None
-        self.fused = (
-            fused.FusedActor(sizes, norm, plain.gain.numpy())
-            if isinstance(plain.activation, nn.ReLU)
-            else None
-        )
-
-    def forward(self, features: th.Tensor) -> th.Tensor:
-        """
-        Decide.
-
-        :param features: (batch, features_dim)
-        :return: (batch, actuators) in [-1, 1]
-        """
-        if self.fused is not None and self.flat.is_cpu:
-            return self.fused(self.flat, features)
-        own = {**dict(self.views(self.flat)), "gain": self.gain}
-        actions: th.Tensor = functional_call(self._plain[0], own, features)
-        return actions
-
-    def plain(self) -> SplitHeads:
-        """Return heads that compute the same, with separate parameters."""
-        heads = copy.deepcopy(self._plain[0])
-        heads.load_state_dict(self.state_dict())
-        return heads
 
 
 class SplitHeadActor(Actor):
@@ -185,10 +142,9 @@ class SplitHeadActor(Actor):
             "init_std": init_std,
             "layer_norm": layer_norm,
         }
-        plain = SplitHeads(
+        self.mu = SplitHeads(  # type: ignore[assignment]  # the parent's is an nn.Sequential
             self.features_dim, self.net_arch, activation_fn=self.activation_fn, **self.head_kwargs
         )
-        self.mu = FlatHeads(plain)  # type: ignore[assignment]  # the parent's is an nn.Sequential
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {**super()._get_constructor_parameters(), **self.head_kwargs}
@@ -270,9 +226,9 @@ class LateActionQ(nn.Module):
         return value
 
 
-class LateActionCritic(FlatParameters, ContinuousCritic):
+class LateActionCritic(ContinuousCritic):
     """
-    SB3's critic with :class:`LateActionQ` for its value functions, all parameters in one vector.
+    SB3's critic with :class:`LateActionQ` for its value functions.
 
     :param n_critics: number of value functions
     :param layer_norm: as in :class:`LateActionQ`
@@ -282,22 +238,16 @@ class LateActionCritic(FlatParameters, ContinuousCritic):
     def __init__(self, *, n_critics: int, layer_norm: bool, **kwargs: Any) -> None:
         super().__init__(n_critics=0, **kwargs)
         self.n_critics = n_critics
-        first, second = kwargs["net_arch"]
-        features_dim, action_dim = kwargs["features_dim"], get_action_dim(self.action_space)
-        activation_fn = kwargs["activation_fn"]
-        plain = [
-            LateActionQ(features_dim, action_dim, (first, second), activation_fn, layer_norm)
+        action_dim = get_action_dim(self.action_space)
+        self.networks = [
+            LateActionQ(
+                kwargs["features_dim"], action_dim, kwargs["net_arch"], kwargs["activation_fn"],
+                layer_norm,
+            )
             for _ in range(n_critics)
-        ]
-        self._plain = tuple(plain)  # in a tuple, of which PyTorch does not see the parameters
-        self.adopt({
-            f"qf{number}.{name}": parameter
-            for number, network in enumerate(plain)
-            for name, parameter in network.named_parameters()
-        })  # fmt: skip
-        fuses = issubclass(activation_fn, nn.ReLU)
-        sizes = features_dim, action_dim, first, second
-        self.fused = fused.FusedValues(sizes, layer_norm) if fuses else None
+        ]  # fmt: skip
+        for number, network in enumerate(self.networks):
+            self.add_module(f"qf{number}", network)
 
     def forward(self, obs: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, ...]:
         """
@@ -310,44 +260,17 @@ class LateActionCritic(FlatParameters, ContinuousCritic):
         # As in SB3: shared features learn from the actor's loss only.
         with th.set_grad_enabled(th.is_grad_enabled() and not self.share_features_extractor):
             features = self.extract_features(obs, self.features_extractor)
-        if self.fused is not None and self.flat.is_cpu:
-            return self.fused(self.flat.view(self.n_critics, -1), features, actions)
-        return tuple(
-            functional_call(network, own, (features, actions))
-            for network, own in zip(self._plain, self._own(self.flat), strict=True)
-        )
+        return tuple(network(features, actions) for network in self.networks)
 
     def q1_forward(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """
         Value the actions by the first value function, for the actor's loss.
 
-        Stock DDPG computes the weights' gradient of this loss, too, and then deletes it.
-
         :param obs: (batch, observation)
         :param actions: (batch, action_dim) in [-1, 1]
-        :return: (batch, 1), with a gradient for the actions only
+        :return: (batch, 1)
         """
         with th.no_grad():
             features = self.extract_features(obs, self.features_extractor)
-        if self.fused is not None and self.flat.is_cpu:
-            vectors = self.flat.detach().view(self.n_critics, -1)
-            return self.fused.first(vectors, features, actions)
-        value: th.Tensor = functional_call(
-            self._plain[0], self._own(self.flat.detach())[0], (features, actions)
-        )
+        value: th.Tensor = self.networks[0](features, actions)
         return value
-
-    def plain(self) -> list[LateActionQ]:
-        """Return value functions that compute the same, with separate parameters."""
-        networks = copy.deepcopy(list(self._plain))
-        for network, own in zip(networks, self._own(self.flat.detach()), strict=True):
-            network.load_state_dict(own)
-        return networks
-
-    def _own(self, vector: th.Tensor) -> list[dict[str, th.Tensor]]:
-        """Find the parameters of each value function by their names in it."""
-        own: list[dict[str, th.Tensor]] = [{} for _ in self._plain]
-        for name, view in self.views(vector):
-            number, _, rest = name.removeprefix("qf").partition(".")
-            own[int(number)][rest] = view
-        return own

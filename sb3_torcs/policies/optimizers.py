@@ -1,4 +1,4 @@
-"""Optimizers for networks whose parameters are one vector, and for those that learn nothing."""
+"""Optimizers with a learning rate for each group, and for networks that learn nothing."""
 
 from __future__ import annotations
 
@@ -8,9 +8,7 @@ from typing import Any
 
 import torch as th
 
-from sb3_torcs.policies import kernels
-
-__all__ = ["IdleOptimizer", "LeanAdam", "adam_factors", "adam_state", "is_usual", "with_lr_scale"]
+__all__ = ["IdleOptimizer", "adam_factors", "adam_state", "is_usual", "with_lr_scale"]
 
 
 class _LrScale:
@@ -34,51 +32,8 @@ class _LrScale:
                 group["lr"] = rate
 
 
-class LeanAdam(_LrScale, th.optim.Adam):
-    """
-    ``Adam(fused=True)`` with our own kernel on the CPU, equal but for rounding.
-
-    A group of parameters may have an ``lr_scale``, by which its learning rate is multiplied.
-
-    :param params: as in ``Adam``
-    :param kwargs: as in ``Adam``
-    """
-
-    def __init__(self, params: Any, **kwargs: Any) -> None:
-        super().__init__(params, **{**kwargs, "fused": True})
-
-    @th.no_grad()
-    def step(self, closure: Callable[[], float] | None = None) -> Any:
-        """
-        Make one update.
-
-        :param closure: as in ``Adam``
-        :return: as in ``Adam``
-        """
-        if closure is not None or not is_usual(self):
-            return super().step(closure)
-        for group in self.param_groups:
-            for param in group["params"]:
-                if param.grad is not None:
-                    weights, gradient = param.detach(), param.grad.contiguous()
-                    flat = (own.numpy().reshape(-1) for own in (weights, gradient))
-                    kernels.adam(*flat, *self.begin_step(param))
-        return None
-
-    def begin_step(self, param: th.Tensor) -> tuple[Any, ...]:
-        """
-        Count an update of one parameter.
-
-        :param param: contiguous, on the CPU
-        :return: what the kernel takes after the weights and their gradient
-        """
-        (group,) = (g for g in self.param_groups if any(param is own for own in g["params"]))
-        state = adam_state(self, param)
-        step, mean, square = (
-            state[name].numpy().reshape(-1) for name in ("step", "exp_avg", "exp_avg_sq")
-        )
-        step += 1
-        return mean, square, *adam_factors(group, step.item(), mean.dtype.type)
+class _ScaledAdam(_LrScale, th.optim.Adam):
+    """Adam whose groups may have an ``lr_scale``."""
 
 
 class IdleOptimizer(th.optim.Optimizer):
@@ -141,9 +96,9 @@ def is_usual(optimizer: th.optim.Optimizer) -> bool:
     :param optimizer: of any kind
     """
     unusual = ("amsgrad", "maximize", "decoupled_weight_decay")
-    return type(optimizer) in (th.optim.Adam, LeanAdam) and all(
-        not any(map(group.get, unusual))
-        and all(param.is_cpu and param.is_contiguous() for param in group["params"])
+    kinds = th.optim.Adam, _ScaledAdam
+    return type(optimizer) in kinds and all(
+        not any(map(group.get, unusual)) and all(param.is_cpu for param in group["params"])
         for group in optimizer.param_groups
     )
 
@@ -155,4 +110,6 @@ def with_lr_scale(optimizer_class: type[th.optim.Optimizer]) -> type[th.optim.Op
     :param optimizer_class: any optimizer of PyTorch
     :return: a subclass; its groups need an ``lr_scale``, which their state keeps
     """
+    if optimizer_class is th.optim.Adam:
+        return _ScaledAdam
     return type(f"LrScaled{optimizer_class.__name__}", (_LrScale, optimizer_class), {})

@@ -23,14 +23,13 @@ from torch import nn
 
 from sb3_torcs.policies import kernels
 from sb3_torcs.policies.bounded import BothWays, BoundedHead, BoundedPolicy, MeanOfBoth
-from sb3_torcs.policies.flat import Slot
-from sb3_torcs.policies.fused import array
 from sb3_torcs.policies.inputs import SensorInputs
 from sb3_torcs.policies.networks import ActorAverage
 from sb3_torcs.policies.optimizers import adam_factors, adam_state, is_usual
 from sb3_torcs.policies.ppo_passes import decide, find_policy_gradient, find_value_gradient
 from sb3_torcs.policies.stock import has_hooks, has_module_hooks, has_own_methods
 from sb3_torcs.policies.threads import Helper, two_threads
+from sb3_torcs.policies.vectors import Slot, array
 
 __all__ = ["LeanForward", "LeanPPO", "is_for"]
 
@@ -371,11 +370,16 @@ def _learns_all(policy: Any) -> bool:
         is_usual(optimizer)
         and len(optimizer.param_groups) == 1
         and {*map(id, optimizer.param_groups[0]["params"])} == {*map(id, learns.values())}
-        and all(own.dtype == th.float32 and own.requires_grad for own in learns.values())
+        and all(map(_can_be_read, learns.values()))
         and not has_hooks(
             (part for part in policy.modules() if part is not policy), optimizer, own_hooks
         )
     )
+
+
+def _can_be_read(parameter: nn.Parameter) -> bool:
+    """Whether a parameter can be compared with its copy without another one."""
+    return parameter.dtype == th.float32 and parameter.is_contiguous() and parameter.requires_grad
 
 
 def _plain(extractor: nn.Module) -> type[nn.Module]:

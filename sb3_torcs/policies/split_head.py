@@ -7,6 +7,7 @@ name ``sb3_torcs.policies.split_head.SplitHeadPolicy`` without an import.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from typing import Any, cast
 
@@ -23,16 +24,14 @@ from sb3_torcs.car import check_count, checked_flag, is_number
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.policies.exact import ExactDriver, ExactPolicy, check_sizes, checked_decay
 from sb3_torcs.policies.export import export_actor
-from sb3_torcs.policies.flat import FlatParameters, keep_plain_state
 from sb3_torcs.policies.mirror import check_symmetric
 from sb3_torcs.policies.networks import (
     HEAD_GAINS,
     ActorAverage,
-    FlatHeads,
     LateActionCritic,
     SplitHeadActor,
 )
-from sb3_torcs.policies.optimizers import IdleOptimizer, LeanAdam, with_lr_scale
+from sb3_torcs.policies.optimizers import IdleOptimizer, with_lr_scale
 
 __all__ = ["SplitHeadPolicy", "export_actor"]
 
@@ -128,32 +127,26 @@ class SplitHeadPolicy(ExactPolicy, TD3Policy):
         self.critic.optimizer = self._optimizer(self.critic, scale, lr_schedule)
         decay = self.own_kwargs["ema_decay"]
         self.average = None if decay is None else ActorAverage(self.actor, decay)
-        self._hook_optimizers()
+        self._follow_actor()
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Become a copy. Copies of optimizers leave their hooks behind."""
         super().__setstate__(state)
-        self._hook_optimizers()
+        self._follow_actor()
 
-    def _hook_optimizers(self) -> None:
-        """Let the optimizers keep the plain networks' state, and the average follow the actor."""
-        for network in (self.actor, self.critic):
-            for part in _flat_parts(network):
-                keep_plain_state(network.optimizer, part)
+    def _follow_actor(self) -> None:
+        """Let the average follow the actor."""
         if self.average is not None:
             self.average.follow(self.actor, self.actor.optimizer)
 
     def _optimizer(
         self, network: nn.Module, scale: float, lr_schedule: Schedule
     ) -> th.optim.Optimizer:
-        """Make an optimizer; the vectors of a network are its last parameters."""
-        last = [part.flat for part in _flat_parts(network)]
-        others = [param for param in network.parameters() if all(param is not p for p in last)]
-        group: dict[str, Any] = {"params": [*others, *last]}
+        group: dict[str, Any] = {"params": list(network.parameters())}
         optimizer_class = self.optimizer_class
         if scale != 1.0:
             group["lr_scale"] = scale
-            if not issubclass(optimizer_class, (LeanAdam, IdleOptimizer)):
+            if not issubclass(optimizer_class, IdleOptimizer):
                 optimizer_class = with_lr_scale(optimizer_class)
         rate = lr_schedule(1)
         return optimizer_class([group], lr=rate, **self.optimizer_kwargs)  # type: ignore[call-arg]
@@ -165,15 +158,9 @@ class SplitHeadPolicy(ExactPolicy, TD3Policy):
             return self.actor
         return cast(Actor, self.average.module)
 
-    @property
-    def fuses(self) -> bool:
-        """Whether the networks pass by hand, see :mod:`sb3_torcs.policies.fused`."""
-        critic = cast(LateActionCritic, self.critic)
-        return critic.fused is not None and critic.flat.is_cpu
-
     def exact_driver(self) -> ExactDriver:
         """Return a copy of the actor that drives when ``predict`` is deterministic."""
-        heads, symmetric = cast(FlatHeads, self.driver.mu).plain(), self.own_kwargs["symmetric"]
+        heads, symmetric = copy.deepcopy(self.driver.mu), self.own_kwargs["symmetric"]
         return ExactDriver(self, self.driver.features_extractor, heads, symmetric=symmetric)
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
@@ -204,10 +191,6 @@ class SplitHeadPolicy(ExactPolicy, TD3Policy):
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {**super()._get_constructor_parameters(), **self.own_kwargs}
-
-
-def _flat_parts(network: nn.Module) -> list[FlatParameters]:
-    return [part for part in network.modules() if isinstance(part, FlatParameters)]
 
 
 def heads_for(action_space: spaces.Box) -> tuple[str, ...]:
@@ -284,7 +267,6 @@ def _fast_optimizer(kwargs: dict[str, Any]) -> dict[str, Any]:
     options = dict(kwargs.get("optimizer_kwargs") or {})
     if issubclass(optimizer_class, th.optim.Adam) and not OWN_KERNEL & options.keys():
         options["fused"] = True
-        optimizer_class = LeanAdam if optimizer_class is th.optim.Adam else optimizer_class
     return {**kwargs, "optimizer_class": optimizer_class, "optimizer_kwargs": options}
 
 
