@@ -31,11 +31,12 @@ from sb3_torcs.errors import Sb3TorcsError, ZooConfigError
 from sb3_torcs.files import listed, path_and_arguments
 from sb3_torcs.training.keeping import REPLAY_BUFFER
 from sb3_torcs.training.resuming import restore_statistics
+from sb3_torcs.training.schedules import FallingSchedule
 from sb3_torcs.training.zoo import OURS, ZOO_KEYS
 from sb3_torcs.training.zoo_data import SCHEDULES, policy_classes
 from sb3_torcs.vec_env import TorcsVecEnv
 
-__all__ = ["Built", "FallingSchedule", "build"]
+__all__ = ["Built", "build"]
 
 REFUSED = (AssertionError, NotImplementedError, TypeError, ValueError)
 """What an algorithm raises for arguments that it does not take."""
@@ -48,28 +49,6 @@ class Built(NamedTuple):
 
     model: Any  # of any algorithm; its environments are ``model.get_env()``
     callbacks: list[BaseCallback]
-
-
-class FallingSchedule:
-    """
-    Falls linearly to 0 over a training: an entry's ``lin_0.001``.
-
-    :param first: value at the beginning
-    """
-
-    def __init__(self, first: float) -> None:
-        self.first = first
-
-    def __call__(self, progress_remaining: float) -> float:
-        """
-        Return the present value.
-
-        :param progress_remaining: 1 at the beginning of a training, 0 at its end
-        """
-        return progress_remaining * self.first
-
-    def __repr__(self) -> str:
-        return f"FallingSchedule({self.first})"
 
 
 def build(
