@@ -19,13 +19,9 @@ from sb3_torcs.agents.saved.algorithm import told_algorithm
 from sb3_torcs.agents.saved.file import learned_weights, saved_data
 from sb3_torcs.agents.saved.writing import RecordCallback, recipe
 from sb3_torcs.agents.wrapping import frames_of
-from sb3_torcs.callbacks import (
-    AdaptiveLearningRateCallback,
-    LeanUpdatesCallback,
-    RacingProgressCallback,
-    RewardCallback,
-)
-from sb3_torcs.callbacks.learning import learn_values
+from sb3_torcs.callbacks import LeanUpdatesCallback, RewardCallback
+from sb3_torcs.callbacks.adapting import AdaptiveLearningRateCallback, learn_values
+from sb3_torcs.callbacks.progress import RacingProgressCallback
 from sb3_torcs.car import check_count
 from sb3_torcs.errors import ends_in_a_line
 from sb3_torcs.vec_env import MirrorVecEnv, TorcsVecEnv

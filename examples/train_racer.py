@@ -22,12 +22,9 @@ from torch import nn
 from sb3_torcs.agents.models import find_model, training_record
 from sb3_torcs.agents.saved.file import learned_weights
 from sb3_torcs.agents.saved.writing import RecordCallback, recipe
-from sb3_torcs.callbacks import (
-    AdaptiveLearningRateCallback,
-    LeanUpdatesCallback,
-    RacingProgressCallback,
-)
-from sb3_torcs.callbacks.learning import learn_values
+from sb3_torcs.callbacks import LeanUpdatesCallback
+from sb3_torcs.callbacks.adapting import AdaptiveLearningRateCallback, learn_values
+from sb3_torcs.callbacks.progress import RacingProgressCallback
 from sb3_torcs.errors import ends_in_a_line
 from sb3_torcs.policies import BoundedPolicy
 from sb3_torcs.sensors import feature_slices

@@ -10,8 +10,7 @@ import difflib
 import functools
 import importlib.util
 import inspect
-import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, TypeVar, cast
 
 __all__ = [
@@ -60,10 +59,8 @@ __all__ = [
     "keywords_of",
     "near_miss",
     "needs_extra",
-    "renamed",
     "unknown_argument",
     "with_known_arguments",
-    "with_new_names",
 ]
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -362,44 +359,3 @@ def unknown_argument(owner: str, name: str, known: Iterable[str]) -> TypeError:
     if name in ELSEWHERE:
         return TypeError(f"{owner} has no argument {name!r}; {ELSEWHERE[name]}")
     return TypeError(f"{owner} has no argument {name!r}{near_miss(name, known)}")
-
-
-def with_new_names(arguments: Mapping[str, Any], names: Mapping[str, str]) -> dict[str, Any]:
-    """
-    Replace older names of arguments, with a ``DeprecationWarning`` for each.
-
-    :param arguments: keyword arguments
-    :param names: the older names and what they are called now
-    :return: the arguments by their present names
-    :raises TypeError: if an argument is given by both names
-    """
-    result = dict(arguments)
-    for old in names.keys() & arguments.keys():
-        new = names[old]
-        if new in arguments:
-            raise TypeError(f"'{old}' is the older name of '{new}'; pass only '{new}'")
-        said = f"'{old}' is now called '{new}'; the older name will be removed in version 0.2"
-        warnings.warn(said, DeprecationWarning, stacklevel=3)
-        result[new] = result.pop(old)
-    return result
-
-
-def renamed(**names: str) -> Callable[[Function], Function]:
-    """
-    Let a function take keyword arguments by their older names, too.
-
-    The names are kept in the function's ``older_names``.
-
-    :param names: ``old="new"``
-    :return: the decorator
-    """
-
-    def decorate(function: Function) -> Function:
-        @functools.wraps(function)
-        def call(*args: Any, **kwargs: Any) -> Any:
-            return function(*args, **with_new_names(kwargs, names))
-
-        call.older_names = names  # type: ignore[attr-defined]
-        return call  # type: ignore[return-value]
-
-    return decorate

@@ -210,11 +210,6 @@ class ActuatorNoise(ActionNoise):
         # These belong to the callbacks of one training.
         return {**self.__dict__, "_watch": None, "stochastic_brake": None}
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        # Models of older versions count in `frames`.
-        counted = {"timesteps": state["frames"]} if "frames" in state else {}
-        self.__dict__.update({k: v for k, v in state.items() if k != "frames"} | counted)
-
     def __deepcopy__(self, memo: dict[int, Any]) -> ActuatorNoise:
         # SB3 makes the noises of parallel environments by deep copies: each needs a stream of
         # its own. Pickles continue the same stream.

@@ -23,8 +23,6 @@ from lint import assert_none, nodes, source, tree
 PACKAGE = Path(__file__).parent.parent / "sb3_torcs"
 FILES = sorted(PACKAGE.rglob("*.py"))
 
-OLDER_PLACES = {PACKAGE / name for name in ("agents/model_writing.py", "progress.py")}
-
 MAX_MODULES = 16  # at the top of the package
 MAX_FOLDERS = 17  # of Python there; beside them native/, the C++
 MAX_CODE_LINES = 300
@@ -46,7 +44,7 @@ FLOORS = (
     {"callbacks", "evaluation", "races"},
     {"training"},
     {"bench", "studies"},
-    {"cli", "progress", "rl_zoo"},
+    {"cli", "rl_zoo"},
 )
 VOCABULARY = {"actions", "car", "rewards", "rivals", "sensors"}
 PURE_FILES = ("tracks/track.py", "tracks/generator.py", "scr/protocol.py")
@@ -229,12 +227,12 @@ def floor_plan() -> dict[str, str]:
 def test_every_module_stands_in_the_floor_plan():
     plan = floor_plan()
     for path in FILES:
-        if path in OLDER_PLACES or path.stem.startswith("__"):
+        if path.stem.startswith("__"):
             continue
         if path.parent != PACKAGE and room(path) != "cli":
             words = re.findall(r"[\w*]+", plan[room(path)])
             assert any(fnmatch.fnmatch(path.stem, word) for word in words), path
-    rooms = {room(path) for path in FILES if path not in OLDER_PLACES} - {"__init__"}
+    rooms = {room(path) for path in FILES} - {"__init__"}
     assert set(plan) == rooms
 
 
@@ -266,15 +264,14 @@ def test_each_folder_of_python_is_installed():
 
 
 @pytest.mark.parametrize("path", [
-    "sb3_torcs.callbacks.GradientStepsCallback", "sb3_torcs.callbacks.MirrorCallback",
+    "sb3_torcs.callbacks.replay.GradientStepsCallback",
+    "sb3_torcs.callbacks.replay.MirrorCallback", "sb3_torcs.training.schedules.FallingSchedule",
     "sb3_torcs.callbacks.NoiseCallback", "sb3_torcs.callbacks.NoiseDecayCallback",
     "sb3_torcs.callbacks.DrivingMetricsCallback", "sb3_torcs.callbacks.RandomStartCallback",
     "sb3_torcs.callbacks.RewardCallback", "sb3_torcs.callbacks.StochasticBrakeCallback",
     "sb3_torcs.noise.OUNoise", "sb3_torcs.noise.SetPointNoise",
     "sb3_torcs.policies.SplitHeadPolicy", "sb3_torcs.policies.export_actor",
-    "sb3_torcs.agents.model_writing.RecordCallback", "sb3_torcs.callbacks.RecordCallback",
-    "sb3_torcs.agents.model_writing.write_driver",
-    "sb3_torcs.progress.RacingProgressCallback",
+    "sb3_torcs.callbacks.RecordCallback",
     "sb3_torcs.tracks.load_track", "sb3_torcs.evaluation.evaluate",
 ])  # fmt: skip
 def test_what_files_and_people_name_stays_importable(path):

@@ -13,8 +13,8 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from torch import nn
 from toy import ToyRace
 
-from sb3_torcs.callbacks import AdaptiveLearningRateCallback, LeanUpdatesCallback
-from sb3_torcs.callbacks.learning import learn_values
+from sb3_torcs.callbacks import LeanUpdatesCallback
+from sb3_torcs.callbacks.adapting import AdaptiveLearningRateCallback, learn_values
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.policies import BoundedPolicy
 from sb3_torcs.policies.mirror import mirror_actions, mirror_image, mirror_observations

@@ -13,15 +13,13 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecChec
 from toy import ToyRace
 
 from sb3_torcs.callbacks import (
-    DrivingMetricsCallback,
-    GradientStepsCallback,
-    MirrorCallback,
     NoiseCallback,
     NoiseDecayCallback,
     RandomStartCallback,
     RewardCallback,
     StochasticBrakeCallback,
 )
+from sb3_torcs.callbacks.replay import GradientStepsCallback, MirrorCallback
 from sb3_torcs.errors import InvalidOption, NoiseNotBound, Sb3TorcsError
 from sb3_torcs.noise import ActuatorNoise, OUNoise, SetPointNoise, noises_of
 
@@ -225,7 +223,7 @@ def test_decay_is_linear_down_to_the_floor(n_envs):
     expected = [1.0 - (1.0 - 0.2) * min(k / 20, 1.0) for k in timesteps]
     np.testing.assert_array_equal(spy.scales, expected)
     assert spy.logged["noise/scale"] == pytest.approx(0.2)
-    assert spy.logged["noise/frames"] == 30
+    assert spy.logged["noise/timesteps"] == 30
 
 
 def test_decay_counts_for_a_noise_that_came_with_the_model():
@@ -241,22 +239,6 @@ def test_steering_a_noise_that_is_not_there_is_an_error(callback):
     """It names the callback that is missing."""
     with pytest.raises(InvalidOption, match="add NoiseCallback"):
         learn(make_model(), 2, callback())
-
-
-@pytest.mark.parametrize(
-    ("callback", "older", "newer", "more"),
-    [
-        (NoiseDecayCallback, "frames", "timesteps", {}),
-        (GradientStepsCallback, "frames", "timesteps", {"gradient_steps": 2}),
-        (DrivingMetricsCallback, "line_decisions", "line_timesteps", {}),
-    ],
-)
-def test_an_argument_keeps_its_older_name_for_one_version(callback, older, newer, more):
-    """It warns and does the same; both names at once would contradict each other."""
-    with pytest.warns(DeprecationWarning, match=f"'{older}' is now called '{newer}'"):
-        assert getattr(callback(**{older: 12}, **more), newer) == 12
-    with pytest.raises(TypeError, match=f"pass only '{newer}'"):
-        callback(**{older: 12, newer: 12}, **more)
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from vectors import assert_they_see_the_same, both_kinds
 
 import sb3_torcs  # noqa: F401  # registers the ids
-from sb3_torcs.callbacks import ConditionsCallback
+from sb3_torcs.callbacks import RandomStartCallback
 from sb3_torcs.car import RESTING
 from sb3_torcs.envs.conditions import Delay
 from sb3_torcs.envs.racing import RacingEnv
@@ -271,7 +271,7 @@ def test_conditions_of_a_training_are_those_of_its_environments_alone(game):
             return True
 
     model = PPO("MlpPolicy", env, n_steps=64, batch_size=64, device="cpu", seed=0)
-    grip = ConditionsCallback(grip=(0.7, 0.8), delay=1)
+    grip = RandomStartCallback(conditions={"grip": (0.7, 0.8), "delay": 1})
     model.learn(600, callback=[grip, Grips()])
     assert drawn
     assert {0.7 <= each.grip <= 0.8 for each in drawn[-2:]} == {True}
@@ -294,7 +294,7 @@ def test_conditions_of_a_training_are_those_of_its_environments_alone(game):
 def test_bad_conditions_of_a_training_are_refused(oval, choice, message):
     """When the callback is made; an environment says the same, and which names there are."""
     with pytest.raises(InvalidOption, match=message):
-        ConditionsCallback(**choice)
+        RandomStartCallback(conditions=choice)
     env = RacingEnv(ScriptedBackend(oval))
     with pytest.raises(InvalidOption, match=message):
         env.set_conditions(choice)

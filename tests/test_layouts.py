@@ -10,7 +10,8 @@ from stable_baselines3 import DDPG, PPO
 from sb3_torcs.actions import ACTIONS, action_layout
 from sb3_torcs.agents.models import load_driver
 from sb3_torcs.agents.scripted import ScriptedDriver
-from sb3_torcs.callbacks import DrivingMetricsCallback, MirrorCallback, NoiseCallback
+from sb3_torcs.callbacks import DrivingMetricsCallback, NoiseCallback
+from sb3_torcs.callbacks.replay import MirrorCallback
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.evaluation.protocol import race_environment
 from sb3_torcs.policies import SplitHeadPolicy

@@ -11,12 +11,16 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_torcs.callbacks import LinePicturesCallback, RacingProgressCallback
 from sb3_torcs.callbacks.display import bars
 from sb3_torcs.callbacks.driven_line import DrivenLine
-from sb3_torcs.callbacks.lines import DrivenLap, draw_learning, driven_laps
+from sb3_torcs.callbacks.lines import (
+    DrivenLap,
+    LinePicturesCallback,
+    draw_learning,
+    driven_laps,
+)
 from sb3_torcs.callbacks.metrics import DrivingMetricsCallback
-from sb3_torcs.callbacks.progress import spoken_moment
+from sb3_torcs.callbacks.progress import RacingProgressCallback, spoken_moment
 from sb3_torcs.envs.racing import RacingEnv
 from sb3_torcs.errors import InvalidOption, OutputNotWritable
 
@@ -237,13 +241,6 @@ def test_a_folder_that_cannot_be_written_ends_the_training_before_it_begins(oval
     pictures = LinePicturesCallback(folder=str(tmp_path / "file.py"), every=0)
     with pytest.raises(OutputNotWritable, match=r"cannot write to the folder '.*file.py'"):
         learned(oval, [], callbacks=[pictures])
-
-
-def test_without_evaluations_there_is_nothing_to_draw(oval, tmp_path):
-    env = DummyVecEnv([lambda: RacingEnv(ScriptedBackend(oval))])
-    model = PPO("MlpPolicy", env, n_steps=32, batch_size=32, device="cpu")
-    with pytest.raises(InvalidOption, match="what DrivingMetricsCallback drives"):
-        model.learn(32, LinePicturesCallback(folder=str(tmp_path)))
 
 
 def test_an_interval_below_zero_is_refused(tmp_path):

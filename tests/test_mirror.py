@@ -18,7 +18,7 @@ from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 from toy import ToyRace
 
-from sb3_torcs.callbacks import MirrorCallback
+from sb3_torcs.callbacks.replay import MirrorCallback
 from sb3_torcs.errors import InvalidAction, InvalidOption
 from sb3_torcs.policies.mirror import (
     mirror_actions,

@@ -25,8 +25,9 @@ from torch import nn
 from toy import ToyRace
 
 from sb3_torcs.bench.policy import updater
-from sb3_torcs.callbacks import GradientStepsCallback, LeanUpdatesCallback
+from sb3_torcs.callbacks import LeanUpdatesCallback
 from sb3_torcs.callbacks.learning import end_changes
+from sb3_torcs.callbacks.replay import GradientStepsCallback
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.policies import SplitHeadPolicy
 from sb3_torcs.policies import updates as lean_updates

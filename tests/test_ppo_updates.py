@@ -13,12 +13,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from torch import nn
 from toy import ToyRace
 
-from sb3_torcs.callbacks import (
-    AdaptiveLearningRateCallback,
-    LeanUpdatesCallback,
-    ReuseRolloutsCallback,
-    ValuesOnlyCallback,
-)
+from sb3_torcs.callbacks import LeanUpdatesCallback
+from sb3_torcs.callbacks.adapting import AdaptiveLearningRateCallback, ValuesOnlyCallback
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.policies import BoundedPolicy
 from sb3_torcs.policies.ppo import LeanPPO, is_for
@@ -345,11 +341,7 @@ def test_copies_of_a_policy_that_makes_a_rollout_stand_alone(policy, tmp_path):
 
 def test_a_model_that_is_interrupted_before_an_update_is_saved(tmp_path):
     model = make(policy=BoundedPolicy, tensorboard_log=str(tmp_path))
-    callbacks = [
-        AdaptiveLearningRateCallback(first_factor=0.1),
-        ReuseRolloutsCallback(),
-        LeanUpdatesCallback(),
-    ]
+    callbacks = [AdaptiveLearningRateCallback(first_factor=0.1), LeanUpdatesCallback()]
     buffer, schedule = model.rollout_buffer, model.lr_schedule
     interrupted(model, "before", *callbacks)
     assert (model.rollout_buffer, model.lr_schedule) == (buffer, schedule)

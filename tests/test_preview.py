@@ -16,7 +16,7 @@ from vectors import assert_they_see_the_same, both_kinds
 
 import sb3_torcs  # noqa: F401  # registers the ids
 from sb3_torcs.agents.scripted import ScriptedDriver
-from sb3_torcs.callbacks import MirrorCallback
+from sb3_torcs.callbacks.replay import MirrorCallback
 from sb3_torcs.envs.batch import Batch
 from sb3_torcs.envs.racing import RacingEnv
 from sb3_torcs.errors import InvalidOption

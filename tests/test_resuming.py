@@ -163,7 +163,7 @@ def test_what_changes_how_it_sees_is_refused(run, tmp_path, capsys):
 
 
 def test_a_callback_that_refuses_to_begin_leaves_no_run(run, tmp_path, capsys):
-    bad = {"TorcsLite-v0": {**ENTRY, "callback": ["sb3_torcs.callbacks.MirrorCallback"]}}
+    bad = {"TorcsLite-v0": {**ENTRY, "callback": ["sb3_torcs.callbacks.replay.MirrorCallback"]}}
     (tmp_path / "own.yml").write_text(yaml.safe_dump(bad))
     words = ["train", *LITE, "--algo", "ppo", "--no-progress", "--folder", str(tmp_path)]
     assert main([*words, "--conf-file", str(tmp_path / "own.yml")]) == 2

@@ -33,8 +33,10 @@ CASES = {
             "sb3_torcs.callbacks.RandomStartCallback": {"speed": 30.0},
             "sb3_torcs.callbacks.NoiseCallback": {"kind": "ou", "dt": 0.1},
             "sb3_torcs.callbacks.NoiseDecayCallback": {"timesteps": 200, "floor": 0.35},
-            "sb3_torcs.callbacks.GradientStepsCallback": {"gradient_steps": 5, "timesteps": 120},
-            "sb3_torcs.callbacks.MirrorCallback": {},
+            "sb3_torcs.callbacks.replay.GradientStepsCallback": {
+                "gradient_steps": 5, "timesteps": 120,
+            },
+            "sb3_torcs.callbacks.replay.MirrorCallback": {},
         },
     },
     "the post's noise and brake": {
@@ -127,18 +129,15 @@ ADAPTIVE = {
     "n_envs": 4,
     "callback": {
         "sb3_torcs.callbacks.RandomStartCallback": {"speed": 80.0, "hard": 1.0},
-        "sb3_torcs.callbacks.AdaptiveLearningRateCallback": {"kl": 0.1},
+        "sb3_torcs.callbacks.adapting.AdaptiveLearningRateCallback": {"kl": 0.1},
     },
 }  # fmt: skip
 
 
-REUSED = {**PPO, "callback": {"sb3_torcs.callbacks.ReuseRolloutsCallback": {"rollouts": 3}}}
-
-
 @pytest.mark.parametrize(
     "changes",
-    [PPO, BEHIND_WRAPPERS, ADAPTIVE, REUSED],
-    ids=["bare", "behind wrappers", "hard starts and a rate that adapts", "rollouts again"],
+    [PPO, BEHIND_WRAPPERS, ADAPTIVE],
+    ids=["bare", "behind wrappers", "hard starts and a rate that adapts"],
 )
 def test_an_algorithm_without_a_replay_buffer_goes_on_the_same(tmp_path, changes):
     wanted = trial(tmp_path, changes)

@@ -19,7 +19,7 @@ from sb3_torcs.policies.threads import one_thread
 __all__ = ["training_rate", "training_share"]
 
 
-AT_THE_BEGINNING = "sb3_torcs.callbacks.GradientStepsCallback"
+AT_THE_BEGINNING = "sb3_torcs.callbacks.replay.GradientStepsCallback"
 """Makes more updates per timestep at the beginning of a training than later."""
 
 WARM_UP = 50  # training timesteps before the clock starts

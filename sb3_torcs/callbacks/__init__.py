@@ -9,35 +9,18 @@ from sb3_torcs.callbacks.exploration import (
     NoiseDecayCallback,
     StochasticBrakeCallback,
 )
-from sb3_torcs.callbacks.learning import (
-    AdaptiveLearningRateCallback,
-    GradientStepsCallback,
-    LeanUpdatesCallback,
-    MirrorCallback,
-    ValuesOnlyCallback,
-)
-from sb3_torcs.callbacks.lines import LinePicturesCallback
+from sb3_torcs.callbacks.learning import LeanUpdatesCallback
 from sb3_torcs.callbacks.metrics import MONITOR_KWARGS, DrivingMetricsCallback
-from sb3_torcs.callbacks.progress import RacingProgressCallback
-from sb3_torcs.callbacks.reuse import ReuseRolloutsCallback
-from sb3_torcs.callbacks.switches import ConditionsCallback, RandomStartCallback, RewardCallback
+from sb3_torcs.callbacks.switches import RandomStartCallback, RewardCallback
 
 __all__ = [
     "MONITOR_KWARGS",
-    "AdaptiveLearningRateCallback",
-    "ConditionsCallback",
     "DrivingMetricsCallback",
-    "GradientStepsCallback",
     "LeanUpdatesCallback",
-    "LinePicturesCallback",
-    "MirrorCallback",
     "NoiseCallback",
     "NoiseDecayCallback",
-    "RacingProgressCallback",
     "RandomStartCallback",
     "RecordCallback",
-    "ReuseRolloutsCallback",
     "RewardCallback",
     "StochasticBrakeCallback",
-    "ValuesOnlyCallback",
 ]

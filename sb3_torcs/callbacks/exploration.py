@@ -9,7 +9,7 @@ from stable_baselines3.common.noise import VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_torcs.car import check_count, checked_choice, is_number
-from sb3_torcs.errors import InvalidOption, renamed
+from sb3_torcs.errors import InvalidOption
 from sb3_torcs.noise import (
     BLOG,
     ActuatorNoise,
@@ -38,6 +38,8 @@ KINDS: dict[str, type[ActuatorNoise]] = {"set_point": SetPointNoise, "ou": OUNoi
 class NoiseCallback(BaseCallback):
     """
     Give the model a noise of :mod:`sb3_torcs.noise`, one stream per parallel environment.
+
+    Use it with DDPG and TD3, which explore by noise alone.
 
     A model that was saved with such a noise continues with its generator, count and scale.
 
@@ -144,12 +146,13 @@ class NoiseDecayCallback(_NoiseUser):
     """
     Reduce the noise linearly. Its timesteps are counted across resumes.
 
+    Use it with :class:`NoiseCallback`, so that the agent drives more and more as it will race.
+
     :param timesteps: after which the floor is reached, of all environments together
     :param floor: share of the noise that remains
     :param verbose: as in ``BaseCallback``
     """
 
-    @renamed(frames="timesteps")
     def __init__(self, *, timesteps: int = 100_000, floor: float = 0.0, verbose: int = 0) -> None:
         super().__init__(verbose)
         check_count("timesteps", timesteps)
@@ -164,7 +167,7 @@ class NoiseDecayCallback(_NoiseUser):
         for noise in self.noises:
             noise.scale = scale
         self.logger.record("noise/scale", scale)
-        self.logger.record("noise/frames", self.noises[0].timesteps)
+        self.logger.record("noise/timesteps", self.noises[0].timesteps)
 
     def _on_step(self) -> bool:
         self._apply()
@@ -174,6 +177,8 @@ class NoiseDecayCallback(_NoiseUser):
 class StochasticBrakeCallback(_NoiseUser):
     """
     Give the brake other parameters in some of the timesteps, so that braking is explored at all.
+
+    Use it when an agent with separate pedals never learns to brake, as in the original post.
 
     :param probability: share of the timesteps
     :param mu: of the brake in these timesteps, in [0, 1]

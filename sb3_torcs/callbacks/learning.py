@@ -1,46 +1,23 @@
-"""Callbacks that change how a training learns: its updates, its learning rate, its samples."""
+"""The one callback that updates faster, and the base of those that change how a model learns."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable
-from functools import partial
 from typing import Any, cast
 
-import torch as th
 from stable_baselines3 import PPO, TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.type_aliases import ReplayBufferSamples
-from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_torcs.callbacks.progress import RacingProgressCallback
-from sb3_torcs.callbacks.tree import require_method
-from sb3_torcs.car import check_count, is_number
-from sb3_torcs.errors import InvalidOption, renamed
+from sb3_torcs.errors import InvalidOption
 from sb3_torcs.policies import ppo, updates
-from sb3_torcs.policies.mirror import check_angles, mirror_image
-from sb3_torcs.policies.mirrored_replay import sample_mirrored
 from sb3_torcs.policies.ppo import LeanForward, LeanPPO
 from sb3_torcs.policies.split_head import SplitHeadPolicy
 from sb3_torcs.policies.updates import LeanUpdates
 
-__all__ = [
-    "AdaptiveLearningRateCallback",
-    "GradientStepsCallback",
-    "LeanUpdatesCallback",
-    "MirrorCallback",
-    "ValuesOnlyCallback",
-    "WhileLearning",
-    "end_changes",
-    "learn_values",
-]
+__all__ = ["LeanUpdatesCallback", "WhileLearning", "end_changes"]
 
-RATE_STEP = 1.5  # [-] by which the learning rate changes after an update
-LEAST_RATE, MOST_RATE = 0.01, 4.0  # [-] of the model's own
 REPLACED = ("train", "_excluded_save_params")  # methods of a model, between rollout and update
 
 
@@ -143,58 +120,17 @@ class WhileLearning(BaseCallback):
         self._undo()
 
 
-class GradientStepsCallback(WhileLearning):
-    """
-    Take more gradient steps at the beginning of a training, when there are few timesteps.
-
-    A resumed training with its replay buffer counts as past its beginning. Models that callbacks
-    save keep their own ``gradient_steps``.
-
-    :param gradient_steps: replace the model's own at the beginning
-    :param timesteps: length of the beginning, of all environments together
-    :param verbose: as in ``BaseCallback``
-    """
-
-    @renamed(frames="timesteps")
-    def __init__(self, *, gradient_steps: int, timesteps: int, verbose: int = 0) -> None:
-        super().__init__(verbose)
-        check_count("gradient_steps", gradient_steps)
-        check_count("timesteps", timesteps)
-        self.gradient_steps = gradient_steps
-        self.timesteps = timesteps
-
-    def _on_training_start(self) -> None:
-        if not isinstance(self.model, OffPolicyAlgorithm):
-            raise InvalidOption(
-                f"{type(self).__name__} sets the gradient steps of off-policy algorithms, but the "
-                f"model learns by {type(self.model).__name__}; take it out of the callbacks"
-            )
-        end_changes(self.model)  # of a training that an error has ended
-        self._algorithm, self._own = self.model, self.model.gradient_steps
-
-    def _on_rollout_end(self) -> None:
-        super()._on_rollout_end()
-        # At once: the algorithm reads it before it calls `train`.
-        buffer = self._algorithm.replay_buffer
-        remembered = 0 if buffer is None else buffer.size() * buffer.n_envs
-        if max(self.num_timesteps, remembered) <= self.timesteps:
-            self._algorithm.gradient_steps = self.gradient_steps
-
-    def _change(self) -> None:
-        """Do nothing: the steps were changed at the end of the rollout."""
-
-    def _undo(self) -> None:
-        self._algorithm.gradient_steps = self._own
-
-
 class LeanUpdatesCallback(WhileLearning):
     """
     Update DDPG or TD3 with a ``SplitHeadPolicy``, or PPO, without PyTorch's record of operations.
 
-    The updates are equal but for rounding, and take about half of the time. PPO decides in this
-    way, too. If the policy is on a GPU, or has a part that the passes do not know (an optimizer, an
-    activation, a features extractor, a hook), then the algorithm's own methods go on. This is
-    checked before each rollout and each update, so other callbacks may change the model.
+    Use it in every training on the CPU by one of these algorithms: it takes about half of the time.
+
+    The updates are equal but for rounding. PPO decides in this way, too. While it is active, the
+    parameters of DDPG and TD3 are views of a few vectors. If the policy is on a GPU, or has a part
+    that the passes do not know (an optimizer, an activation, a features extractor, a hook), then
+    the algorithm's own methods go on. This is checked before each rollout and each update, so other
+    callbacks may change the model.
 
     :param verbose: as in ``BaseCallback``
     """
@@ -248,200 +184,3 @@ class LeanUpdatesCallback(WhileLearning):
     def _undo(self) -> None:
         if isinstance(vars(self.model.policy).get("forward"), LeanForward):
             del vars(self.model.policy)["forward"]
-
-
-class AdaptiveLearningRateCallback(WhileLearning):
-    """
-    Scale PPO's learning rate so that each update changes the policy about equally much.
-
-    As exploration fades, the same step changes what a Gaussian policy does more and more. So the
-    rate falls by a factor of 1.5 after an update whose divergence from the policy before is more
-    than twice the target, and rises by it after one with less than half of the target (Schulman et
-    al., 2017, section 4, adapt a penalty in the same way). The model's own schedule goes on below;
-    models that callbacks save keep it, and the factor, too, as ``learning_rate_factor``: a resumed
-    training goes on with it.
-
-    With a target that stays, a policy never settles: what it drives well changes from update to
-    update. A target that falls lets it come to rest.
-
-    :param kl: target of the divergence per update [nats]
-    :param last_kl: the same at the end of the training, to which it falls linearly [nats]; ``None``
-        is ``kl``
-    :param first_factor: on the model's learning rate at the beginning, 0.01 to 4. With one below 1
-        the first updates take little of what a good policy knows
-    :param verbose: as in ``BaseCallback``
-    :raises InvalidOption: if a target is not above 0, the factor is out of its range, or the model
-        is not PPO
-    """
-
-    def __init__(
-        self,
-        *,
-        kl: float = 0.01,
-        last_kl: float | None = None,
-        first_factor: float = 1.0,
-        verbose: int = 0,
-    ) -> None:
-        super().__init__(verbose)
-        last_kl = kl if last_kl is None else last_kl
-        for name, target in (("kl", kl), ("last_kl", last_kl)):
-            if not is_number(target) or target <= 0.0:
-                raise InvalidOption(f"{name} is {target!r}; pass a divergence above 0, e.g. 0.01")
-        if not is_number(first_factor) or not LEAST_RATE <= first_factor <= MOST_RATE:
-            raise InvalidOption(
-                f"first_factor is {first_factor!r}; expected {LEAST_RATE:g} to {MOST_RATE:g}"
-            )
-        self.kl, self.last_kl, self.first_factor = kl, last_kl, first_factor
-
-    @property
-    def factor(self) -> float:
-        """By which the model's own learning rate is multiplied."""
-        return float(vars(self.model).get("learning_rate_factor", self.first_factor))
-
-    def _on_training_start(self) -> None:
-        if not isinstance(self.model, PPO):
-            raise InvalidOption(
-                f"{type(self).__name__} reads the divergence that PPO logs, but the model learns "
-                f"by {type(self.model).__name__}; take it out of the callbacks"
-            )
-        self._own = self.model.lr_schedule
-
-    def _set_factor(self, factor: float) -> None:
-        self.model.learning_rate_factor = factor  # type: ignore[attr-defined]  # so that it is saved
-
-    def _on_rollout_start(self) -> None:
-        super()._on_rollout_start()
-        remaining = self.model._current_progress_remaining
-        target = self.last_kl + remaining * (self.kl - self.last_kl)
-        kl = self.logger.name_to_value.get("train/approx_kl")
-        if kl is not None and kl > 2.0 * target:
-            self._set_factor(max(self.factor / RATE_STEP, LEAST_RATE))
-        elif kl is not None and kl < 0.5 * target:
-            self._set_factor(min(self.factor * RATE_STEP, MOST_RATE))
-
-    def _change(self) -> None:
-        self.model.lr_schedule = self._scaled
-
-    def _scaled(self, progress_remaining: float) -> float:
-        return self.factor * self._own(progress_remaining)
-
-    def _undo(self) -> None:
-        self.model.lr_schedule = self._own
-
-
-class ValuesOnlyCallback(BaseCallback):
-    """
-    Put the policy of PPO or A2C back after each update, so that only its value function learns.
-
-    A student, and most shipped agents, drive, but come without a value function, and a new one may
-    spoil them. So let the value function learn first, in a training of its own, as
-    :func:`learn_values` does; in a second training, without this callback, both learn.
-
-    :param verbose: as in ``BaseCallback``
-    :raises InvalidOption: if the algorithm is another
-    """
-
-    def __init__(self, *, verbose: int = 0) -> None:
-        super().__init__(verbose)
-
-    def _on_training_start(self) -> None:
-        policy = self.model.policy
-        if not isinstance(policy, ActorCriticPolicy):
-            raise InvalidOption(
-                f"{type(self).__name__} is for PPO and A2C, but the model learns by "
-                f"{type(self.model).__name__}; take it out of the callbacks"
-            )
-        parts = policy.mlp_extractor.value_net, policy.value_net
-        values = {id(own) for part in parts for own in part.parameters()}
-        state = *policy.parameters(), *policy.buffers()  # a buffer counts what an average has seen
-        others = [own for own in state if id(own) not in values]
-        self._policy = [(own, own.detach().clone()) for own in others]
-
-    def _on_rollout_start(self) -> None:
-        with th.no_grad():
-            for own, before in self._policy:
-                own.copy_(before)
-
-    def _on_training_end(self) -> None:
-        self._on_rollout_start()
-
-    def _on_step(self) -> bool:
-        return True
-
-
-def learn_values(model: PPO, timesteps: int) -> None:
-    """
-    Let the value function of a model learn, and leave its policy as it is; show the progress.
-
-    The next training begins with a fresh optimizer, and with the learning rate that it asks for.
-
-    :param model: with a policy that drives already
-    :param timesteps: to learn from
-    """
-    model.learn(
-        timesteps,
-        callback=[
-            ValuesOnlyCallback(),
-            RacingProgressCallback(),
-            LeanUpdatesCallback(),
-            AdaptiveLearningRateCallback(kl=0.03),
-        ],
-    )
-    # Both come of updates of the policy, too, which were taken back.
-    vars(model).pop("learning_rate_factor", None)
-    model.policy.optimizer.state.clear()
-
-
-class MirrorCallback(WhileLearning):
-    """
-    Mirror half of each batch from left to right, so that its bends go the other way.
-
-    The replay buffer holds the transitions as they were driven, and saved files are those of SB3.
-
-    :param verbose: as in ``BaseCallback``
-    """
-
-    def __init__(self, *, verbose: int = 0) -> None:
-        super().__init__(verbose)
-
-    def _on_training_start(self) -> None:
-        buffer = getattr(self.model, "replay_buffer", None)
-        if not isinstance(buffer, ReplayBuffer):
-            raise InvalidOption(
-                f"{type(self).__name__} mirrors samples of a replay buffer, but "
-                f"{type(self.model).__name__} has none; take it out of the callbacks"
-            )
-        normalizer = self.model.get_vec_normalize_env()
-        if normalizer is not None and normalizer.norm_obs:
-            raise InvalidOption(
-                f"{type(self).__name__} needs observations whose middle is 0, which VecNormalize "
-                "moves; take 'normalize' away: the observations are scaled already"
-            )
-        require_method(self.training_env, "range_finder_angles")
-        for angles in self.training_env.get_attr("range_finder_angles"):
-            check_angles(angles, type(self).__name__)
-        try:
-            mirror_image(buffer.observation_space)
-        except InvalidOption as error:
-            raise InvalidOption(f"{type(self).__name__}: {error}") from error
-        self._buffer = buffer
-
-    def _change(self) -> None:
-        self._buffer.sample = _MirroredSample(self._buffer)  # type: ignore[method-assign]
-
-    def _undo(self) -> None:
-        vars(self._buffer).pop("sample", None)
-
-
-class _MirroredSample:
-    """Replaces the ``sample`` of a replay buffer."""
-
-    def __init__(self, buffer: ReplayBuffer) -> None:
-        self._buffer = buffer
-
-    def __call__(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
-        return sample_mirrored(self._buffer, batch_size, env)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        # After Ctrl-C the buffer may be saved while it is replaced: pickle its own method.
-        return partial, (type(self._buffer).sample, self._buffer)

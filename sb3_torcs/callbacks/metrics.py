@@ -24,7 +24,7 @@ from sb3_torcs.actions import ACTIONS, BRAKE_THRESHOLD, PEDALS, ActionLayout, la
 from sb3_torcs.callbacks.driven_line import DrivenLine, drive_lap, line_image
 from sb3_torcs.callbacks.tree import callbacks_in
 from sb3_torcs.car import check_count
-from sb3_torcs.errors import InvalidOption, renamed
+from sb3_torcs.errors import InvalidOption
 from sb3_torcs.rewards import CRASHES
 from sb3_torcs.vec_env import glance
 
@@ -165,6 +165,8 @@ class DrivingMetricsCallback(BaseCallback):
     """
     Log how the car drives, for any algorithm, number of environments and kind of ``VecEnv``.
 
+    Use it in every training that you look at in TensorBoard.
+
     ========================================  ==============================================  ======
     ``driving/…``                             what                                            unit
     ========================================  ==============================================  ======
@@ -195,7 +197,6 @@ class DrivingMetricsCallback(BaseCallback):
     :param verbose: as in ``BaseCallback``
     """
 
-    @renamed(line_decisions="line_timesteps")
     def __init__(
         self,
         *,

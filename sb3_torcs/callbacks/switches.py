@@ -1,8 +1,9 @@
-"""Callbacks that change the training environments: the reward, starts, conditions."""
+"""Callbacks that change the training environments: the reward, and how episodes begin."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -13,6 +14,7 @@ from sb3_torcs.callbacks.tree import callbacks_in, require_method
 from sb3_torcs.car import (
     StartName,
     check_count,
+    checked_choice,
     checked_delay,
     checked_factor,
     checked_hard_starts,
@@ -21,7 +23,9 @@ from sb3_torcs.car import (
 )
 from sb3_torcs.rewards import Reward, RewardChoice
 
-__all__ = ["ConditionsCallback", "RandomStartCallback", "RewardCallback"]
+__all__ = ["RandomStartCallback", "RewardCallback"]
+
+CONDITIONS = ("delay", "grip", "mass")
 
 _originals: WeakKeyDictionary[VecEnv, dict[str, list[Any]]] = WeakKeyDictionary()
 """What environments had before any switch, by setter. All callbacks share it: one that looked for
@@ -47,6 +51,9 @@ class _SwitchUser(BaseCallback):
 class RewardCallback(_SwitchUser):
     """
     Use another reward in the training environments, from the beginning or from a later timestep on.
+
+    Use it when an agent shall learn to drive first and to take care later, or to compare rewards
+    without another environment.
 
     :param reward: name of a reward, or a mapping of terms to weights
     :param also_eval: also use it in the environments of an ``EvalCallback``, changing its score
@@ -90,7 +97,10 @@ class RewardCallback(_SwitchUser):
 
 class RandomStartCallback(_SwitchUser):
     """
-    Change the start of training episodes; evaluations keep theirs.
+    Change how training episodes begin; evaluations keep theirs.
+
+    Use it in every training, so that each corner is practised from the beginning, and not only
+    those that the car reaches from the grid.
 
     The first episode begins before any callback is called, so it keeps the environment's start.
 
@@ -99,6 +109,8 @@ class RandomStartCallback(_SwitchUser):
     :param hard: share of random starts that lie before places where episodes ended badly, at a
         speed that can be lost on the way there, 0 to 1; see
         :meth:`~sb3_torcs.envs.racing.RacingEnv.set_hard_starts`
+    :param conditions: ``delay``, ``grip`` and ``mass`` of episodes, each a value or a pair between
+        which each episode draws; e.g. ``{"grip": [0.9, 1.1]}``
     :param verbose: as in ``BaseCallback``
     """
 
@@ -108,9 +120,17 @@ class RandomStartCallback(_SwitchUser):
         start: StartName = "random",
         speed: float | None = None,
         hard: float = 0.0,
+        conditions: Mapping[str, Any] = MappingProxyType({}),
         verbose: int = 0,
     ) -> None:
         super().__init__(verbose)
+        for name, choice in conditions.items():
+            # checked here, for a message of this process and not of a worker
+            if checked_choice("conditions", name, CONDITIONS) == "delay":
+                checked_delay(choice)
+            else:
+                checked_factor(name, choice)
+        self.conditions = dict(conditions)
         self.hard = checked_hard_starts(hard)
         self.start = checked_start(start)
         self.speed = None if speed is None else checked_start_speed(speed)
@@ -122,43 +142,9 @@ class RandomStartCallback(_SwitchUser):
             settings.append(("set_random_speed", self.speed))
         if self.hard:
             settings.append(("set_hard_starts", self.hard))
+        if self.conditions:
+            settings.append(("set_conditions", self.conditions))
         self._switches = [_Switch(self.training_env, *setting) for setting in settings]
-
-
-class ConditionsCallback(_SwitchUser):
-    """
-    Change the conditions of training episodes; evaluations keep theirs.
-
-    An agent that learned with less grip than it will have keeps a margin. The first episode begins
-    before any callback is called, so it keeps the environment's conditions, as all episodes do with
-    what is left out here.
-
-    :param delay: control ticks until an action arrives, or a pair of them between which each
-        episode draws
-    :param grip: factor on the friction of all ground, or a pair
-    :param mass: factor on the mass of the car, or a pair
-    :param verbose: as in ``BaseCallback``
-    :raises InvalidOption: if a value is not allowed
-    """
-
-    def __init__(
-        self,
-        *,
-        delay: int | Sequence[int] | None = None,
-        grip: float | Sequence[float] | None = None,
-        mass: float | Sequence[float] | None = None,
-        verbose: int = 0,
-    ) -> None:
-        super().__init__(verbose)
-        choices = {"delay": delay, "grip": grip, "mass": mass}
-        self.conditions = {name: made for name, made in choices.items() if made is not None}
-        for name, choice in self.conditions.items():
-            # checked here, for a message of this process and not of a worker
-            checked_delay(choice) if name == "delay" else checked_factor(name, choice)
-
-    def _on_training_start(self) -> None:
-        super()._on_training_start()
-        self._switches = [_Switch(self.training_env, "set_conditions", self.conditions)]
 
 
 class _Switch:

@@ -1,31 +1,15 @@
-"""Which callbacks there are, what they keep, and what environments can do for them."""
+"""Which callbacks there are, and what environments can do for them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Any, Protocol, runtime_checkable
+from collections.abc import Iterator
 
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_torcs.errors import InvalidOption
 
-__all__ = ["KeepsArrays", "callbacks_in", "require_method"]
-
-
-@runtime_checkable
-class KeepsArrays(Protocol):
-    """A callback with a state of its own, which a checkpoint of a study holds."""
-
-    def arrays(self) -> Mapping[str, Any]:
-        """Return the state after a rollout, as NumPy arrays by name."""
-
-    def restore(self, arrays: Mapping[str, Any]) -> None:
-        """
-        Take the state over, before the training goes on.
-
-        :param arrays: that ``arrays`` returned
-        """
+__all__ = ["callbacks_in", "require_method"]
 
 
 def callbacks_in(callback: BaseCallback | None) -> Iterator[BaseCallback]:

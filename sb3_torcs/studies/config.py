@@ -28,7 +28,6 @@ from sb3_torcs.errors import (
     StudyError,
     ZooConfigError,
     near_miss,
-    with_new_names,
 )
 from sb3_torcs.evaluation.protocol import GAME
 from sb3_torcs.files import listed, read_yaml
@@ -345,14 +344,4 @@ def _merged_callbacks(callbacks: Any, changes: Mapping[str, Any]) -> list[Any]:
 
 def _paths_and_arguments(item: Any) -> list[tuple[Any, Any]]:
     """Read an item of a list of callbacks; a wrong one is refused with the whole entry."""
-    pairs = item.items() if isinstance(item, Mapping) else [(item, {})]
-    return [(path, _with_new_names(path, arguments)) for path, arguments in pairs]
-
-
-def _with_new_names(path: str, arguments: Any) -> Any:
-    """Let the older name of a callback's argument change what an entry says by the new one."""
-    from sb3_torcs import callbacks
-
-    ours = getattr(callbacks, str(path).removeprefix("sb3_torcs.callbacks."), None)
-    names = getattr(getattr(ours, "__init__", None), "older_names", {})
-    return with_new_names(arguments, names) if isinstance(arguments, Mapping) else arguments
+    return list(item.items()) if isinstance(item, Mapping) else [(item, {})]

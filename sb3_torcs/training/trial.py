@@ -12,7 +12,7 @@ from __future__ import annotations
 import io
 import json
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -29,7 +29,7 @@ from sb3_torcs.agents.saved.writing import RecordCallback, recipe
 from sb3_torcs.agents.wrapping import frames_of
 from sb3_torcs.callbacks.driven_line import LineRecorder
 from sb3_torcs.callbacks.metrics import LineListener
-from sb3_torcs.callbacks.tree import KeepsArrays, callbacks_in
+from sb3_torcs.callbacks.tree import callbacks_in
 from sb3_torcs.errors import StudyError
 from sb3_torcs.evaluation.ladder import rung
 from sb3_torcs.evaluation.protocol import Episode, Merit, evaluate, merit, race_environment
@@ -277,8 +277,6 @@ class Training:
         if getattr(self.model, "replay_buffer", None) is not None:
             arrays: dict[str, Any] = dict(_buffer_arrays(self.model.replay_buffer))
             np.savez(folder / REPLAY, **arrays)
-        for name, callback in self._keepers():
-            np.savez(folder / name, **callback.arrays())
         if self.normalizer is not None:
             self.normalizer.save(str(folder / LAST_STATISTICS))
         if self.best_model is not None:
@@ -307,21 +305,12 @@ class Training:
         if (folder / REPLAY).is_file():
             with np.load(folder / REPLAY) as arrays:
                 _refill(self.model.replay_buffer, arrays)
-        for name, callback in self._keepers():
-            with np.load(folder / name) as arrays:
-                callback.restore(arrays)
         state = json.loads((folder / STATE).read_text(encoding="utf-8"))
         self.rows, self._slices, self._ended = state["rows"], state["slices"], state["episodes"]
         self._best, self._spent = Merit(*state["best"]), np.array(state["spent"])
         for car, mishaps in enumerate(state["mishaps"]):
             env.env_method("set_mishaps", mishaps, indices=car)
         self.best_model = (folder / BEST_MODEL).read_bytes()
-
-    def _keepers(self) -> Iterator[tuple[str, KeepsArrays]]:
-        """Find the callbacks that keep arrays, and name their files in a checkpoint."""
-        every = chain.from_iterable(map(callbacks_in, self.callbacks))
-        for number, callback in enumerate(own for own in every if isinstance(own, KeepsArrays)):
-            yield f"callback-{number}.npz", callback
 
     def _drive(self, track: str) -> list[Episode]:
         if track not in self._races:

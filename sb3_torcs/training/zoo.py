@@ -416,7 +416,6 @@ def _arguments(function: Callable[..., Any]) -> set[str] | None:
         parameters = inspect.signature(own).parameters.values()
         kinds = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
         names.update(p.name for p in parameters if p.kind in kinds)
-        names.update(getattr(own, "older_names", ()))
         if not any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters):
             return names
     return None

@@ -77,8 +77,8 @@ class RecordCallback(BaseCallback):
     """
     Writes the record into the model, so that ``sb3-torcs`` drives it as in its training.
 
-    ``sb3-torcs train`` and ``study`` use it. In your own script, pass it to ``learn``, before the
-    callbacks that save the model.
+    Use it in your own script: pass it to ``learn``, before the callbacks that save the model.
+    ``sb3-torcs train`` and ``study`` use it themselves.
 
     :param asked: options of the training, of :func:`recipe`; ``None`` reads them from the
         environment, which keeps the arguments of ``gym.make`` and Gymnasium's wrappers
