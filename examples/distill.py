@@ -17,9 +17,8 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import nn
 
-from sb3_torcs.agents.models import driver_record, find_model
-from sb3_torcs.agents.saved.algorithm import told_algorithm
-from sb3_torcs.agents.saved.file import learned_weights, saved_data
+from sb3_torcs.agents.models import driver_record, find_model, training_record
+from sb3_torcs.agents.saved.file import learned_weights
 from sb3_torcs.agents.saved.record import DRIVEN_WITH
 from sb3_torcs.agents.saved.writing import recipe, write_record
 from sb3_torcs.agents.wrapping import frames_of
@@ -120,7 +119,7 @@ def _same_for_all(teachers: Sequence[str]) -> dict:
 def _policy(name: str) -> ActorCriticPolicy:
     """Load the policy of a teacher."""
     file = find_model(name)
-    if told_algorithm(saved_data(file)) != "ppo":
+    if training_record(file).algo != "ppo":
         raise SystemExit(f"{name} is no model of PPO; give one, e.g. ppo-any-road")
     if driver_record(name).env_kwargs.get("action") != "pedal":
         raise SystemExit(f'{name} does not drive with action="pedal"; give one, e.g. ppo-any-road')

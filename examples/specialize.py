@@ -14,9 +14,8 @@ import torch as th
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_torcs.agents.models import driver_record, find_model
-from sb3_torcs.agents.saved.algorithm import told_algorithm
-from sb3_torcs.agents.saved.file import learned_weights, saved_data
+from sb3_torcs.agents.models import driver_record, find_model, training_record
+from sb3_torcs.agents.saved.file import learned_weights
 from sb3_torcs.agents.saved.writing import RecordCallback, recipe
 from sb3_torcs.agents.wrapping import frames_of
 from sb3_torcs.callbacks import LeanUpdatesCallback, RewardCallback
@@ -114,7 +113,7 @@ def make_model(
 def go_on(args: argparse.Namespace, tracks: list[str], settings: Settings) -> Path:
     """Go on learning, and return the model's file."""
     file = find_model(args.driver)
-    if told_algorithm(saved_data(file)) != "ppo":
+    if training_record(file).algo != "ppo":
         raise SystemExit(f"{args.driver} is no model of PPO; give one, e.g. ppo-any-road")
     trained = driver_record(args.driver).env_kwargs
     if trained.get("action") != "pedal":

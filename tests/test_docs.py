@@ -419,7 +419,7 @@ def test_commands_in_the_text_parse(parsed):
 
 def check_mentioned(parsed, line):
     match shlex.split(line):
-        case ["sb3-torcs", "evaluate" | "compare" | "watch" | "compete" | "study" | "report"
+        case ["sb3-torcs", "evaluate" | "compare" | "watch" | "compete" | "study"
               | "optimize-lap" | "race"]:  # fmt: skip
             pass  # the verb alone, which needs to be told what to do it with
         case ["sb3-torcs", *words]:

@@ -154,7 +154,7 @@ NEEDS = [
     (["robots", "inferno", "--telemetry", "a.parquet"], "pyarrow"),
     (["race", "scripted", "inferno"], "openskill"),
     (["watch", "scripted", "--video", "a.mp4"], "imageio_ffmpeg"),
-    (["report", "."], "plotly"),
+    (["study", "--report", "."], "plotly"),
     (["study", "a.yml"], "ray"),
     (["-c", "import sb3_torcs; sb3_torcs.parallel_env"], "pettingzoo"),
 ]
@@ -253,7 +253,7 @@ def test_an_extra_may_be_missing_but_not_be_of_another_version(monkeypatch):
     requiring(
         monkeypatch, {"plotly": "5.1", "rl_zoo3": "2.9"},
         'plotly>=6; extra == "reports"', 'rl_zoo3>=2.7; extra == "zoo"',
-        'sb3-contrib>=2.7; extra == "zoo"', 'sb3-torcs[reports,zoo]; extra == "study"',
+        'sb3-contrib>=2.7; extra == "zoo"', 'sb3-torcs[reports]; extra == "study"',
         'rl_zoo3>=2.7; extra == "study"',
     )  # fmt: skip
     checks = {check.name: check for check in requirements.check_extras()}
@@ -261,7 +261,7 @@ def test_an_extra_may_be_missing_but_not_be_of_another_version(monkeypatch):
     assert checks["extra reports"].fix == 'pip install "sb3-torcs[reports]"'
     assert checks["extra zoo"].ok
     assert checks["extra zoo"].found.startswith(
-        'no sb3-contrib; type: pip install "sb3-torcs[zoo]"; only for `train`'
+        'no sb3-contrib; type: pip install "sb3-torcs[zoo]"; only for the RL Zoo'
     )
     assert checks["extra study"] == requirements.Check("extra study", True, "rl_zoo3 2.9", None)
 

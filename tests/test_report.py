@@ -79,7 +79,7 @@ def test_every_seed_is_in_the_report_failures_too(study, tmp_path):
 
 
 def test_the_same_results_give_the_same_report_to_the_byte(study, tmp_path, capsys):
-    assert main(["report", str(study), "--output", str(tmp_path / "one")]) == 0
+    assert main(["study", "--report", str(study), "--output", str(tmp_path / "one")]) == 0
     assert capsys.readouterr().out == f"{tmp_path}/one/report.md\n{tmp_path}/one/report.html\n"
     np.random.default_rng().random()
     write_report(study, tmp_path / "two")
@@ -167,7 +167,9 @@ def test_a_name_is_no_table(tmp_path):
     ],
 )  # fmt: skip
 def test_rows_that_say_nothing_are_told(tmp_path, capsys, change):
-    assert main(["report", str(written(tmp_path / "study", [{**row(0), **change}]))]) == 2
+    assert (
+        main(["study", "--report", str(written(tmp_path / "study", [{**row(0), **change}]))]) == 2
+    )
     assert "results.csv cannot be read as results (ValueError" in capsys.readouterr().err
 
 
@@ -175,17 +177,17 @@ def test_rows_that_say_nothing_are_told(tmp_path, capsys, change):
 def test_a_table_that_is_damaged_is_told(tmp_path, capsys, text):
     heading = ",".join(FIELDS)
     (tmp_path / "results.csv").write_bytes(text.format(heading).encode("latin-1"))
-    assert main(["report", str(tmp_path)]) == 2
+    assert main(["study", "--report", str(tmp_path)]) == 2
     assert "results.csv cannot be read as results (" in capsys.readouterr().err
 
 
 def test_what_is_no_study_is_told(tmp_path, capsys):
-    assert main(["report", str(tmp_path)]) == 2
+    assert main(["study", "--report", str(tmp_path)]) == 2
     assert "holds no results.csv; give the folder of a study" in capsys.readouterr().err
     (tmp_path / "folder" / "results.csv").mkdir(parents=True)
-    assert main(["report", str(tmp_path / "folder")]) == 2
+    assert main(["study", "--report", str(tmp_path / "folder")]) == 2
     assert "cannot be read as results (IsADirectoryError" in capsys.readouterr().err
-    assert main(["report", str(written(tmp_path / "empty", []))]) == 2
+    assert main(["study", "--report", str(written(tmp_path / "empty", []))]) == 2
     assert "no agent was evaluated yet" in capsys.readouterr().err
 
 
@@ -195,7 +197,7 @@ def test_a_report_that_cannot_be_written_is_told(study, tmp_path, capsys, taken)
         (tmp_path / "out").touch()
     else:
         (tmp_path / taken).mkdir(parents=True)
-    assert main(["report", str(study), "--output", str(tmp_path / "out")]) == 2
+    assert main(["study", "--report", str(study), "--output", str(tmp_path / "out")]) == 2
     assert f"cannot write '{tmp_path}/out/" in capsys.readouterr().err
 
 

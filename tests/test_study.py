@@ -293,15 +293,10 @@ def test_what_was_lost_of_a_folder_is_told(begun, capsys):
     assert "small-nets-seed0' has lost its checkpoint-*; remove" in capsys.readouterr().err
 
 
-def test_a_damaged_checkpoint_is_told_once(begun):
-    """As a row: at an error of a worker Tune would try again."""
+def test_a_damaged_checkpoint_is_reported(begun):
     study, store = begun
-    reports = []
-    study_module._run_or_tell(study.trials[0], store, reports.append)
-    (report,) = reports
-    assert report["phase"] == "failed"
-    assert "its checkpoint cannot be read (" in report["error"]
-    assert "remove the folder small-nets-seed0 of the study" in report["error"]
+    with pytest.raises(StudyError, match=r"checkpoint cannot be read .*; remove its folder"):
+        run_trial(study.trials[0], store, lambda row: None)
 
 
 @pytest.mark.parametrize(

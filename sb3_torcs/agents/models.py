@@ -13,9 +13,8 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from sb3_torcs.actions import ACTIONS, action_layout
 from sb3_torcs.agents.ghosts import GhostDriver, check_fits, is_ghost, read_ghost
-from sb3_torcs.agents.saved.algorithm import algorithm_of, check_same, is_sbx, told_algorithm
+from sb3_torcs.agents.saved.algorithm import algorithm_class, check_same
 from sb3_torcs.agents.saved.driver import ModelDriver
 from sb3_torcs.agents.saved.file import (
     as_mismatch,
@@ -24,7 +23,7 @@ from sb3_torcs.agents.saved.file import (
     saved_data,
     saved_weights,
 )
-from sb3_torcs.agents.saved.policy import Spaces, build_policy, readable_policy, readable_space
+from sb3_torcs.agents.saved.policy import Spaces, build_policy
 from sb3_torcs.agents.saved.record import (
     BEST_MODEL,
     DRIVEN_WITH,
@@ -43,7 +42,6 @@ from sb3_torcs.errors import (
     near_miss,
 )
 from sb3_torcs.files import readable
-from sb3_torcs.sensors import view_of
 from sb3_torcs.torcs.installation import INSTALL, find_game
 
 if TYPE_CHECKING:
@@ -235,15 +233,12 @@ def saved_spaces(model: Path, *, trust: bool = False) -> Spaces:
     known = _record(model, data).spaces
     if known is not None:
         return known
-    wanted = {name: data[name] for name in ("observation_space", "action_space")}
-    seen, does = (readable_space(item) for item in wanted.values())
-    if seen is not None and does is not None:
-        return seen, does
     if not trust:
-        raise ModelNotTrusted(UNTRUSTED.format(model=model, why="its spaces are pickled"))
+        raise ModelNotTrusted(UNTRUSTED.format(model=model, why="it has no record of its training"))
     from stable_baselines3.common.save_util import json_to_data
 
     with as_mismatch(f"'{model}' does not tell what it sees and does", "give"):
+        wanted = {name: data[name] for name in ("observation_space", "action_space")}
         loaded = json_to_data(json.dumps(wanted))
         return loaded["observation_space"], loaded["action_space"]
 
@@ -267,34 +262,10 @@ def check_spaces(
         record = training_record(model)
         hint = f" (it was trained on {record.env_id})" if record.env_id else ""
         name = env.spec.id if env.spec else "Torcs-v0"  # cars of one race have no spec
-        frames_seen = _frames_seen(has, needs) if what == "observations" else None
-        option = _option_of(has)
-        if record.known and frames_seen is not None and frames is None:
-            advice = (
-                f"it sees {frames_seen} observations at once, which its record does not tell; "
-                "train it with VecFrameStack around VecNormalize, not within it, and with "
-                "RecordCallback"
-            )
-        elif record.known and name in ("Torcs-v0", "TorcsLite-v0"):  # one contract
+        advice = f"train a model for this one: sb3-torcs train --env {name}"
+        if record.known:
             said = ", ".join(f"{key}={value!r}" for key, value in _task(record).items())
-            advice = f"it learned with {said}; give it the same"
-        elif record.known or (frames_seen is None and option is None):
-            advice = (
-                "give the --env that it was trained on, or train a model for this one: sb3-torcs "
-                f"train --env {name}"
-            )
-        elif frames_seen is not None:
-            advice = (
-                f"if it sees {frames_seen} observations at once, write "
-                f"'frame_stack: {frames_seen}' into '{model.parent / 'config.yml'}', as the zoo "
-                "does"
-            )
-        else:
-            advice = (
-                f"an environment that is made with {option} has them: sb3-torcs evaluate takes "
-                f"--env-kwargs {option}, and RecordCallback writes it into the models of a script, "
-                "for all commands"
-            )
+            advice = f"it learned with {said}; give it the same, or {advice}"
         raise ModelMismatch(
             f"'{model}'{hint} has {what} {_layout(has)}, but {name} has {_layout(needs)}; {advice}"
         )
@@ -307,28 +278,6 @@ def _task(record: TrainingRecord) -> dict[str, Any]:
     kept = record.kept(DRIVEN_WITH)
     usual = {"sensors": ["base"], "action": "pedals"}  # what else may have been given here
     return {**kept, **{key: value for key, value in usual.items() if key not in kept}, **found}
-
-
-def _option_of(space: spaces.Space[Any]) -> str | None:
-    """Find the argument of an environment that gives it such observations or actions."""
-    if not isinstance(space, spaces.Box) or len(space.shape) != 1:
-        return None
-    for action in ACTIONS:
-        layout = action_layout(action)
-        if np.array_equal((space.low, space.high), np.array((layout.low, layout.high), np.float32)):
-            return f"action={action!r}"
-    view = view_of(space)
-    return None if view is None else f"sensors={list(view.sensors)}".replace(" ", "")
-
-
-def _frames_seen(has: spaces.Space[Any], needs: spaces.Space[Any]) -> int | None:
-    """Say how many observations of one space come to the other, if they do."""
-    if not (isinstance(has, spaces.Box) and isinstance(needs, spaces.Box)):
-        return None
-    if len(has.shape) != 1 or len(needs.shape) != 1:
-        return None
-    frames, rest = divmod(has.shape[0], needs.shape[0])
-    return frames if rest == 0 and frames > 1 and stacked_space(needs, frames) == has else None
 
 
 def _layout(space: spaces.Space[Any]) -> str:
@@ -367,24 +316,22 @@ def load_driver(
     if reason is not None:
         raise ModelMismatch(f"'{file}' cannot be driven as it was trained: {reason}")
     frames = frames_of(record.hyperparameters)
-    if is_sbx(data) and not trust:
-        raise ModelNotTrusted(UNTRUSTED.format(model=file, why="SBX pickles its weights"))
     seen = saved_spaces(file, trust=trust)
     check_spaces(file, seen, env, frames)
-    model = _as_sb3_does(file, algo or record.algo) if trust else _policy(file, record, algo, seen)
+    if algo is not None:
+        check_same(file, record.algo, algo)
+    model = _as_sb3_does(file, algo or record.algo) if trust else _policy(file, record, seen)
     return ModelDriver(model, _statistics(file, record, trust), frames)
 
 
-def _policy(file: Path, record: TrainingRecord, algo: str | None, seen: Spaces) -> Any:
-    """Build a policy from plain data, with its weights."""
-    data = saved_data(file)
-    if algo is not None:
-        algorithm_of(algo, data, file)
-        check_same(file, record.algo or told_algorithm(data), algo)
+def _policy(file: Path, record: TrainingRecord, seen: Spaces) -> Any:
+    """Build the policy that a record describes, with its weights."""
+    if record.policy is None:
+        raise ModelNotTrusted(UNTRUSTED.format(model=file, why="it has no record of its training"))
     weights = saved_weights(file)
     with as_mismatch(f"'{file}' does not load", "give"):
         try:
-            policy = build_policy(record.policy or readable_policy(data), seen)
+            policy = build_policy(record.policy, seen)
         except ModelNotTrusted as error:
             raise ModelNotTrusted(UNTRUSTED.format(model=file, why=error)) from None
         policy.load_state_dict(weights)
@@ -393,12 +340,14 @@ def _policy(file: Path, record: TrainingRecord, algo: str | None, seen: Spaces) 
 
 def _as_sb3_does(file: Path, algo: str | None) -> Any:
     """Load a model with everything that is pickled in it."""
-    name, algorithm = algorithm_of(algo, saved_data(file), file)
+    if algo is None:
+        raise ModelMismatch(f"'{file}' does not say its algorithm; give it, e.g. --algo ddpg")
+    algorithm = algorithm_class(algo)
     # On the CPU, which is always available, and the fastest for single timesteps. A driver does not
     # need the schedules, which may be from another version, nor a replay buffer, about whose class
     # SB3 would warn after a training with returns over several timesteps.
     kwargs = {"device": "cpu", "buffer_size": 1, "replay_buffer_class": None}
-    with as_mismatch(f"'{file}' does not load as {name}", "give an --algo that fits, or"):
+    with as_mismatch(f"'{file}' does not load as {algo}", "give an --algo that fits, or"):
         model = algorithm.load(io.BytesIO(file.read_bytes()), **kwargs)
         check_finite(file, model.policy.state_dict())
         return model

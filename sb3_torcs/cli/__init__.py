@@ -22,7 +22,6 @@ from sb3_torcs.cli import (
     install_torcs,
     optimize_lap,
     race,
-    report,
     robots,
     serve,
     study,
@@ -41,7 +40,7 @@ __all__ = ["main"]
 USAGE_ERROR = 2
 PROCESS_NAME = "sb3-racing"
 VERBS = (
-    doctor, install_torcs, tracks, train, evaluate, compare, watch, optimize_lap, study, report,
+    doctor, install_torcs, tracks, train, evaluate, compare, watch, optimize_lap, study,
     robots, race, serve, compete, bench,
 )  # fmt: skip
 

@@ -22,7 +22,7 @@ USERS = {
     "sbx": "algorithms of SBX",
     "study": "`study`",
     "video": "videos",
-    "zoo": "`train`, `bench` and models of sb3-contrib",
+    "zoo": "the RL Zoo's own scripts and models of sb3-contrib",
 }
 """What each extra is for."""
 

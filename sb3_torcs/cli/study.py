@@ -43,7 +43,15 @@ def add_parser(subparsers: Any) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
-    add("file", metavar="FILE.yml", help="e.g. examples/studies/smoke.yml")
+    what = parser.add_mutually_exclusive_group(required=True).add_argument
+    what("file", nargs="?", metavar="FILE.yml", help="e.g. examples/studies/smoke.yml")
+    what(
+        "--report",
+        metavar="FOLDER",
+        help="instead of running a study, write its learning curves and tables, with every seed: "
+        "report.html, a page that works offline, and report.md with pictures. It may still run",
+    )
+    add("--output", metavar="DIR", help="folder of the report; default: that of the study")
     add("--folder", metavar="DIR", help="folder of the results; default: logs/studies/NAME")
     where = parser.add_mutually_exclusive_group().add_argument
     where("--jobs", type=positive, metavar="N", help="agents at a time; default: one per core")
@@ -61,6 +69,8 @@ def run(args: argparse.Namespace) -> int:
     :param args: from the command line
     :return: the exit status
     """
+    if args.report is not None:
+        return _report(Path(args.report).expanduser(), args.output)
     from sb3_torcs.studies.config import read_study
     from sb3_torcs.studies.runner import require_ray, run_study
     from sb3_torcs.studies.storage import StudyFolder
@@ -69,7 +79,6 @@ def run(args: argparse.Namespace) -> int:
     study = read_study(args.file)
     folder = writable_folder(args.folder or Path("logs") / "studies" / study.name)
     board = Board(study)
-    # Ray Tune handles Ctrl-C itself while it runs.
     interrupted = contextlib.suppress(KeyboardInterrupt)
     signals: list[int] = []
     with interrupted, quiet_output(args.json), board.shown():
@@ -94,11 +103,22 @@ def run(args: argparse.Namespace) -> int:
         print(f"{ended} of {len(study.trials)} agents trained and measured")
         if store.results.is_file():
             print(f"results: {store.results}")
+        report = shlex.join(["sb3-torcs", "study", "--report", str(folder)])
         print("go on with:" if left else "see them:")
-        print(f"  {_command(args) if left else shlex.join(['sb3-torcs', 'report', str(folder)])}")
+        print(f"  {_command(args) if left else report}")
     if len(left) > len(failed):
         return EXIT_STATUS + signals[0] if signals else INTERRUPTED
     return int(bool(failed))
+
+
+def _report(folder: Path, output: str | None) -> int:
+    """Write the report of a study."""
+    from sb3_torcs.studies.report import write_report
+
+    report = write_report(folder, Path(output).expanduser() if output else folder)
+    print(report)
+    print(report.with_suffix(".html"))
+    return 0
 
 
 def _command(args: argparse.Namespace) -> str:

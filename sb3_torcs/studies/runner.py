@@ -1,4 +1,4 @@
-"""Studies: every variant with every seed, as trials of Ray Tune on the local cores or a cluster.
+"""Studies: every variant with every seed, as tasks of Ray on the local cores or a cluster.
 
 Each trial stores its state in the study's folder, which is a Ray actor on the machine that runs the
 command. A trial that is begun again, because its worker was lost or the study was killed, continues
@@ -16,6 +16,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -38,38 +39,31 @@ from sb3_torcs.studies.storage import Files, StudyFolder
 
 __all__ = ["Progress", "require_ray", "run_study", "run_trial"]
 
-RETRIES = 3  # retries of a trial whose worker was lost or whose code failed, per run of the command
+RETRIES = 3  # of a trial whose worker was lost or whose code failed, per run of the command
+LOOK = 0.2  # [s] between two looks at how far the trials are
 SESSION = ".session"  # where a killed run's temporary files are
 SCRATCH = "st-"  # prefix of folders for temporary files; short, since paths of sockets are limited
 MARK = ".of-a-study"  # a file that names the folder for temporary files
 PATIENCE = 30.0  # [s] until a folder for temporary files counts as one that cannot be removed
-REPLACED = [
-    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGUSR1") if hasattr(signal, name)
-]
-"""Signals whose handlers Ray replaces; Windows has no SIGUSR1."""
 GRACE = 20.0  # [s] that Ray has to end after SIGTERM
 STARTS = 10  # attempts: Ray gives its own processes 15 s, too little on a busy machine
 PRIVATE = "sb3_torcs_study"  # a resource that marks a Ray that was started by a study
-FAILED = "failed"  # the phase of a row with an error instead of a race
+
+LASTING = (InvalidOption, OutputNotWritable, StudyError, TrackFileError, TrackNotFound)
+"""Errors that would come again: a trial that meets one is not tried once more."""
 
 Progress = Callable[[Trial, dict[str, Any]], None]
 """Called with a trial and the last of its rows, or with ``{"state": …}``."""
 
-QUIET = {
-    "RAY_AIR_NEW_OUTPUT": "0",
-    "RAY_USAGE_STATS_ENABLED": "0",
-    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
-    "RAY_CHDIR_TO_TRIAL_DIR": "0",
+SETTINGS = {
+    "RAY_USAGE_STATS_ENABLED": "0",  # it shall phone nobody
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # else it warns
+    "RAY_gcs_server_port_wait_time_s": "120",
     "RAY_worker_register_timeout_seconds": "600",
-    "TUNE_DISABLE_AUTO_CALLBACK_LOGGERS": "1",
-    "TUNE_WARN_THRESHOLD_S": "1000000",
 }
-"""Ray shall phone nobody, write no logs of its own, and leave the working folder alone.
-Its workers may take long to start."""
-
 
 IMPATIENT = {"RAY_NUM_REDIS_GET_RETRIES": "1"}
-"""A cluster that does not answer is told within a minute; Ray would try for eight."""
+"""A cluster that does not answer is reported within a minute; Ray would try for eight."""
 
 
 def run_trial(trial: Trial, store: Any, report: Callable[[dict[str, Any]], None]) -> None:
@@ -166,10 +160,10 @@ def run_study(
             if trial not in left:
                 tell(trial, {"state": "done"})
         if left:
-            # Ray and Tune replace these handlers and never put them back.
-            kept = handlers_kept(*REPLACED)
+            # Ray replaces this handler and never puts it back.
+            kept = handlers_kept(signal.SIGTERM)
             with kept, _ray(store, jobs, address, signals) as scratch:
-                _tune(left, store, scratch, tell)
+                _train_all(left, store, scratch, tell)
     return store.results
 
 
@@ -195,14 +189,14 @@ def require_ray(address: str | None = None) -> None:
             f"'{address}' is for clients outside of a cluster; type the command on one of its "
             "machines, with --address auto"
         )
-    settings = QUIET if address is None else {**QUIET, **IMPATIENT}
+    settings = SETTINGS if address is None else {**SETTINGS, **IMPATIENT}
     for name, value in settings.items():
         os.environ.setdefault(name, value)
     try:
-        import ray.tune  # noqa: F401
+        import ray  # noqa: F401
     except ImportError as error:
         raise RayUnavailable(
-            f"a study needs Ray Tune, which does not import ({error}); type: {install_line('ray')}"
+            f"a study needs Ray, which does not import ({error}); type: {install_line('ray')}"
         ) from error
 
 
@@ -224,10 +218,13 @@ def _ray(
     enough.daemon = True
 
     def end(number: int, frame: FrameType | None) -> None:
+        """End as at Ctrl-C. Ray cannot if its own processes have had the signal, too."""
         del frame
         if signals is not None:
             signals.append(number)
-        _end(enough)
+        with contextlib.suppress(RuntimeError):  # a second signal
+            enough.start()
+        raise KeyboardInterrupt
 
     options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
     if address is None:
@@ -245,7 +242,7 @@ def _ray(
                 with_patience(lambda: ray.init(**options))
             else:
                 ray.init(**options)
-        except Exception as error:  # what it waited for in vain is of no other class
+        except Exception as error:  # Ray raises bare ones, too
             raise RayUnavailable(
                 f"Ray does not start in '{scratch}' ({error}); is there room, is the path short, "
                 "and is the machine not too busy? Otherwise choose another folder: TMPDIR=/tmp"
@@ -258,7 +255,6 @@ def _ray(
                 f"the Ray at '{address}' belongs to another study, and ends with it; leave "
                 "--address out, or start a cluster with `ray start --head`"
             )
-        # Tune handles Ctrl-C; Ray would treat SIGTERM as a crash.
         with answered(end, signal.SIGTERM):
             yield scratch
     finally:
@@ -270,29 +266,21 @@ def _ray(
 
 def with_patience(start: Callable[[], Any]) -> Any:
     """
-    Start Ray, again if its own processes were not there in time.
+    Start Ray, again if its own processes were not there in the time that it gives them.
 
     :param start: starts it
     :return: what that returns
     """
+    import ray
+
     for _ in range(STARTS - 1):
         try:
             return start()
-        except Exception as error:
-            if "timed out" not in str(error).lower():
-                raise
+        except (OSError, ValueError):  # for which time is no remedy
+            raise
+        except Exception:
+            ray.shutdown()
     return start()
-
-
-def _end(enough: threading.Timer) -> None:
-    """
-    End as at Ctrl-C. Ray cannot if its own processes have had the signal, too, as by `timeout`.
-
-    :param enough: what ends this process by force
-    """
-    with contextlib.suppress(RuntimeError):  # a second signal
-        enough.start()
-    signal.raise_signal(signal.SIGINT)
 
 
 def _end_by_force(scratch: Path, session: Path) -> None:
@@ -323,80 +311,71 @@ def _remove_folder(folder: Path) -> None:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _tune(trials: list[Trial], store: StudyFolder, scratch: Path, progress: Progress) -> None:
-    """Let Ray Tune run the trials."""
+class _Folder(StudyFolder):
+    """The folder of a study as an actor, which collects what workers report."""
+
+    def __init__(self, path: Path, study: Study) -> None:
+        super().__init__(path, study)
+        self._reports: list[tuple[Trial, dict[str, Any]]] = []
+
+    def report(self, trial: Trial, row: dict[str, Any]) -> None:
+        """Take the newest row of a trial, or its state."""
+        self._reports.append((trial, row))
+
+    def reports(self) -> list[tuple[Trial, dict[str, Any]]]:
+        """Return what was reported since the last call."""
+        taken, self._reports = self._reports, []
+        return taken
+
+
+def _train_all(trials: list[Trial], store: StudyFolder, scratch: Path, progress: Progress) -> None:
+    """Let Ray train and measure the trials."""
     import ray
-    from ray import tune
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
     here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=False)
-    folder = ray.remote(StudyFolder).options(num_cpus=0, scheduling_strategy=here)
-    actor = folder.remote(store.path, store.study)
-
-    def trainable(config: dict[str, Any]) -> None:
-        if scratch.is_dir():  # on this machine: what a killed worker leaves is removed with it
-            tempfile.tempdir = str(scratch)
-        with cores.at_most(1):  # on the others train other trials
-            _run_or_tell(trials[config["trial"]], _Remote(actor), tune.report)
-
-    here_only = _HereOnly(progress)
-
-    class Watch(tune.Callback):
-        """Passes the reports of Ray Tune to the progress function."""
-
-        def on_trial_start(self, **heard: Any) -> None:
-            here_only.call(trials[heard["trial"].config["trial"]], {"state": "running"})
-
-        def on_trial_result(self, **heard: Any) -> None:
-            trial, row = trials[heard["trial"].config["trial"]], heard["result"]
-            here_only.call(trial, row)
-            if row["phase"] == "final":
-                here_only.call(trial, {"state": "done"})
-            elif row["phase"] == FAILED:
-                here_only.call(trial, {"state": "failed"})
-
-    results = tune.Tuner(
-        tune.with_resources(trainable, {"cpu": 1}),
-        param_space={"trial": tune.grid_search(list(range(len(trials))))},
-        run_config=tune.RunConfig(
-            name="trials",
-            storage_path=str(scratch),
-            verbose=0,
-            callbacks=[Watch()],
-            failure_config=tune.FailureConfig(max_failures=RETRIES),
-        ),
-    ).fit()
-    # A trial that was still waiting at Ctrl-C has no config.
-    found = [results[number] for number in range(len(results))]
-    errors = {result.config["trial"]: _error(result) for result in found if result.config}
-    for number, trial in enumerate(trials):
-        if store.ended(trial):
-            progress(trial, {"state": "done"})
-        elif errors.get(number) is None:
-            progress(trial, {"state": "stopped"})
-        else:
-            progress(trial, {"state": "failed", "error": errors[number]})
-
-
-def _run_or_tell(trial: Trial, store: Any, report: Callable[[dict[str, Any]], None]) -> None:
-    """Run a trial. An error that would recur is reported as a row, so that Tune does not retry."""
+    kind = ray.remote(_Folder).options(num_cpus=0, scheduling_strategy=here)
+    actor = kind.remote(store.path, store.study)
+    task = ray.remote(_train).options(num_cpus=1, max_retries=RETRIES, retry_exceptions=True)
+    running = {task.remote(trial, actor, scratch): trial for trial in trials}
     try:
-        run_trial(trial, store, report)
-    except (InvalidOption, OutputNotWritable, StudyError, TrackFileError, TrackNotFound) as error:
-        report({"phase": FAILED, "error": _last_line(error)})
+        while running:
+            ended, _ = ray.wait(list(running), timeout=LOOK)
+            for trial, row in ray.get(actor.reports.remote()):
+                progress(trial, row)
+            for result in ended:
+                error = _error(result)
+                state = {"state": "done"} if error is None else {"state": "failed", "error": error}
+                progress(running.pop(result), state)
+    finally:  # Ctrl-C
+        for trial in running.values():
+            progress(trial, {"state": "done" if store.ended(trial) else "stopped"})
 
 
-def _nobody(trial: Trial, row: dict[str, Any]) -> None:
-    """Watch nothing."""
-    del trial, row
+def _train(trial: Trial, actor: Any, scratch: Path) -> str | None:
+    """Train and measure one agent on a worker; return an error that would come again."""
+    if scratch.is_dir():  # on this machine: what a killed worker leaves is removed with it
+        tempfile.tempdir = str(scratch)
+    store = _Remote(actor)
+    report = partial(store.report, trial)
+    report({"state": "running"})
+    try:
+        with cores.at_most(1):  # on the others train other trials
+            run_trial(trial, store, report)
+    except LASTING as error:
+        return _last_line(error)
+    return None
 
 
 def _error(result: Any) -> str | None:
     """Return why a trial failed: its own message, or the last line of a worker's traceback."""
-    if result.error is not None:
-        return _last_line(result.error)
-    said: str | None = (result.metrics or {}).get("error")
-    return said
+    import ray
+
+    try:
+        found: str | None = ray.get(result)
+        return found
+    except ray.exceptions.RayError as error:
+        return _last_line(error)
 
 
 def _last_line(error: Exception) -> str:
@@ -404,14 +383,9 @@ def _last_line(error: Exception) -> str:
     return str(error).strip().splitlines()[-1]
 
 
-class _HereOnly:
-    """A callback for this process only: Ray Tune pickles it as one that does nothing."""
-
-    def __init__(self, call: Callable[..., None] | None = None) -> None:
-        self.call: Any = call
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return (_HereOnly, ())
+def _nobody(trial: Trial, row: dict[str, Any]) -> None:
+    """Watch nothing."""
+    del trial, row
 
 
 class _Remote:

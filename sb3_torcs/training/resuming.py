@@ -12,8 +12,8 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_torcs.agents.models import check_spaces, saved_spaces, saved_timesteps, training_record
-from sb3_torcs.agents.saved.algorithm import check_same, told_algorithm
-from sb3_torcs.agents.saved.file import as_mismatch, saved_data
+from sb3_torcs.agents.saved.algorithm import check_same
+from sb3_torcs.agents.saved.file import as_mismatch
 from sb3_torcs.agents.wrapping import frames_of, normalizes
 from sb3_torcs.car import range_finder_angles
 from sb3_torcs.errors import ModelMismatch, ModelNotTrusted
@@ -98,7 +98,6 @@ def check_resumable(
     """
     from stable_baselines3.common.save_util import load_from_pkl
 
-    data = saved_data(model)
     record = training_record(model)
     if record.driver_only:
         raise ModelMismatch(
@@ -116,8 +115,7 @@ def check_resumable(
             f"'{model}' has learned by {record.subclass}, and would go on by plain {record.algo}; "
             "go on in your own script"
         )
-    known = record.algo is not None
-    check_same(model, record.algo or told_algorithm(data), algo, to_learn=known)
+    check_same(model, record.algo, algo, to_learn=True)
     frames = frames_of(entry)
     before, after = (_lasting(each) for each in (record.hyperparameters, entry))
     for what, was in before.items():

@@ -154,7 +154,7 @@ class Training:
         except Exception as error:  # a broken file can raise anything
             self.close()
             raise StudyError(
-                f"the checkpoint cannot be read ({type(error).__name__}: {error}); remove its "
+                f"its checkpoint cannot be read ({type(error).__name__}: {error}); remove its "
                 "folder to start this agent again"
             ) from error
 

@@ -6,7 +6,6 @@ import importlib
 from pathlib import Path
 from typing import Any
 
-from sb3_torcs.agents.saved.file import referenced_class
 from sb3_torcs.errors import (
     InvalidOption,
     ModelMismatch,
@@ -20,11 +19,8 @@ __all__ = [
     "ALGORITHMS",
     "SBX",
     "algorithm_class",
-    "algorithm_of",
     "check_same",
-    "is_sbx",
     "known_parent",
-    "told_algorithm",
     "zoo_name",
 ]
 
@@ -43,18 +39,6 @@ ALGORITHMS = {
 LIBRARIES = ("stable_baselines3", "sb3_contrib", "sbx")
 
 SAVED_AS = {"ddpg": "td3"}  # models of the two cannot be told apart
-
-# Attributes that only one family of algorithms saves; the first one found names it. DDPG saves the
-# same as TD3, and each of the two classes can drive the other's models.
-TELLING_KEYS = (
-    ("top_quantiles_to_drop_per_net", "tqc"),
-    ("line_search_shrinking_factor", "trpo"),
-    ("clip_range", "ppo"),
-    ("exploration_fraction", "dqn"),
-    ("target_entropy", "sac"),
-    ("target_policy_noise", "td3"),
-    ("vf_coef", "a2c"),
-)
 
 
 def algorithm_class(name: str) -> Any:
@@ -114,56 +98,6 @@ def _sbx_algorithms(name: str) -> dict[str, Any]:
             f"{install_line('sbx')}"
         ) from error
     return {SBX + word.lower(): own for word, own in vars(sbx).items() if word[0].isupper()}
-
-
-def told_algorithm(data: dict[str, Any]) -> str | None:
-    """
-    Infer the algorithm of a model from its saved attributes.
-
-    :param data: of :func:`~sb3_torcs.agents.saved.file.saved_data`
-    :return: the zoo's name of it; ``None`` if it cannot be inferred
-    """
-    if is_sbx(data):
-        return SBX + referenced_class(data.get("policy_class")).split(".")[1]  # sbx.tqc.policies
-    if "recurrent" in str(data.get("policy_class")).lower():
-        return "ppo_lstm"
-    family = referenced_class(data.get("policy_class")).split(".")[1:2]  # as in sb3_contrib.ars
-    if family and family[0] in ALGORITHMS:
-        return family[0]
-    return next((algo for key, algo in TELLING_KEYS if key in data), None)
-
-
-def algorithm_of(name: str | None, data: dict[str, Any], model: Path) -> tuple[str, Any]:
-    """
-    Find the algorithm of a saved model.
-
-    :param name: the zoo's name of it; ``None`` infers it
-    :param data: of :func:`~sb3_torcs.agents.saved.file.saved_data`
-    :param model: the file, for messages
-    :return: its name and its class
-    :raises ModelMismatch: if it cannot be inferred
-    :raises InvalidOption: if there is no such algorithm
-    :raises PackageMissing: if it is one of SBX, and that is not installed
-    """
-    name = name or told_algorithm(data)
-    if name is None:
-        raise ModelMismatch(f"'{model}' does not say its algorithm; give it, e.g. --algo ddpg")
-    if is_sbx(data) and not name.startswith(SBX):
-        name = SBX + name
-    try:
-        return name, algorithm_class(name)
-    except PackageMissing as error:
-        raise PackageMissing(f"'{model}' is a model of SBX: {error}") from error
-
-
-def is_sbx(data: dict[str, Any]) -> bool:
-    """
-    Check whether a model is of SBX, which has SB3's algorithms in JAX.
-
-    :param data: of :func:`~sb3_torcs.agents.saved.file.saved_data`
-    :return: whether it is
-    """
-    return referenced_class(data.get("policy_class")).startswith("sbx.")
 
 
 def check_same(model: Path, saved: str | None, algo: str, *, to_learn: bool = False) -> None:

@@ -6,7 +6,6 @@ its JSON and its weights, and limits the RAM that they take.
 
 from __future__ import annotations
 
-import base64
 import io
 import json
 import os
@@ -30,7 +29,6 @@ __all__ = [
     "as_mismatch",
     "check_finite",
     "learned_weights",
-    "referenced_class",
     "saved_as",
     "saved_data",
     "saved_weights",
@@ -168,25 +166,6 @@ def check_finite(model: Path, weights: dict[str, th.Tensor]) -> None:
                 f"the weights '{name}' of '{model}' are not finite: its training has diverged; "
                 "give a model that was saved before, e.g. best_model.zip of the same run"
             )
-
-
-def referenced_class(item: Any) -> str:
-    """
-    Read the class that a pickle refers to, without unpickling it.
-
-    :param item: of :func:`saved_data`
-    :return: its dotted path; empty if the pickle is more than a name
-    """
-    try:
-        found = list(pickletools.genops(base64.b64decode(item[":serialized:"])))
-    except BROKEN:
-        return ""
-    plain = [(op.name, argument) for op, argument, _ in found if op.name not in ("FRAME", "PROTO")]
-    if [name for name, _ in plain if name != "MEMOIZE"] != [
-        "SHORT_BINUNICODE", "SHORT_BINUNICODE", "STACK_GLOBAL", "STOP",
-    ]:  # fmt: skip
-        return ""
-    return ".".join(str(argument) for name, argument in plain if name == "SHORT_BINUNICODE")
 
 
 def _part(archive: zipfile.ZipFile, name: str, limit: int) -> bytes:

@@ -5,14 +5,12 @@ from __future__ import annotations
 import importlib
 import inspect
 import math
-import re
 from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
-from sb3_torcs.agents.saved.file import referenced_class
 from sb3_torcs.errors import ModelNotTrusted, needs_extra
 
 __all__ = [
@@ -21,8 +19,6 @@ __all__ = [
     "plain",
     "plain_policy",
     "plain_space",
-    "readable_policy",
-    "readable_space",
     "restored_space",
 ]
 
@@ -136,51 +132,11 @@ def restored_space(said: Any) -> spaces.Space[Any] | None:
     return spaces.Box(low.reshape(shape).copy(), high.reshape(shape).copy(), shape, dtype.type)
 
 
-def readable_space(item: Any) -> spaces.Space[Any] | None:
-    """
-    Build a space from the text that SB3 writes beside its pickle for human readers.
-
-    :param item: of :func:`~sb3_torcs.agents.saved.file.saved_data`
-    :return: the space; ``None`` if the text is incomplete
-    """
-    try:
-        kind = re.fullmatch(r"<class 'gymnasium\.spaces\.\w+\.(\w+)'>", str(item.get(":type:")))
-        if kind is None or "..." in f"{item.get('low')}{item.get('high')}":
-            return None
-        said = {"kind": kind[1], "shape": item.get("_shape"), **item}
-        for name in ("low", "high"):
-            said[name] = [float(word) for word in re.findall(r"[^\s\[\]]+", item.get(name, ""))]
-        return restored_space(said)
-    except (AttributeError, KeyError, TypeError, ValueError):
-        return None
-
-
-def readable_policy(data: Mapping[str, Any]) -> dict[str, Any]:
-    """
-    Describe the policy of a model that has no record of ours.
-
-    :param data: of :func:`~sb3_torcs.agents.saved.file.saved_data`
-    :return: as of :func:`plain_policy`
-    """
-    name = referenced_class(data.get("policy_class"))
-    said = data.get("policy_kwargs")
-    if not name or not isinstance(said, dict):
-        return {"unreadable": "the class of its policy is pickled"}
-    kwargs: dict[str, Any] = {}
-    for key, item in said.items():
-        if key not in (":type:", ":serialized:", *FOR_LEARNING):
-            found = re.fullmatch(r"<class '([\w.]+)'>", item) if isinstance(item, str) else None
-            kwargs[key] = {"class": found[1]} if found else item
-    if data.get("use_sde"):
-        kwargs["use_sde"] = True
-    return {"class": name, "kwargs": kwargs}
-
-
 def build_policy(said: Mapping[str, Any], seen: Spaces) -> Any:
     """
     Build a policy from its description.
 
-    :param said: by :func:`plain_policy` or :func:`readable_policy`
+    :param said: by :func:`plain_policy`
     :param seen: the observation space and the action space
     :return: the policy, without its weights; it cannot learn
     :raises ModelNotTrusted: if that takes more than plain data and known classes

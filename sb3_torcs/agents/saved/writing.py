@@ -30,19 +30,15 @@ from sb3_torcs.agents.saved.policy import (
     plain,
     plain_policy,
     plain_space,
-    readable_policy,
-    readable_space,
     restored_space,
 )
 from sb3_torcs.agents.saved.record import (
     RECORD,
     VERSION,
-    TrainingRecord,
-    record_beside,
     record_within,
 )
 from sb3_torcs.agents.wrapping import LEFT_OUT
-from sb3_torcs.errors import InvalidOption, ModelNotTrusted
+from sb3_torcs.errors import InvalidOption, ModelMismatch
 from sb3_torcs.files import whole_file
 from sb3_torcs.policies.inputs import columns_of
 from sb3_torcs.torcs.track_names import lasting_kwargs
@@ -139,7 +135,7 @@ def write_driver(model: str | Path, driver: str | Path, *, value_function: bool 
     :param value_function: whether to keep that of PPO, from which another training may go on.
         Without it, sensors that only the value function saw (``actor_sensors``) are left out, too
     :raises InvalidOption: if ``model`` is no path
-    :raises ModelMismatch: if the model cannot be read
+    :raises ModelMismatch: if the model cannot be read, or has no record of its training
     :raises OutputNotWritable: if the file cannot be written; the previous one is kept
     """
     if not isinstance(model, str | Path):
@@ -149,7 +145,12 @@ def write_driver(model: str | Path, driver: str | Path, *, value_function: bool 
         )
     model, driver = saved_as(model), Path(os.path.expanduser(driver))
     data, weights = saved_data(model), saved_weights(model)
-    data[RECORD] = {**_record_in(model, data), "driver_only": True}
+    if record_within(model, data) is None:
+        raise ModelMismatch(
+            f"'{model}' has no record of its training; pass sb3_torcs.callbacks.RecordCallback to "
+            "learn, and save it again"
+        )
+    data[RECORD]["driver_only"] = True
     if not value_function:
         _leave_out_sensors(data, weights)
     for name in SEEN_LAST:
@@ -158,18 +159,21 @@ def write_driver(model: str | Path, driver: str | Path, *, value_function: bool 
     for name, tensor in weights.items():
         if name.startswith(left_out) and tensor.is_floating_point():
             tensor.fill_(float("nan"))
+    _write_parts(
+        model, driver, {"data": json.dumps(data).encode(), "policy.pth": _torch_file(weights)}
+    )
+
+
+def _write_parts(model: Path, driver: Path, parts: Mapping[str, bytes]) -> None:
+    """Write the file of a model with other parts, and with empty optimizers."""
     with (
         whole_file(driver) as aside,
         zipfile.ZipFile(model) as source,
         zipfile.ZipFile(aside, "w") as target,
     ):
         for name in source.namelist():
-            content = source.read(name)
-            if name == "data":
-                content = json.dumps(data).encode()
-            elif name == "policy.pth":
-                content = _torch_file(weights)
-            elif name.endswith("optimizer.pth"):
+            content = parts[name] if name in parts else source.read(name)
+            if name.endswith("optimizer.pth"):
                 state = th.load(io.BytesIO(content), map_location="cpu", weights_only=True)
                 content = _torch_file({**state, "state": {}})
             # No date: the same model makes the same file.
@@ -203,26 +207,6 @@ def _torch_file(value: Any) -> bytes:
     file = io.BytesIO()
     th.save(value, file)
     return file.getvalue()
-
-
-def _record_in(model: Path, data: Mapping[str, Any]) -> Recipe:
-    """Take the record of a saved model, or compose it from the files beside it."""
-    if record_within(model, data) is not None:
-        written: Recipe = data[RECORD]
-        return written
-    record = record_beside(model) or TrainingRecord()
-    seen, does = (readable_space(data[name]) for name in ("observation_space", "action_space"))
-    if seen is None or does is None or record.statistics_file is not None:
-        raise ModelNotTrusted(f"'{model}' has pickled spaces or statistics; train it anew")
-    return {
-        "version": VERSION,
-        **recipe(record.algo, record.env_id, record.hyperparameters),
-        "observation_space": plain_space(seen),
-        "action_space": plain_space(does),
-        "policy": readable_policy(data),
-        "statistics": None,
-        "start_time": data.get("start_time"),
-    }
 
 
 def _recipe_of_environment(model: BaseAlgorithm) -> Recipe:
