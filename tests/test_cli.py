@@ -477,7 +477,8 @@ def test_a_robot_is_no_model(capsys):
 @pytest.mark.usefixtures("game")
 def test_who_does_not_say_where_it_was_trained_drives_in_the_game(capsys, plain):
     for name, track in (("scripted", "a-speedway"), (plain, "aalborg")):
-        world, said = driven(capsys, name, "--track", track)
+        trust = [] if name == "scripted" else ["--trust", "--algo", "ddpg"]
+        world, said = driven(capsys, name, "--track", track, *trust)
         assert world == "Torcs-v0"
         assert said.endswith(
             f"driving Torcs-v0: '{name}' does not say where it was trained, and the game is "
@@ -488,7 +489,7 @@ def test_who_does_not_say_where_it_was_trained_drives_in_the_game(capsys, plain)
 
 @pytest.mark.usefixtures("no_game")
 def test_without_the_game_it_drives_in_the_world_that_needs_none(capsys, plain):
-    world, said = driven(capsys, plain)
+    world, said = driven(capsys, plain, "--trust", "--algo", "ddpg")
     assert world == "TorcsLite-v0"
     assert "Torcs-v0 does not run here, `sb3-torcs doctor` says why" in said
 

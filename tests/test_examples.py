@@ -17,7 +17,7 @@ from stable_baselines3 import PPO
 
 from sb3_torcs.agents.models import AGENTS, driver_record, find_model
 from sb3_torcs.agents.saved.file import learned_weights, saved_weights
-from sb3_torcs.agents.saved.writing import RecordCallback
+from sb3_torcs.agents.saved.writing import RecordCallback, recipe, write_record
 from sb3_torcs.callbacks.lines import DrivenLap, driven_laps
 from sb3_torcs.envs.aids import AIDS
 from sb3_torcs.errors import OutputNotWritable
@@ -315,7 +315,9 @@ def test_who_cannot_teach_is_told_so(name, words, message, monkeypatch, tmp_path
 ])  # fmt: skip
 def test_who_drives_with_two_pedals_cannot_teach(name, words, monkeypatch, tmp_path, game):
     model = str(tmp_path / "model.zip")
-    PPO("MlpPolicy", gym.make("TorcsLite-v0"), device="cpu").save(model)
+    newborn = PPO("MlpPolicy", gym.make("TorcsLite-v0"), device="cpu")
+    write_record(newborn, recipe("ppo", "TorcsLite-v0", {}))
+    newborn.save(model)
     teach = ["--teach"] if name == "distill.py" else []
     with pytest.raises(
         SystemExit, match=f"{model} does not drive with action=.pedal.; give one, e.g"

@@ -78,7 +78,9 @@ def test_a_saved_recurrent_model_drives_as_before(recurrent, tmp_path):
     recurrent.save(tmp_path / "m.zip")
     with lite(max_episode_steps=60) as env:
         (expected,) = evaluate(env, recurrent)
-        assert evaluate(env, load_driver(tmp_path / "m.zip", env)) == [expected]
+        assert evaluate(env, load_driver(tmp_path / "m.zip", env, "ppo_lstm", trust=True)) == [
+            expected
+        ]
 
 
 def test_normalized_observations_leave_the_state_alone(recurrent):

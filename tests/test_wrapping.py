@@ -188,7 +188,7 @@ def test_a_model_that_would_see_something_else_is_refused(tmp_path, entry, says)
         (tmp_path / "config.yml").write_text(yaml.safe_dump(entry))
         (tmp_path / "args.yml").write_text(yaml.safe_dump({"algo": "ppo", "env": "TorcsLite-v0"}))
         with pytest.raises(ModelMismatch, match=says):
-            load_driver(tmp_path / "m.zip", env)
+            load_driver(tmp_path / "m.zip", env, trust=True)
 
 
 def test_what_normalizes_may_be_written_as_python():
@@ -206,4 +206,4 @@ def test_a_vector_wrapper_that_passes_on_is_no_obstacle(tmp_path, path):
         PPO("MlpPolicy", env, device="cpu").save(tmp_path / "m.zip")
         entry = {"vec_env_wrapper": path}
         (tmp_path / "config.yml").write_text(yaml.safe_dump(entry))
-        assert isinstance(load_driver(tmp_path / "m.zip", env), ModelDriver)
+        assert isinstance(load_driver(tmp_path / "m.zip", env, "ppo", trust=True), ModelDriver)
