@@ -83,7 +83,7 @@ class School:
                 track=tracks,
                 start="random",
                 max_episode_steps=300,
-                grip=[args.grip, 1.0],
+                conditions={"grip": [args.grip, 1.0]},
                 **self.env_kwargs,
             )
             part.env_method("set_random_speed", 80.0)

@@ -86,7 +86,7 @@ def make_cars(args: argparse.Namespace, env_kwargs: dict, settings: Settings) ->
     """Make cars that begin anywhere on the road, many of them where others left it before."""
     cars = TorcsVecEnv(
         settings.cars, threads=1, start="random", reward=reward(args, settings, settings.crash),
-        grip=settings.grip, max_episode_steps=settings.episode, **env_kwargs,
+        conditions={"grip": settings.grip}, max_episode_steps=settings.episode, **env_kwargs,
     )  # fmt: skip
     cars.env_method("set_random_speed", 80.0)
     cars.env_method("set_hard_starts", settings.hard)

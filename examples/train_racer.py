@@ -231,7 +231,7 @@ def cars_alone(
         reward=reward_alone(settings, args),
         start="random",
         max_episode_steps=settings.episode,
-        grip=settings.grip,
+        conditions={"grip": settings.grip},
         **env_kwargs,
     )
     cars.env_method("set_random_speed", settings.speed)
@@ -260,8 +260,7 @@ def cars_in_races(
         reward=reward_in_races(settings, races, args),
         opponents=races.fields,
         grid_place=races.places,
-        runoff=8.0,
-        recovery=20.0,
+        ends={"runoff": 8.0, "recovery": 20.0},
         max_episode_steps=races.limits,
         **env_kwargs,
     )
@@ -356,7 +355,7 @@ def main() -> None:
     known = args.ancestor or args.racer or args.driver
     env_kwargs = {
         "track": args.track if several else args.track[0], **how_to_drive(known),
-        **dict.fromkeys(races.aids, True),
+        "aids": races.aids,
     }  # fmt: skip
     weights = (
         learned_weights(find_model(known)) if known else learn_alone(args, env_kwargs, settings)

@@ -50,10 +50,9 @@ __all__ = [
     "checked_delay",
     "checked_factor",
     "checked_flag",
+    "checked_from_zero",
     "checked_hard_starts",
     "checked_laps",
-    "checked_recovery",
-    "checked_runoff",
     "checked_start",
     "checked_start_speed",
     "is_count",
@@ -86,12 +85,6 @@ CONTROL_TICK = 0.02
 
 MANY_LAPS = 1 << 30
 """[-] More laps than anyone drives, for a race without an end; the game can count to twice that."""
-
-LONGEST_RECOVERY = 60.0
-"""[s] Longer than any car needs that comes back at all."""
-
-WIDEST_RUNOFF = 100.0
-"""[m] Wider than any ground beside a road of the game."""
 
 MAX_DAMAGE = 10000.0
 """[points] At which TORCS takes a car out of the race; its drag has doubled by then."""
@@ -173,35 +166,19 @@ def checked_laps(laps: int | None) -> int | None:
     return int(laps)
 
 
-def _checked_from_zero(name: str, value: Any, high: float, allowed: str) -> float:
-    """Check a number from 0 to ``high``; the error says in words what is ``allowed``."""
+def checked_from_zero(name: str, value: Any, high: float, allowed: str) -> float:
+    """
+    Check a number that is 0 or greater.
+
+    :param name: of the option
+    :param value: what was given
+    :param high: the most that is allowed
+    :param allowed: the same in words, for the error
+    :raises InvalidOption: if it is no such number
+    """
     if not is_number(value) or not 0.0 <= value <= high:
         raise InvalidOption(f"{name} is {value!r}; expected {allowed}")
     return float(value)
-
-
-def checked_runoff(runoff: float) -> float:
-    """
-    Check how far a car may be beside the road before its episode ends.
-
-    :param runoff: [m]
-    :return: the same
-    :raises InvalidOption: if it is no such length
-    """
-    allowed = f"a number of metres from 0 to {WIDEST_RUNOFF:g}"
-    return _checked_from_zero("runoff", runoff, WIDEST_RUNOFF, allowed)
-
-
-def checked_recovery(recovery: float) -> float:
-    """
-    Check how long a car may be without headway before its episode ends.
-
-    :param recovery: [s]
-    :return: the same
-    :raises InvalidOption: if it is no such time
-    """
-    allowed = f"a number of seconds from 0 to {LONGEST_RECOVERY:g}"
-    return _checked_from_zero("recovery", recovery, LONGEST_RECOVERY, allowed)
 
 
 def checked_start(start: StartName) -> StartName:
@@ -224,7 +201,7 @@ def checked_start_speed(speed: float) -> float:
     :raises InvalidOption: if no car can start so
     """
     allowed = f"0 to {MAX_START_SPEED:g} m/s"
-    return _checked_from_zero("speed of random starts", speed, MAX_START_SPEED, allowed)
+    return checked_from_zero("speed of random starts", speed, MAX_START_SPEED, allowed)
 
 
 def checked_choice(name: str, choice: Name, choices: Collection[str]) -> Name:
@@ -266,7 +243,7 @@ def checked_hard_starts(share: float) -> float:
     :return: the same
     :raises InvalidOption: for anything else
     """
-    return _checked_from_zero("the share of hard starts", share, 1.0, "0 to 1")
+    return checked_from_zero("the share of hard starts", share, 1.0, "0 to 1")
 
 
 MAX_DELAY = 50  # control ticks: 1 s

@@ -7,11 +7,9 @@ from __future__ import annotations
 
 import contextlib
 import difflib
-import functools
 import importlib.util
-import inspect
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 __all__ = [
     "EXTRAS",
@@ -56,11 +54,9 @@ __all__ = [
     "check_extras",
     "ends_in_a_line",
     "install_line",
-    "keywords_of",
     "near_miss",
     "needs_extra",
     "unknown_argument",
-    "with_known_arguments",
 ]
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -319,43 +315,14 @@ def near_miss(name: object, known: Iterable[str], advice: str = "") -> str:
     return f"; {ending}" if ending else ""
 
 
-def with_known_arguments(init: Function) -> Function:
-    """
-    Decorate a constructor: the error for an unknown argument names the one that was probably meant.
-
-    :param init: that takes keyword arguments
-    """
-    known = keywords_of(init)
-    owner = init.__qualname__.partition(".")[0]  # also for a class that is made from it
-
-    @functools.wraps(init)
-    def checked(self: Any, *positional: Any, **arguments: Any) -> None:
-        for name in arguments:
-            if name not in known:
-                raise unknown_argument(owner, name, known)
-        init(self, *positional, **arguments)
-
-    return cast("Function", checked)
-
-
-def keywords_of(function: Callable[..., Any]) -> list[str]:
-    """
-    List the arguments that a function takes by name, but for those that it only passes on.
-
-    :param function: or a class, for its constructor
-    """
-    parameters = inspect.signature(function).parameters.values()
-    return [each.name for each in parameters if each.kind is not each.VAR_KEYWORD]
-
-
 def unknown_argument(owner: str, name: str, known: Iterable[str]) -> TypeError:
     """
-    Make the error for an argument that a class does not have.
+    Make the error for an argument that a function does not have: Python's own, and advice.
 
-    :param owner: name of the class
+    :param owner: name of the function
     :param name: of the argument
     :param known: the names that it has
     """
-    if name in ELSEWHERE:
-        return TypeError(f"{owner} has no argument {name!r}; {ELSEWHERE[name]}")
-    return TypeError(f"{owner} has no argument {name!r}{near_miss(name, known)}")
+    error = f"{owner}() got an unexpected keyword argument {name!r}"
+    advice = f"; {ELSEWHERE[name]}" if name in ELSEWHERE else near_miss(name, known)
+    return TypeError(error + advice)

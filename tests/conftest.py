@@ -106,7 +106,7 @@ class ScriptedBackend:
 
 def held_with(aid, oval, asked, **state):
     """What a car with a driver aid holds in the timestep after the one that ends with a state."""
-    env = RacingEnv(ScriptedBackend(oval, state, {}), recovery=10.0, **{aid: True})
+    env = RacingEnv(ScriptedBackend(oval, state, {}), ends={"recovery": 10.0}, aids=[aid])
     env.reset(seed=0)
     env.step(asked)
     env.step(asked)

@@ -43,8 +43,9 @@ def drives(track, driver=None):
 
     Not the rewards themselves: Python sums terms more precisely from 3.12 on.
     """
-    options = {"sensors": SEEN, "reward": "blog", "catch_slides": True, "unstick": True}
-    env = gym.make("sb3_torcs:TorcsLite-v0", track=track, start="random", runoff=50.0, **options)
+    options = {"sensors": SEEN, "reward": "blog", "aids": ["catch_slides", "unstick"]}
+    options["ends"] = {"runoff": 50.0}
+    env = gym.make("sb3_torcs:TorcsLite-v0", track=track, start="random", **options)
     told, rng = [], np.random.default_rng(7)
     for seed in range(4):
         seen, _ = env.reset(seed=seed)

@@ -75,6 +75,7 @@ class Loopback(_Thread):
         self.actions = []
         self.late = 0
         self.client = None
+        self.address = {"host": self.host, "port": self.port}  # as of ``Torcs-v0``
 
     def take(self, message, sender):
         if message.startswith(b"SCR"):

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import inspect
 import typing
 
 import numpy as np
 import pytest
 
 from sb3_torcs.car import RANGE_FINDERS, RangeFinderName
+from sb3_torcs.envs.options import CONDITIONS, ENDS, LITE, PICTURE, SCR, TORCS
 from sb3_torcs.envs.torcs import TorcsEnv
 from sb3_torcs.envs.torcs_lite import TorcsLiteEnv
 from sb3_torcs.errors import Sb3TorcsError
@@ -23,36 +25,45 @@ def names_in(hint):
 
 
 def choices():
-    for cls in (TorcsEnv, TorcsLiteEnv):
-        for argument, hint in typing.get_type_hints(cls.__init__).items():
-            if names_in(hint):
-                yield pytest.param(cls, argument, names_in(hint), id=f"{cls.__name__}-{argument}")
+    for cls, table in ((TorcsEnv, TORCS), (TorcsLiteEnv, LITE)):
+        for argument, option in table.items():
+            if argument != "picture" and names_in(option.hint):
+                names = names_in(option.hint)
+                yield pytest.param(cls, argument, names, id=f"{cls.__name__}-{argument}")
 
 
 def test_what_is_chosen_by_name_has_a_type():
-    chosen = {
-        "action",
-        "gearbox",
-        "picture",
-        "range_finders",
-        "render_mode",
-        "reward",
-        "sensors",
-        "start",
-    }
+    chosen = {"action", "aids", "gearbox", "range_finders", "render_mode", "reward", "sensors",
+              "start"}  # fmt: skip
     of_lite = {case.values[1] for case in choices() if case.values[0] is TorcsLiteEnv}
     of_the_game = {case.values[1] for case in choices() if case.values[0] is TorcsEnv}
     assert of_lite == chosen
-    assert of_the_game == chosen | {"backend", "view"}
+    assert of_the_game == chosen | {"backend"}
 
 
 @pytest.mark.parametrize(("cls", "argument", "names"), list(choices()))
 def test_another_name_is_refused_and_those_of_the_type_are_told(cls, argument, names):
-    more = {"picture": "game"} if argument == "view" else {}
+    wrong = ["nonsense"] if argument == "aids" else "nonsense"
     with pytest.raises(Sb3TorcsError) as told:
-        cls(**{argument: "nonsense"}, **more)
+        cls(**{argument: wrong})
     after = str(told.value).partition("nonsense")[2]
     assert [name for name in names if name not in after] == []
+
+
+@pytest.mark.parametrize("cls", [TorcsEnv, TorcsLiteEnv])
+def test_the_table_is_the_signature(cls):
+    """As editors, ``inspect`` and the documentation read it."""
+    table = {TorcsEnv: TORCS, TorcsLiteEnv: LITE}[cls]
+    parameters = inspect.signature(cls).parameters
+    assert {name: each.default for name, each in parameters.items()} == {
+        name: option.default for name, option in table.items()
+    }
+    assert all(option.text and f":param {name}: " in cls.__doc__ for name, option in table.items())
+
+
+@pytest.mark.parametrize("group", [ENDS, CONDITIONS, PICTURE, SCR])
+def test_the_keys_of_a_group_are_documented(group):
+    assert all(option.text for option in group.values())
 
 
 @pytest.mark.parametrize(

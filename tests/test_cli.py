@@ -359,14 +359,16 @@ def test_an_evaluation_takes_any_argument_of_the_environment(capsys):
     """Conditions such as a delay are not those of the training unless they are given."""
     words = ["evaluate", "scripted", *LITE, "--track", "g-track-1", "--laps", "1", "--json"]
     times = []
-    for more in ([], ["--env-kwargs", "delay=[3, 4]", "sensors=[base, preview]"]):
+    for more in ([], ["--env-kwargs", "conditions={delay: [3, 4]}", "sensors=[base, preview]"]):
         status, out, _ = run(capsys, *words, *more)
         assert status == 0
         times.append(json.loads(out)["episodes"][0]["lap_times"])
     assert times[0] != times[1]
-    status, _, err = run(capsys, *words, "--env-kwargs", "dely=3")
+    status, _, err = run(capsys, *words, "--env-kwargs", "conditons={delay: 3}")
     assert status == 2
-    assert "--env-kwargs: unknown env_kwargs: argument 'dely'; did you mean 'delay'?" in err
+    assert (
+        "--env-kwargs: unknown env_kwargs: argument 'conditons'; did you mean 'conditions'?" in err
+    )
 
 
 @pytest.mark.parametrize(("setting", "advice"), [
@@ -381,7 +383,7 @@ def test_an_evaluation_takes_any_argument_of_the_environment(capsys):
 ])  # fmt: skip
 def test_an_argument_that_has_an_option_is_given_by_it(capsys, setting, advice):
     """One of the two would be dropped without a word."""
-    words = ["evaluate", "scripted", *LITE, "--laps", "1", "--env-kwargs", "delay=2", setting]
+    words = ["evaluate", "scripted", *LITE, "--laps", "1", "--env-kwargs", "start=grid", setting]
     status, out, err = run(capsys, *words)
     assert (status, out, err.count("\n")) == (2, "", 1)
     assert f"--env-kwargs has {setting}" in err
@@ -724,7 +726,8 @@ def test_an_episode_is_driven_again_from_its_own_seed_and_start():
 
 def test_a_video_shows_the_drive_with_its_aids_and_delay(monkeypatch):
     """An aid steps in at the beginning of a timestep, and not between."""
-    kwargs = {"track": "g-track-1", "unstick": True, "recovery": 20.0, "runoff": 5.0, "delay": 3}
+    kwargs = {"track": "g-track-1", "aids": ["unstick"], "ends": {"recovery": 20.0, "runoff": 5.0}}
+    kwargs["conditions"] = {"delay": 3}
     recorder = recording.Recorder("TorcsLite-v0", kwargs, 100)
     recorder.reset(seed=0)
     for _ in range(60):

@@ -19,7 +19,6 @@ from sb3_torcs.agents.models import AGENTS, driver_record, find_model
 from sb3_torcs.agents.saved.file import learned_weights, saved_weights
 from sb3_torcs.agents.saved.writing import RecordCallback, recipe, write_record
 from sb3_torcs.callbacks.lines import DrivenLap, driven_laps
-from sb3_torcs.envs.aids import AIDS
 from sb3_torcs.errors import OutputNotWritable
 from sb3_torcs.evaluation.protocol import ChosenWorld
 from sb3_torcs.races.entrants import find_entrants
@@ -135,7 +134,7 @@ def test_a_racer_races_against_its_ancestor(ancestor, monkeypatch, tmp_path, gam
     budget = ["--ancestor", ancestor, "--values=1", "--robots=1", "--races=2"]
     run(monkeypatch, "train_racer.py", *budget, "--track", "g-track-1", "--folder", str(tmp_path))
     record = driver_record(tmp_path / "model.zip")
-    assert record.kept(AIDS) == {"unstick": True, "keep_clear": True, "catch_slides": True}
+    assert record.env_kwargs["aids"] == ["unstick", "keep_clear", "catch_slides"]
     bias = "action_net.linear.bias"
     before, after = (learned_weights(find_model(m))[bias] for m in (ancestor, tmp_path / "model"))
     np.testing.assert_allclose(after, before, atol=0.01)

@@ -12,7 +12,7 @@ from sb3_torcs.errors import GameFailed, SceneryMissing
 from sb3_torcs.torcs.display import VirtualDisplay
 from sb3_torcs.torcs.scenery import find_scenery
 
-GAME = {"render_mode": "rgb_array", "picture": "game", "render_size": (160, 120)}
+GAME = {"render_mode": "rgb_array", "picture": {"size": (160, 120)}}
 CORNER = {"distance": 600.0, "speed": 20.0}
 
 

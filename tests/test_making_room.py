@@ -158,9 +158,9 @@ class TestWhatIsSeen:
 
 
 @contextmanager
-def two_agents(track, **aid):
+def two_agents(track, aids):
     """Two cars on the grid, and nobody else."""
-    envs = TorcsVecEnv(1, agents=2, track=track, **aid)
+    envs = TorcsVecEnv(1, agents=2, track=track, aids=aids)
     try:
         envs.seed(0)
         envs.reset()
@@ -169,9 +169,9 @@ def two_agents(track, **aid):
         envs.close()
 
 
-def contacts(keep_distance):
+def contacts(aids):
     """Count the contacts of a car that drives faster than the one ahead of it."""
-    with two_agents("g-track-1", keep_distance=keep_distance) as envs:
+    with two_agents("g-track-1", aids) as envs:
         ahead = np.argmin([car.race_position for car in envs.get_attr("car")])
         actions = np.stack([0.3 * GAS, 0.3 * GAS])
         for step in range(200):
@@ -186,13 +186,13 @@ def contacts(keep_distance):
 
 
 def test_a_car_that_is_asked_to_rams_nobody(game):
-    assert contacts(keep_distance=False) > 0
-    assert contacts(keep_distance=True) == 0
+    assert contacts([]) > 0
+    assert contacts(["keep_distance"]) == 0
 
 
-def contacts_beside(keep_clear):
+def contacts_beside(aids):
     """Count the contacts of two cars that are side by side, and both want to the middle."""
-    with two_agents("b-speedway", keep_clear=keep_clear) as envs:
+    with two_agents("b-speedway", aids) as envs:
         actions = np.stack([0.5 * GAS, 0.5 * GAS])
         aims = np.array([4.0, -4.0])
         for step in range(200):
@@ -212,13 +212,13 @@ def contacts_beside(keep_clear):
 
 
 def test_a_car_that_keeps_clear_touches_nobody_beside_it(game):
-    assert contacts_beside(keep_clear=False) > 0
-    assert contacts_beside(keep_clear=True) == 0
+    assert contacts_beside([]) > 0
+    assert contacts_beside(["keep_clear"]) == 0
 
 
 def test_races_driven_at_once_make_room_as_single_ones_do(game):
-    aids = dict.fromkeys(("keep_distance", "keep_clear", "unstick"), True)
-    options = {"opponents": ["bt", "tita"], **aids}
+    aids = ["keep_distance", "keep_clear", "unstick"]
+    options = {"opponents": ["bt", "tita"], "aids": aids}
     with both_kinds("Torcs-v0", track="g-track-1", action="pedal", **options) as (ours, theirs):
         ours.action_space.low[1] = theirs.action_space.low[1] = 0.9  # into those ahead
         assert_they_see_the_same(ours, theirs, steps=60)
@@ -230,4 +230,4 @@ def test_a_world_without_races_has_nobody_to_keep_from(game, world, aid):
     with pytest.raises(
         InvalidOption, match=f"other cars, which is needed for '{aid}'; use Torcs-v0 with"
     ):
-        gym.make(**world, **{aid: True})
+        gym.make(**world, aids=[aid])

@@ -166,11 +166,15 @@ def test_without_a_recipe_the_environment_tells(tmp_path):
 def test_arrays_among_the_arguments_of_an_environment_are_recorded_as_lists(tmp_path):
     """Left out, an evaluation would show the policy other beams."""
     angles = np.linspace(-60, 60, 19)
-    made = {"range_finders": angles, "delay": np.array([0, 3]), "laps": np.int64(2)}
+    made = {"range_finders": angles, "conditions": {"delay": np.array([0, 3])}, "laps": np.int64(2)}
     with gym.make("TorcsLite-v0", **made) as env:
         trained(DDPG, "MlpPolicy", env, **OFF_POLICY).save(tmp_path / "m.zip")
     record = models.training_record(tmp_path / "m.zip")
-    assert record.env_kwargs == {"range_finders": angles.tolist(), "delay": [0, 3], "laps": 2}
+    assert record.env_kwargs == {
+        "range_finders": angles.tolist(),
+        "conditions": {"delay": [0, 3]},
+        "laps": 2,
+    }
 
 
 @pytest.mark.parametrize("normalized", [False, True])

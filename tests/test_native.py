@@ -164,7 +164,11 @@ class TestEqualToItself:
         assert pickle.dumps(again) == pickle.dumps(fresh)
 
     def test_a_pickled_environment_goes_on_among_robots_with_noise(self):
-        options = {"opponents": ("bt", "inferno:3"), "grid_place": 2, "sensor_noise": True}
+        options = {
+            "opponents": ("bt", "inferno:3"),
+            "grid_place": 2,
+            "conditions": {"sensor_noise": True},
+        }
         env = gym.make("Torcs-v0", track="dirt-2", **options).unwrapped
         env.reset(seed=3)
         for _ in range(20):
@@ -515,7 +519,7 @@ class TestLaps:
 
     def test_a_wall_before_the_line_voids_no_lap(self):
         """The car hits it on its way to the line, where its first lap begins, and then no more."""
-        options = {"runoff": 30.0, "recovery": 20.0, "unstick": True}
+        options = {"ends": {"runoff": 30.0, "recovery": 20.0}, "aids": ["unstick"]}
         env = gym.make("Torcs-v0", track="g-track-1", laps=1, **options)
         before = env.unwrapped.track.length - 400.0
         driver, gas = ScriptedDriver(), np.array([0.0, 1.0, 0.0], np.float32)
@@ -593,6 +597,9 @@ class TestAmongRobots:
             assert game.find_robot(*game.parse_robot(name)).car == "car1-trb1"
 
 
+NOISE = {"sensor_noise": True}
+
+
 class TestNoise:
     def drive(self, seed, **options):
         """Range finders and opponents of a drive that ends beside the road."""
@@ -602,12 +609,12 @@ class TestNoise:
         return np.array([[*car.range_finders, *car.opponents] for car in cars])
 
     def test_it_is_seeded(self):
-        noisy = self.drive(1, sensor_noise=True)
-        np.testing.assert_array_equal(noisy, self.drive(1, sensor_noise=True))
-        assert not np.array_equal(noisy, self.drive(2, sensor_noise=True))
+        noisy = self.drive(1, conditions=NOISE)
+        np.testing.assert_array_equal(noisy, self.drive(1, conditions=NOISE))
+        assert not np.array_equal(noisy, self.drive(2, conditions=NOISE))
 
     def test_it_is_of_the_size_that_the_manual_says(self):
-        clean, noisy = self.drive(1), self.drive(1, sensor_noise=True)
+        clean, noisy = self.drive(1), self.drive(1, conditions=NOISE)
         seen = clean[:, :19] > 0.5
         ratio = noisy[:, :19][seen] / clean[:, :19][seen]
         assert ratio.mean() == pytest.approx(1.0, abs=0.02)
@@ -616,7 +623,7 @@ class TestNoise:
         assert (noisy[:, 19:][near] / clean[:, 19:][near]).std() == pytest.approx(0.02, rel=0.25)
 
     def test_beside_the_road_there_is_nothing_to_err_about(self):
-        clean, noisy = self.drive(1), self.drive(1, sensor_noise=True)
+        clean, noisy = self.drive(1), self.drive(1, conditions=NOISE)
         off = clean[:, 0] == -1.0
         assert off.any()
         assert (clean[off, :19] == -1.0).all()

@@ -292,8 +292,8 @@ def test_a_ghost_is_a_driver_like_others(file):
     [({"track": "b-speedway"}, "track 'a-speedway', not 'b-speedway'"),
      ({"track": TRACK, "action_repeat": 2}, "action_repeat 5, not 2"),
      ({"track": TRACK, "gearbox": "road_speed"}, "gearbox 'automatic', not 'road_speed'"),
-     ({"track": TRACK, "grip": 0.8}, "grip 1.0, not 0.8"),
-     ({"track": TRACK, "delay": 3}, "delay 0, not 3"),
+     ({"track": TRACK, "conditions": {"grip": 0.8}}, "grip 1.0, not 0.8"),
+     ({"track": TRACK, "conditions": {"delay": 3}}, "delay 0, not 3"),
      ({"track": TRACK, "opponents": ["bt"]}, "opponents")],
 )  # fmt: skip
 def test_a_ghost_drives_no_other_race(file, kwargs, said):
@@ -346,7 +346,7 @@ def test_over_the_scr_protocol_a_ghost_drives_the_same_laps(ghost, file):
     race = RaceSetup(TRACK, [("scr_server", 0)], 3)
     with start_server(find_game(), race, sockets):
         sockets[0].close()
-        agent = Agent(str(file), {"track": TRACK, "host": "127.0.0.1", "port": port})
+        agent = Agent(str(file), {"track": TRACK, "scr": {"host": "127.0.0.1", "port": port}})
         agent.drive()
     assert tuple(agent.lap_times) == ghost.lap_times
 

@@ -22,7 +22,7 @@ from sb3_torcs.agents.robots import race as robots_race
 from sb3_torcs.agents.saved.writing import recipe, write_record
 from sb3_torcs.agents.scripted import ScriptedDriver
 from sb3_torcs.cli import main
-from sb3_torcs.envs.aids import AIDS, aids_named
+from sb3_torcs.envs.options import AIDS
 from sb3_torcs.errors import InvalidOption, OutputNotWritable
 from sb3_torcs.evaluation.comparing import saved_drives
 from sb3_torcs.races import protocol
@@ -283,7 +283,7 @@ def test_a_policy_that_refuses_to_draw_from_no_numbers_is_out_too(game, tmp_path
 @pytest.mark.slow
 def test_a_race_with_hard_contacts_ends_with_numbers(game, tmp_path):
     """A contact may put a car nowhere: then its driver is out, and the others race on."""
-    racer = copied_agent("ppo-racer", tmp_path / "racer.zip", keep_clear=False, catch_slides=False)
+    racer = copied_agent("ppo-racer", tmp_path / "racer.zip", aids=["unstick", "keep_distance"])
     entrants = find_entrants(["inferno", racer], game)
     race = run_race(entrants, "aalborg", laps=3)
     assert {one.driver for one in race.standings if one.out} == set(race.failures)
@@ -313,7 +313,7 @@ def test_no_report_is_made_of_a_race_without_a_whole_lap(capsys, game, monkeypat
 def test_an_agent_that_learned_alone_may_get_aids(tmp_path, game):
     """It races as one whose record has them, to the bit."""
     alone = "ppo-any-road"
-    with_aids = copied_agent(alone, tmp_path / "agent.zip", **dict.fromkeys(AIDS, True))
+    with_aids = copied_agent(alone, tmp_path / "agent.zip", aids=AIDS)
     races = [
         run_race(find_entrants(["bt", "inferno", agent], game, aids), SHORT, laps=1)
         for agent, aids in ((alone, AIDS), (with_aids, ()), (alone, ()))
@@ -325,23 +325,10 @@ def test_an_agent_that_learned_alone_may_get_aids(tmp_path, game):
 
 
 @pytest.mark.parametrize(
-    ("names", "aids"),
-    [
-        ("all", AIDS),
-        ("keep_clear", ("keep_clear",)),
-        ("unstick, keep_clear", ("unstick", "keep_clear")),
-    ],
-)
-def test_aids_are_named_on_the_command_line(names, aids):
-    assert aids_named(names) == aids
-
-
-@pytest.mark.parametrize(
     ("names", "message"),
     [
-        ("keep_clea", "no driver aid 'keep_clea'; did you mean 'keep_clear'"),
-        ("unstick,", "no driver aid ''; driver aids: unstick"),
-        ("unstick,all", "no driver aid 'all'; driver aids: unstick.*or 'all' alone"),
+        ("keep_clea", "aids has 'keep_clea'; did you mean 'keep_clear'"),
+        ("unstick,", "aids has ''; the driver aids are unstick"),
     ],
 )
 def test_no_such_aid(capsys, game, names, message):
@@ -359,7 +346,7 @@ def test_an_agent_with_aids_and_without_a_record_is_still_told(game, tmp_path):
     PPO("MlpPolicy", "sb3_torcs:TorcsLite-v0", n_steps=2, batch_size=2, device="cpu").save(file)
     (entrant,) = find_entrants([str(file)], game, ["unstick"])
     assert not entrant.agent.record.known
-    assert entrant.agent.kept(["action"]) == {"unstick": True}
+    assert entrant.agent.kept(["action"]) == {"aids": ("unstick",)}
 
 
 def test_policies_of_one_driver_are_asked_at_once(monkeypatch, game):

@@ -60,15 +60,18 @@ def test_the_edge_of_the_road_is_still_on_it(oval):
 @pytest.mark.parametrize(("axis", "end"), [(7.0, ""), (-7.0, ""), (7.01, "off_track")])
 def test_a_car_may_be_beside_the_road_where_there_is_runoff(oval, axis, end):
     """Of 2 m, on a road of 10 m."""
-    _, _, terminated, _, info = run(oval, {"distance_from_axis": axis}, runoff=2.0)
+    _, _, terminated, _, info = run(oval, {"distance_from_axis": axis}, ends={"runoff": 2.0})
     assert (terminated, info["end"]) == (end != "", end)
     assert info["off_track"]
+
+
+ENDS = {"recovery": 4.0}
 
 
 @pytest.mark.parametrize("state", [{"heading_error": 3.0}, {"speed_x": 1.0}])
 def test_a_car_has_time_to_recover_where_it_is_given(oval, state):
     """Of 4 s, to turn round or to set off, from the last timestep with headway on."""
-    env = RacingEnv(ScriptedBackend(oval, {"speed_x": 20.0}, *[state] * 50), recovery=4.0)
+    env = RacingEnv(ScriptedBackend(oval, {"speed_x": 20.0}, *[state] * 50), ends=ENDS)
     env.reset(seed=0)
     steps = [env.step(GAS) for _ in range(42)]
     assert [step[2] for step in steps] == [False] * 41 + [True]
@@ -78,7 +81,7 @@ def test_a_car_has_time_to_recover_where_it_is_given(oval, state):
 def test_who_backs_out_of_a_spin_makes_no_headway(oval):
     """A car that reverses the right way along the road may not do so for ever."""
     back = {"heading_error": math.pi, "speed_x": -10.0}
-    env = RacingEnv(ScriptedBackend(oval, *[back] * 50), recovery=4.0)
+    env = RacingEnv(ScriptedBackend(oval, *[back] * 50), ends=ENDS)
     env.reset(seed=0)
     assert [env.step(GAS)[2] for _ in range(41)] == [False] * 40 + [True]
 
@@ -249,10 +252,15 @@ def test_without_hard_starts_mishaps_change_no_start(oval):
         ({"action_repeat": 1 << 31}, "action_repeat is 2147483648"),
         ({"laps": 0}, "laps is 0"),
         ({"laps": True}, "laps is True"),
-        ({"runoff": -1.0}, "runoff is -1.0; expected a number of metres from 0 to 100"),
-        ({"runoff": "wide"}, "runoff is 'wide'"),
-        ({"recovery": -1.0}, "recovery is -1.0; expected a number of seconds from 0 to 60"),
-        ({"recovery": "long"}, "recovery is 'long'"),
+        ({"ends": {"runoff": -1.0}}, "runoff is -1.0; expected a number of metres from 0 to 100"),
+        ({"ends": {"runoff": "wide"}}, "runoff is 'wide'"),
+        (
+            {"ends": {"recovery": -1.0}},
+            "recovery is -1.0; expected a number of seconds from 0 to 60",
+        ),
+        ({"ends": {"recovery": "long"}}, "recovery is 'long'"),
+        ({"ends": {"runof": 1.0}}, "ends has no key 'runof'; did you mean 'runoff'"),
+        ({"ends": 8.0}, "ends is 8.0; expected a dict with any of runoff, recovery"),
         ({"start": "pits"}, "start is 'pits'; expected 'grid' or 'random'"),
         ({"start": "gird"}, "start is 'gird'; did you mean 'grid'"),
         ({"render_mode": "ansi"}, "render_mode is 'ansi'"),

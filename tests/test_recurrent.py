@@ -121,7 +121,7 @@ def test_in_somebody_elses_race_each_race_begins_with_an_empty_mind(monkeypatch)
     driver = Counting()
     monkeypatch.setattr(driving, "load_driver", lambda *_: driver)
     with Anew(ticks=50) as server:
-        agent = driving.Agent("scripted", {"host": server.host, "port": server.port})
+        agent = driving.Agent("scripted", {"scr": server.address})
         driver.asked.clear()
         agent.drive()
     begun = [number for number, (state, _) in enumerate(driver.asked) if state is None]

@@ -180,14 +180,18 @@ def test_a_lost_or_doubled_datagram_changes_nothing(backend):
         ({"opponents": ["ppo-any-road"]}, UnknownRobot, "agents are opponents with backend 'nat"),
         ({"opponents": "inferno"}, InvalidOption, "expected a list of names"),
         ({"grid_place": 2}, InvalidOption, "expected 1, since there are no opponents, or None"),
-        ({"sensor_noise": True}, InvalidOption, "-noisy"),
-        ({"port": 3001}, InvalidOption, "add host='localhost'"),
-        ({"host": 5}, InvalidOption, "host is 5; expected a name, e.g. 'localhost', or None"),
-        ({"host": ""}, InvalidOption, "host is ''; expected a name"),
-        ({"host": "localhost", "port": 99999}, InvalidOption, "expected 1 to 65535"),
-        ({"host": "localhost", "opponents": ["inferno"]}, InvalidOption, "serve --robots"),
-        ({"backend": "native", "host": "localhost"}, InvalidOption, "add backend='scr'"),
-        ({"render_mode": "game"}, InvalidOption, "--window"),
+        ({"conditions": {"sensor_noise": True}}, InvalidOption, "-noisy"),
+        ({"scr": {"port": 3001}}, InvalidOption, r"add scr=\{'host'"),
+        (
+            {"scr": {"host": 5}},
+            InvalidOption,
+            "host is 5; expected a name, e.g. 'localhost', or None",
+        ),
+        ({"scr": {"host": ""}}, InvalidOption, "host is ''; expected a name"),
+        ({"scr": {"host": "localhost", "port": 99999}}, InvalidOption, "expected 1 to 65535"),
+        ({"scr": {"host": "localhost"}, "opponents": ["inferno"]}, InvalidOption, "serve --robots"),
+        ({"backend": "native", "scr": {"host": "localhost"}}, InvalidOption, "add backend='scr'"),
+        ({"picture": "game"}, InvalidOption, "--window"),
     ],
 )
 def test_what_cannot_be_is_told_before_anything_starts(options, error, message):
@@ -226,7 +230,7 @@ def test_a_broken_car_is_told(tmp_path):
 
 def test_a_server_that_runs_already_is_driven():
     with Loopback() as server:
-        env = gym.make("Torcs-v0", backend="scr", host=server.host, port=server.port)
+        env = gym.make("Torcs-v0", backend="scr", scr=server.address)
         env.reset(seed=0)
         for _ in range(10):
             *_, info = env.step(np.array([0.5, 0.25, 0.0], np.float32))
@@ -291,10 +295,10 @@ def test_a_yaw_rate_that_is_not_told_is_that_of_the_last_tick():
 
 
 def test_without_a_track_nothing_of_the_road_is_told():
-    with pytest.raises(InvalidOption, match="add host='localhost'"):
+    with pytest.raises(InvalidOption, match=r"add scr=\{'host'"):
         ScrBackend(None)
     with Loopback() as server:
-        settings = {"backend": "scr", "track": None, "host": server.host, "port": server.port}
+        settings = {"backend": "scr", "track": None, "scr": server.address}
         with pytest.raises(InvalidOption, match="'line' and 'motion' need the track of the race"):
             gym.make("sb3_torcs:Torcs-v0", sensors=["base", "line", "motion"], **settings)
         env = gym.make("sb3_torcs:Torcs-v0", **settings)
@@ -351,7 +355,7 @@ class Anew(Loopback):
 
 def test_an_agent_drives_on_in_a_race_that_begins_anew():
     with Anew(ticks=100) as server:
-        agent = Agent("scripted", {"host": server.host, "port": server.port})
+        agent = Agent("scripted", {"scr": server.address})
         agent.drive()
     assert len(server.inits) == 3
     assert agent.distance == 99.0
@@ -405,7 +409,7 @@ class Watching(Loopback):
         super().take(message, sender)
 
 with Watching(ticks=300) as server:
-    address = {"host": server.host, "port": server.port}
+    address = {"scr": server.address}
     if sys.argv[1:]:
         Agent(sys.argv[1], {"track": "aalborg", **address}).drive()
     else:
@@ -437,7 +441,7 @@ def test_a_rehearsal_leaves_nothing_behind():
         world = ScrBackend("aalborg", host=server.host, port=server.port)
         assert world.over
         assert (list(world.latencies), world.lost_ticks) == ([], 0)
-        agent = Agent("scripted", {"track": "aalborg", "host": server.host, "port": server.port})
+        agent = Agent("scripted", {"track": "aalborg", "scr": server.address})
         assert (agent.lap_times, agent.distance, agent.end) == ([], 0.0, None)
         assert not server.inits
         world.close()
@@ -452,7 +456,7 @@ def test_both_sides_count_the_same_lost_ticks(think):
     with start_server(find_game(), race, [bound], deadline=0.01) as game:
         host, port = bound.getsockname()
         bound.close()
-        settings = {"track": "a-speedway", "host": host, "port": port, "action_repeat": 1}
+        settings = {"track": "a-speedway", "scr": {"host": host, "port": port}, "action_repeat": 1}
         agent = Agent("scripted", settings)
         pauses = [think] * 10
         decide = agent.driver.predict

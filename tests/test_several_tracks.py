@@ -118,7 +118,7 @@ def test_what_cannot_be_is_told(make):
 
 
 @pytest.mark.usefixtures("game")
-@pytest.mark.parametrize("options", [{"backend": "scr"}, {"render_mode": "game"}])
+@pytest.mark.parametrize("options", [{"backend": "scr"}, {"picture": "game"}])
 def test_what_has_one_track_refuses_a_list(options):
     with pytest.raises(InvalidOption, match="one track"):
         gym.make("Torcs-v0", track=TRACKS, **options)
@@ -231,7 +231,9 @@ class TestRacesAtOnce:
         env_id = f"sb3_torcs:{request.param}"
 
         def make(grip):
-            return gym.make(env_id, track=TRACKS, start="random", grip=grip, max_episode_steps=4)
+            return gym.make(
+                env_id, track=TRACKS, start="random", conditions={"grip": grip}, max_episode_steps=4
+            )
 
         grips = [1.0, 0.6, [0.5, 0.9]] * (self.RACES // 3)
         return [lambda grip=grip: make(grip) for grip in grips]

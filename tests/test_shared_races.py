@@ -274,29 +274,29 @@ class TestMistakes:
 
     def test_controls_that_arrive_late(self):
         with pytest.raises(InvalidOption, match="delay is 3, which is for a race of one agent"):
-            make_race(2, delay=3)
+            make_race(2, conditions={"delay": 3})
 
     @pytest.mark.parametrize(
         "option",
         [
-            {"backend": "scr"}, {"host": "localhost"}, {"port": 3001}, {"grip": 0.9},
-            {"mass": (0.9, 1.1)}, {"picture": "game"}, {"view": "tv"}, {"boards": False},
-            {"render_size": (64, 48)},
+            {"backend": "scr"}, {"scr": {"host": "localhost"}}, {"conditions": {"grip": 0.9}},
+            {"conditions": {"mass": (0.9, 1.1)}}, {"picture": "game"}, {"picture": {"view": "tv"}},
         ],
     )  # fmt: skip
     def test_options_of_a_race_of_one_agent(self, option):
-        (name,) = option
+        (name,) = option.get("conditions", option)
         with pytest.raises(InvalidOption, match=f"{name} is .*, which is for a race of one agent"):
             TorcsVecEnv(1, 2, **option)
 
     def test_no_option_at_all(self):
-        with pytest.raises(TypeError, match=r"no option 'oponents'; did you mean 'opponents'\?"):
+        with pytest.raises(
+            TypeError, match=r"keyword argument 'oponents'; did you mean 'opponents'\?"
+        ):
             make_race(2, oponents=["bt"])
 
     def test_their_usual_values_are_no_mistake(self, make):
-        shown = {"picture": "above", "view": "behind", "boards": True, "render_size": [640, 480]}
-        usual = {"backend": "native", "host": None, "port": None, "grip": 1.0, "mass": 1.0}
-        assert make(1, 2, **shown, **usual).num_envs == 2
+        usual = {"picture": "above", "backend": "native", "scr": {"host": None}}
+        assert make(1, 2, conditions={"grip": 1.0, "mass": 1.0}, **usual).num_envs == 2
 
     def test_worlds_with_one_car(self):
         with pytest.raises(InvalidOption, match=r"TorcsLite-v0 has one car in each race"):
@@ -426,7 +426,7 @@ class TestVectorEnvironment:
     def test_threads_change_nothing(self, make):
         answers = []
         for threads in (1, 2):
-            envs = make(2, 3, threads=threads, opponents=["bt"], sensor_noise=True)
+            envs = make(2, 3, threads=threads, opponents=["bt"], conditions={"sensor_noise": True})
             envs.seed(1)
             digest = [envs.reset().tobytes()]
             for action in random_actions(150, 6):
@@ -746,7 +746,7 @@ class TestAgentsAsOpponents:
         ("options", "message"),
         [
             ({"action_repeat": 2}, "action_repeat is 2, .* were trained with 5"),
-            ({"grip": 0.9}, "grip is .* which this world cannot change"),
+            ({"conditions": {"grip": 0.9}}, "grip is .* which this world cannot change"),
             ({"picture": "game", "render_mode": "rgb_array"}, "'scripted' is an agent"),
             ({"opponents": ["infermo"]}, "give the.*no robot 'infermo'; did you mean 'inferno'"),
             ({"opponents": ["inferno"] * 20}, "opponents has 20 names; expected at most 19"),

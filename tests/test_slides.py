@@ -17,6 +17,8 @@ ASKED = np.array([0.3, 0.0, 0.4], np.float32)
 AS_ASKED = Controls(*map(float, ASKED))
 
 
+ENDS = {"runoff": 50.0, "recovery": 20.0}
+
 held = partial(held_with, "catch_slides", asked=ASKED)
 
 
@@ -63,8 +65,8 @@ def worst_slide(env, side):
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_a_car_that_would_spin_does_not(game, side):
-    make = partial(gym.make, "Torcs-v0", track="b-speedway", runoff=50.0, recovery=20.0)
-    with make() as spins, make(catch_slides=True) as caught:
+    make = partial(gym.make, "Torcs-v0", track="b-speedway", ends=ENDS)
+    with make() as spins, make(aids=["catch_slides"]) as caught:
         assert worst_slide(spins, side) > 2.0
         assert worst_slide(caught, side) < 1.0
 
@@ -73,7 +75,8 @@ def test_a_car_that_would_spin_does_not(game, side):
 def test_races_driven_at_once_catch_slides_as_single_ones_do(request, env_id):
     if env_id == "Torcs-v0":
         request.getfixturevalue("game")
-    with both_kinds(env_id, track="b-speedway", catch_slides=True, runoff=50.0) as (ours, theirs):
+    options = {"aids": ["catch_slides"], "ends": {"runoff": 50.0}}
+    with both_kinds(env_id, track="b-speedway", **options) as (ours, theirs):
         for envs in (ours, theirs):
             envs.set_options({"distance": 1200.0, "speed": 60.0})
         ours.action_space.low[2] = theirs.action_space.low[2] = 0.2

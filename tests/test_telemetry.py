@@ -169,10 +169,12 @@ def test_a_track_of_the_game_is_stored_by_its_name(env_id, track):
 
 
 @pytest.mark.usefixtures("game")
-@pytest.mark.parametrize("kwargs", [{}, {"delay": 2}, {"opponents": ["scripted"]}])
+@pytest.mark.parametrize(
+    "kwargs", [{}, {"conditions": {"delay": 2, "sensor_noise": True}}, {"opponents": ["scripted"]}]
+)
 def test_who_looks_on_draws_no_noise(kwargs):
     """What an agent sees is the same to the bit, where each control tick is noted."""
-    made = {"track": "g-track-1", "sensor_noise": True, **kwargs}
+    made = {"track": "g-track-1", "conditions": {"sensor_noise": True}, **kwargs}
     alone, noted = (gym.make("sb3_torcs:Torcs-v0", **made) for _ in range(2))
     log_drives(noted, "x")
     seen = [env.reset(seed=3)[0] for env in (alone, noted)]

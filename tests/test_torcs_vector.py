@@ -88,7 +88,7 @@ def assert_same(one, other, where):
         (0, {"start": "grid", "max_episode_steps": 25}),
         (1, {"start": "random"}),
         (2, {"start": "random", "reward": "blog", "max_episode_steps": 40, "action_repeat": 2}),
-        (3, {"start": "random", "sensor_noise": True, "track": "michigan"}),
+        (3, {"start": "random", "conditions": {"sensor_noise": True}, "track": "michigan"}),
         (4, {"start": "random", "track": ["aalborg", "g-track-1"], "max_episode_steps": 20}),
         (5, {"start": "random", "car": ["car1-trb1", "baja-bug"]}),
     ],
@@ -217,7 +217,7 @@ def test_a_wrong_action_is_told_and_leaves_the_races_usable(make):
 
 
 def test_a_wrong_action_does_not_arrive_late(make):
-    envs = make(num_envs=2, delay=6)
+    envs = make(num_envs=2, conditions={"delay": 6})
     envs.reset(seed=0)
     waiting = [env.delay.waiting for env in envs.envs]
     with pytest.raises(InvalidAction, match="throttle is nan"):

@@ -14,7 +14,8 @@ from vectors import assert_they_see_the_same, both_kinds
 from sb3_torcs.car import Controls
 
 ASKED = np.array([0.3, 0.9, 0.0], np.float32)
-FREELY = {"unstick": True, "recovery": 15.0, "runoff": 8.0}
+ENDS = {"recovery": 15.0, "runoff": 8.0}
+FREELY = {"aids": ["unstick"], "ends": ENDS}
 HEADINGS = [-3.1, -2.4, -1.6, -0.8, 0.8, 1.6, 2.4, 3.1]
 
 
@@ -106,7 +107,7 @@ def test_races_driven_at_once_free_their_cars_as_single_ones_do(request, env_id)
 
 
 def test_who_has_not_asked_for_it_drives_on(make):
-    env = make(recovery=15.0, runoff=8.0)
+    env = make(ends=ENDS)
     env.reset(seed=0, options={"heading_error": 2.0})
     for _ in range(5):
         env.step(ASKED)

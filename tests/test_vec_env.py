@@ -119,8 +119,13 @@ OPTIONS = [
     {"start": "random"},
     {"start": "random", "reward": "blog", "max_episode_steps": 20, "action_repeat": 2},
     {"start": "random", "reward": {**EVERY_TERM, "crash": -3.0}, "laps": 1},
-    {"start": "random", "runoff": 3.0},
-    {"start": "random", "runoff": 3.0, "recovery": 3.0, "unstick": True, "action": "pedal"},
+    {"start": "random", "ends": {"runoff": 3.0}},
+    {
+        "start": "random",
+        "ends": {"runoff": 3.0, "recovery": 3.0},
+        "aids": ["unstick"],
+        "action": "pedal",
+    },
     {"reward": "apex", "action": "manual", "gearbox": "automatic"},
     {"action": "pedal", "gearbox": "road_speed", "max_episode_steps": -1},
     {"start": "random", "track": ["aalborg", "g-track-1", "e-track-5"], "max_episode_steps": 15},
@@ -146,7 +151,7 @@ def test_it_does_what_a_dummy_does(env_id, make, options, threads):
     "options",
     [
         {"car": ["car1-trb1", "baja-bug"], "track": ["aalborg", "dirt-1"], "start": "random"},
-        {"sensor_noise": True, "start": "random"},
+        {"conditions": {"sensor_noise": True}, "start": "random"},
         {"opponents": ["inferno"], "laps": 2},
     ],
     ids=lambda options: "-".join(options),
@@ -369,7 +374,8 @@ def test_after_a_term_that_fails_each_timestep_is_paid_once(make, monkeypatch):
 
     monkeypatch.setitem(rewards.TERMS, "careless", careless)
     ours, theirs = (
-        make(2, env_id=LITE, reward={"progress": 1.0, "careless": 1.0}, delay=3) for _ in range(2)
+        make(2, env_id=LITE, reward={"progress": 1.0, "careless": 1.0}, conditions={"delay": 3})
+        for _ in range(2)
     )
     for envs in (ours, theirs):
         envs.seed(0)
@@ -519,7 +525,11 @@ def test_a_list_of_time_limits_goes_round_the_races(make, game, agents):
     [
         ({"opponents": None}, InvalidOption, "opponents is None; expected a list"),
         ({"opponents": 5}, InvalidOption, "opponents is 5; expected a list"),
-        ({"sensor_noise": "off"}, InvalidOption, "sensor_noise is 'off'; expected True or False"),
+        (
+            {"conditions": {"sensor_noise": "off"}},
+            InvalidOption,
+            "sensor_noise is 'off'; expected True or False",
+        ),
         ({"car": 5}, InvalidOption, "car is 5; expected the name of"),
         ({"car": "car5"}, UnknownCar, "no car 'car5'"),
     ],

@@ -136,7 +136,7 @@ def test_a_run_is_gone_on_with_behind_its_wrappers(run, tmp_path, capsys):
 
 def test_in_somebody_elses_race_the_wrappers_are_there(run):
     with Loopback(ticks=60) as server:
-        agent = driving.Agent(str(run), {"host": server.host, "port": server.port})
+        agent = driving.Agent(str(run), {"scr": server.address})
         agent.drive()
     assert agent.env.action_space.low.tolist() == [-1.0, -1.0, -1.0]
     assert agent.distance > 0.0

@@ -68,7 +68,9 @@ def race(args, seed):
     order = np.random.default_rng(seed).permutation(len(ROBOTS))
     kept = agent_record(args.agent, find_game()).env_kwargs
     options = {"opponents": [ROBOTS[i] for i in order], "laps": args.laps, "max_episode_steps": -1}
-    options |= {"runoff": 30.0, "recovery": 60.0}  # who spins or leaves the road races on
+    options |= {
+        "ends": {"runoff": 30.0, "recovery": 60.0}
+    }  # a car that spins or leaves the road races on
     env = gym.make("sb3_torcs:Torcs-v0", **{**kept, **options})
     racer = Racer(load_driver(args.agent, env), env.unwrapped)
     env.reset(seed=seed)

@@ -7,7 +7,7 @@ import os
 import tokenize
 import zipfile
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from sb3_torcs.agents.rollout import Timestep, drive
 from sb3_torcs.agents.saved.file import BROKEN
-from sb3_torcs.envs.aids import AIDS
+from sb3_torcs.envs.aids import Aids
 from sb3_torcs.errors import InvalidOption, ModelMismatch, near_miss
 from sb3_torcs.files import whole_file, writable_file
 from sb3_torcs.torcs.installation import find_game
@@ -206,8 +206,8 @@ class GhostDriver:
 
 
 USUAL: Mapping[str, Any] = {
-    "action": "pedals", "gearbox": "automatic", "start": "grid", "opponents": (), "delay": 0,
-    "grip": 1.0, "mass": 1.0, **dict.fromkeys(AIDS, False),
+    "action": "pedals", "gearbox": "automatic", "start": "grid", "opponents": (), "aids": (),
+    "delay": 0, "grip": 1.0, "mass": 1.0,
 }  # fmt: skip
 """Options that change a drive, and their usual values."""
 
@@ -225,7 +225,7 @@ def check_fits(ghost: Ghost, env: gym.Env[Any, Any], name: str | Path) -> None:
         raise ModelMismatch(
             f"the ghost '{name}' was driven in {WORLD}, not in {env.spec.id}: give --env {WORLD}"
         )
-    backend, aids = env.get_wrapper_attr("backend"), env.get_wrapper_attr("aids")
+    backend = env.get_wrapper_attr("backend")
     has = {
         **USUAL,
         **(env.spec.kwargs if env.spec is not None else {}),  # cars of one race have none
@@ -233,9 +233,10 @@ def check_fits(ghost: Ghost, env: gym.Env[Any, Any], name: str | Path) -> None:
         "car": backend.car,
         "action_repeat": env.get_wrapper_attr("action_repeat"),
         "action": env.get_wrapper_attr("action"),
-        **asdict(aids),
+        "aids": env.get_wrapper_attr("aids").names,
     }
-    needs = {**USUAL, **ghost.env_kwargs}
+    needs = {**USUAL, **ghost.env_kwargs, **(ghost.env_kwargs.get("conditions") or {})}
+    needs["aids"] = Aids.of(needs["aids"]).names
     own_track = load_track(find_track(needs["track"], find_game()))
     needs["track"], has["track"] = own_track.name, backend.track.name
     if needs["track"] == has["track"]:  # which two roads may have

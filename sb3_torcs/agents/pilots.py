@@ -39,8 +39,8 @@ class CarOfAnAgent:
             raise InvalidOption(f"'{driver}' is a ghost, which looks at nobody and cannot race")
         self.driver = driver
         self.record = agent_record(driver, find_game())
-        self._aids = dict.fromkeys(aids, True)
         kwargs = self.record.env_kwargs
+        self._aids = (*kwargs.get("aids", ()), *aids)
         self.car = self.record.one_car
         self.gearbox: str = kwargs.get("gearbox", "automatic")
         self.angles: FloatArray = range_finder_angles(kwargs.get("range_finders", "scr"))
@@ -52,7 +52,7 @@ class CarOfAnAgent:
         :param names: of options of an environment
         :return: those that its training had, and the aids
         """
-        return {**self.record.kept(names), **self._aids}
+        return {**self.record.kept(names), **({"aids": self._aids} if self._aids else {})}
 
 
 @dataclass

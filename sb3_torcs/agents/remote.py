@@ -30,7 +30,7 @@ def check_told(driver: str, options: Mapping[str, Any], advice: str) -> None:
     :raises ModelMismatch: if it sees other cars or its car's file, or has aids that do
     """
     untold = sorted((NEEDS_RACE | NEEDS_CAR).intersection(options.get("sensors", ())))
-    untold += [aid for aid in NEED_RIVALS if options.get(aid)]
+    untold += [aid for aid in NEED_RIVALS if aid in options.get("aids", ())]
     if untold:
         raise ModelMismatch(
             f"'{driver}' drives with {', '.join(map(repr, untold))}, for which the game's "

@@ -25,7 +25,7 @@ OPTIONAL: dict[str, Any] = {
     "knows_road": True,  # whether ``track`` is the one that is driven, not a stand-in
     "tells_race": False,  # whether it fills ``CarState.race``
     "shares_race": False,  # whether the cars of other agents move whenever this one does
-    "conditions": (),  # names of those that ``set_conditions(grip, mass)`` changes
+    "conditions": (),  # of ``grip``, ``mass`` and ``sensor_noise`` those that it can have
     "draw_track": None,  # a method, of a world that has several; see :class:`Backend`
 }
 """What a world may have besides, and what holds for one that does not have it."""

@@ -184,7 +184,7 @@ class NativeBackend(EngineWorld):
     :param gearbox: see :data:`sb3_torcs.actions.GEARBOXES`
     """
 
-    conditions = ("grip", "mass")
+    conditions = ("grip", "mass", "sensor_noise")
 
     tells_race = True
 

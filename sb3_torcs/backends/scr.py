@@ -118,7 +118,7 @@ class ScrBackend:
         if self._own and track is None:
             raise InvalidOption(
                 "track is None, which is for a race at a host of its own; name a track, such as "
-                "'aalborg', or add host='localhost'"
+                "'aalborg', or add scr={'host': 'localhost'}"
             )
         self.knows_road = track is not None
         self.track: Track = UNKNOWN_ROAD if track is None else load_track(find_track(track, game))
@@ -130,10 +130,10 @@ class ScrBackend:
         if not self._own and (len(entries) > 1 or grid_place is not None):
             raise InvalidOption(
                 f"opponents and grid_place are those of the race at {host}; name them there, e.g. "
-                "`sb3-torcs serve --robots inferno`, or leave out host"
+                "`sb3-torcs serve --robots inferno`, or leave out scr"
             )
         if self._own and port is not None:
-            raise InvalidOption(f"port is {port!r}, but there is no host; add host='localhost'")
+            raise InvalidOption(f"port is {port!r} without a host; add scr={{'host': 'localhost'}}")
         if not is_count(self._address[1]) or self._address[1] > MAX_PORT:
             raise InvalidOption(f"port is {port!r}; expected 1 to {MAX_PORT}")
         self._race = RaceSetup(
@@ -167,7 +167,7 @@ class ScrBackend:
         if start is not None and not self._own:
             raise InvalidOption(
                 "a race at a host of its own begins on the grid; use start='grid' and no options "
-                "of reset, or leave out host"
+                "of reset, or leave out scr"
             )
         self._check_owner()
         self._drive = []

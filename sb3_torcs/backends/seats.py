@@ -227,6 +227,7 @@ class Seat(Drawn):
     """
 
     tells_race = True
+    conditions = ("sensor_noise",)
 
     def __init__(self, race: SharedRace, number: int) -> None:
         self.race, self.number = race, number

@@ -62,7 +62,7 @@ def pictures() -> Figures:
 
     :return: ``game_frames_per_s``
     """
-    env = gym.make(TORCS, render_mode="game", render_size=SIZE)
+    env = gym.make(TORCS, render_mode="rgb_array", picture={"size": SIZE})
     actions = scripted_actions(env, PICTURES)
     env.reset(seed=0)
     env.render()  # starts the game

@@ -31,7 +31,7 @@ race_car_ticks_per_s      TorcsVecEnv on one thread: ticks of all cars of a race
                           five per timestep
 scr_ticks_per_s           env.step with backend="scr", five ticks per timestep
 scr_reset_ms              resets with backend="scr"
-game_frames_per_s         render_mode="game" at 640x480
+game_frames_per_s         picture="game" at 640x480
 policy_*                  updates of a DDPG with SplitHeadPolicy, batch size 64
 core_gflops               matrix products of 64 x 256 x 256, best turn
 ddpg_updates_per_s        updates of the default DDPG entry of Torcs-v0, best turn

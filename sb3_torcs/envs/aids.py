@@ -2,33 +2,40 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections.abc import Iterable
+from dataclasses import dataclass
 
-from sb3_torcs.car import CarState, Controls, checked_flag
+from sb3_torcs.car import CarState, Controls
+from sb3_torcs.envs.options import AIDS, AidName, checked_aids
 from sb3_torcs.envs.slides import caught_steering, slides
 from sb3_torcs.envs.unstick import freeing_controls, needs_freeing
-from sb3_torcs.errors import InvalidOption, near_miss
 from sb3_torcs.rivals import needed_brake, needed_turn
 
-__all__ = ["AIDS", "NEED_RIVALS", "Aids", "aided", "aids_named"]
+__all__ = ["NEED_RIVALS", "Aids", "aided", "aids_named"]
 
 
 @dataclass
 class Aids:
-    """
-    The driver aids of a car.
-
-    :raises InvalidOption: if one is neither ``True`` nor ``False``
-    """
+    """The driver aids of a car."""
 
     unstick: bool  # a car that is stuck frees itself
     keep_distance: bool  # it brakes by itself for the car ahead
     keep_clear: bool  # it steers away by itself from those beside it
     catch_slides: bool  # it steers against a slide, before it spins
 
-    def __post_init__(self) -> None:
-        for name in AIDS:
-            setattr(self, name, checked_flag(name, getattr(self, name)))
+    @classmethod
+    def of(cls, names: Iterable[AidName]) -> Aids:
+        """
+        Make the aids of these names.
+
+        :param names: any of :data:`~sb3_torcs.envs.options.AIDS`
+        """
+        return cls(*(name in names for name in AIDS))
+
+    @property
+    def names(self) -> tuple[AidName, ...]:
+        """The names of these aids."""
+        return tuple(name for name in AIDS if getattr(self, name))
 
     def change(self, controls: Controls, car: CarState) -> Controls:
         """
@@ -72,26 +79,19 @@ def aided(
     return steering, throttle, brake
 
 
-AIDS = tuple(aid.name for aid in fields(Aids))
-"""What they are called as options of an environment, in the order of compiled code."""
-
 NEED_RIVALS = ("keep_distance", "keep_clear")
 """Those that have to see other cars."""
 
 
-def aids_named(names: str) -> tuple[str, ...]:
+def aids_named(names: str) -> tuple[AidName, ...]:
     """
     Read the names of driver aids.
 
     :param names: with commas between them, or ``"all"``
-    :return: the names
     :raises InvalidOption: if there is no aid of such a name
     """
-    if names == "all":
-        return AIDS
-    aids = tuple(name.strip() for name in names.split(","))
-    for aid in aids:
-        if aid not in AIDS:
-            advice = f"driver aids: {', '.join(AIDS)}; or 'all' alone"
-            raise InvalidOption(f"no driver aid '{aid}'{near_miss(aid, AIDS, advice)}")
-    return aids
+    return (
+        AIDS
+        if names == "all"
+        else checked_aids("aids", [each.strip() for each in names.split(",")])
+    )

@@ -19,9 +19,9 @@ from sb3_torcs.backends.native import NativeBackend, NativeFleet
 from sb3_torcs.backends.seats import SeatWorld
 from sb3_torcs.backends.several import present_world
 from sb3_torcs.car import CAR_RECORD, CarState, Controls, FloatArray, car_from_record
-from sb3_torcs.envs.aids import AIDS
 from sb3_torcs.envs.compiled import COMPILED, RULES, aid_cars, read_actions, value_timesteps
 from sb3_torcs.envs.info import racing_info
+from sb3_torcs.envs.options import AIDS
 from sb3_torcs.envs.racing import RacingEnv
 from sb3_torcs.errors import CarLost, InvalidAction, InvalidOption
 from sb3_torcs.rewards import Term

@@ -111,7 +111,7 @@ def aid_cars(cars: Any, aids: npt.NDArray[np.bool_], controls: FloatArray) -> No
     Change controls as :class:`~sb3_torcs.envs.aids.Aids` does.
 
     :param cars: (n,) at the beginning of a timestep
-    :param aids: (n, 4) which cars have which, in the order of :data:`~sb3_torcs.envs.aids.AIDS`
+    :param aids: (n, 4) which cars have which, in the order of :data:`~sb3_torcs.envs.options.AIDS`
     :param controls: (n, 5) that were asked for, changed
     """
     for row in range(len(cars)):

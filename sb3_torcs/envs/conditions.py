@@ -9,12 +9,17 @@ import numpy as np
 
 from sb3_torcs.backends.base import optional
 from sb3_torcs.car import RESTING, Controls, checked_delay, checked_factor
+from sb3_torcs.envs.arguments import read_group
+from sb3_torcs.envs.options import CONDITIONS, ConditionOptions
 from sb3_torcs.errors import InvalidOption
 
 __all__ = ["Conditions", "Delay", "Part"]
 
 Part = tuple[Controls, int]
 """Controls, and the control ticks for which they are held."""
+
+
+FACTORS = ("grip", "mass")
 
 
 class Delay:
@@ -49,18 +54,14 @@ class Conditions:
     """
     What each episode draws of its world.
 
-    :param delay: control ticks, or a pair of them
-    :param grip: factor on the friction of all ground, or a pair
-    :param mass: factor on the mass of the car, or a pair
-    :raises InvalidOption: if one has a value that is not allowed
+    :param choice: what was chosen, by name
+    :raises InvalidOption: if a name or a value is not allowed
     """
 
-    def __init__(self, delay: Any, grip: Any, mass: Any) -> None:
-        self.choice = {"delay": delay, "grip": grip, "mass": mass}
-        self._delays = checked_delay(delay)
-        self._factors = {
-            name: checked_factor(name, choice) for name, choice in (("grip", grip), ("mass", mass))
-        }
+    def __init__(self, choice: ConditionOptions | Mapping[str, Any] | None = None) -> None:
+        self.choice = read_group("conditions", CONDITIONS, choice)
+        self._delays = checked_delay(self.choice["delay"])
+        self._factors = {name: checked_factor(name, self.choice[name]) for name in FACTORS}
         self._changed = [name for name, bounds in self._factors.items() if bounds != (1.0, 1.0)]
         self._tells = bool(self._changed)
         self.grip = self.mass = 1.0
@@ -72,12 +73,13 @@ class Conditions:
         :param choice: those that change, by name
         :raises InvalidOption: if a name or a value is not allowed
         """
-        for name in choice:
-            if name not in self.choice:
-                raise InvalidOption(
-                    f"unknown condition {name!r}; allowed: {', '.join(self.choice)}"
-                )
-        changed = Conditions(**{**self.choice, **choice})
+        changed = Conditions({**self.choice, **choice})
+        noise = self.choice["sensor_noise"]
+        if changed.choice["sensor_noise"] != noise:
+            raise InvalidOption(
+                f"sensor_noise was {noise} when the environment was made, and stays so; make "
+                "another one"
+            )
         changed._tells |= self._tells  # a world keeps what it was told last
         changed.grip, changed.mass = self.grip, self.mass  # of the present episode
         return changed
@@ -94,7 +96,8 @@ class Conditions:
                 f"delay is {self.choice['delay']!r}, and the cars of one race move at once; leave "
                 "it out, or drive each agent in a race of its own"
             )
-        for name in self._changed:
+        noise = ["sensor_noise"] if self.choice["sensor_noise"] else []
+        for name in self._changed + noise:
             if name not in optional(world, "conditions"):
                 raise InvalidOption(
                     f"{name} is {self.choice[name]!r}, which this world cannot change; "
@@ -106,7 +109,7 @@ class Conditions:
         Draw the conditions of an episode. Equal bounds draw nothing.
 
         :param rng: the environment's
-        :param world: a backend, which is told
+        :param world: a backend, in which they are set
         :param repeat: control ticks per timestep
         :return: the delay
         """

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, Literal, get_args
+from typing import Any, Unpack, get_args
 
 import gymnasium as gym
 import numpy as np
@@ -22,17 +22,15 @@ from sb3_torcs.car import (
     FloatArray,
     StartName,
     checked_hard_starts,
-    checked_laps,
-    checked_recovery,
-    checked_runoff,
     checked_start,
     checked_start_speed,
-    is_count,
 )
 from sb3_torcs.envs.aids import NEED_RIVALS, Aids
+from sb3_torcs.envs.arguments import read_options, takes_options
 from sb3_torcs.envs.conditions import Conditions, Delay, Part
 from sb3_torcs.envs.ends import GRACE_TICKS, REASONS, STUCK_TICKS, TRUNCATING, end_of, waited
 from sb3_torcs.envs.info import racing_info
+from sb3_torcs.envs.options import RACING, RacingOptions, RenderMode
 from sb3_torcs.envs.starts import Starts, read_start
 from sb3_torcs.errors import CarLost, EnvClosed, InvalidOption, StartBlocked
 from sb3_torcs.rewards import CRASHES, Reward, RewardChoice
@@ -42,9 +40,6 @@ from sb3_torcs.tracks.track import Track
 __all__ = ["Observation", "RacingEnv", "RenderMode"]
 
 Observation = npt.NDArray[np.float32]
-RenderMode = Literal["rgb_array", "human"]
-
-MAX_ACTION_REPEAT = 50_000  # [-] a timestep of 1,000 s
 
 
 def _check_tells(world: Backend, view: View, aids: Aids) -> None:
@@ -71,89 +66,46 @@ def _check_tells(world: Backend, view: View, aids: Aids) -> None:
         )
 
 
+@takes_options(RACING)
 class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
     """
     A car on a track, driven by steering and pedals.
 
     :param backend: the world
-    :param action: which numbers an action has; see :func:`sb3_torcs.actions.action_layout`
-    :param sensors: which groups of sensors an observation has; see :mod:`sb3_torcs.sensors`
-    :param reward: a preset, or a mapping from terms to weights; see :mod:`sb3_torcs.rewards`
-    :param action_repeat: control ticks of 0.02 s per timestep
-    :param start: ``"grid"``, or ``"random"``: anywhere on the track, moving, and one time in ten
-        on the grid
-    :param laps: whole laps after which the episode is truncated; ``None`` drives on
-    :param runoff: how far the mass centre may be beside the road before the episode ends [m]
-    :param recovery: how long a car may stand, or face backwards, before the episode ends [s]; 0
-        ends it after 1.5 s of standing, 3 s after a standing start, and at once if it faces
-        backwards
-    :param unstick: whether a car that is stuck across the road or beside it frees itself; actions
-        count for nothing meanwhile
-    :param keep_distance: whether a car brakes by itself where it is too close to the car ahead
-    :param keep_clear: whether a car steers away by itself from cars beside it
-    :param catch_slides: whether a car that slides steers against it by itself, before it spins
-    :param delay: control ticks by which controls arrive late; or a pair, between which each
-        episode draws
-    :param grip: factor on the friction of all ground; or a pair, as for the delay
-    :param mass: factor on the mass of the car; or a pair, as for the delay
-    :param render_mode: ``None``, or one of ``metadata["render_modes"]``
     :raises InvalidOption: if an option has a value that is not allowed
     """
 
     metadata: dict[str, Any] = {"render_modes": [*get_args(RenderMode)], "render_fps": 10.0}  # noqa: RUF012
 
-    def __init__(
-        self,
-        backend: Backend,
-        *,
-        action: ActionName = "pedals",
-        sensors: Sequence[SensorsName] = ("base",),
-        reward: RewardChoice = "progress",
-        action_repeat: int = 5,
-        start: StartName = "grid",
-        laps: int | None = None,
-        runoff: float = 0.0,
-        recovery: float = 0.0,
-        unstick: bool = False,
-        keep_distance: bool = False,
-        keep_clear: bool = False,
-        catch_slides: bool = False,
-        delay: int | Sequence[int] = 0,
-        grip: float | Sequence[float] = 1.0,
-        mass: float | Sequence[float] = 1.0,
-        render_mode: str | None = None,
-    ) -> None:
-        if not is_count(action_repeat) or action_repeat > MAX_ACTION_REPEAT:
-            raise InvalidOption(
-                f"action_repeat is {action_repeat!r}; expected a whole number from 1 to "
-                f"{MAX_ACTION_REPEAT}"
-            )
+    def __init__(self, backend: Backend, **options: Unpack[RacingOptions]) -> None:
+        given = read_options("RacingEnv.__init__", RACING, options)
+        render_mode = given["render_mode"]
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             modes = ", ".join(repr(mode) for mode in self.metadata["render_modes"])
             raise InvalidOption(f"render_mode is {render_mode!r}; expected None or one of {modes}")
         self.backend = backend
         self._draw_track = optional(backend, "draw_track")
-        self.action_repeat = int(action_repeat)
-        self.laps = checked_laps(laps)
-        self.runoff = checked_runoff(runoff)
-        self.recovery_ticks = round(checked_recovery(recovery) / CONTROL_TICK)
-        self.aids = Aids(unstick, keep_distance, keep_clear, catch_slides)
+        self.action_repeat: int = given["action_repeat"]
+        self.laps: int | None = given["laps"]
+        self.runoff: float = given["ends"]["runoff"]
+        self.recovery_ticks = round(given["ends"]["recovery"] / CONTROL_TICK)
+        self.aids = Aids.of(given["aids"])
         self.render_mode = render_mode
         self.metadata = {
             **self.metadata,
-            "render_fps": 1.0 / (action_repeat * CONTROL_TICK),
+            "render_fps": 1.0 / (self.action_repeat * CONTROL_TICK),
         }
-        self.view = View(sensors)
+        self.view = View(given["sensors"])
         _check_tells(backend, self.view, self.aids)
         self.observation_space = spaces.Box(self.view.low, self.view.high, dtype=np.float32)
-        self.action = action
-        self.layout = action_layout(action, optional(backend, "gears"))
+        self.action: ActionName = given["action"]
+        self.layout = action_layout(self.action, optional(backend, "gears"))
         self.action_space = spaces.Box(
             np.array(self.layout.low, np.float32), np.array(self.layout.high, np.float32)
         )
-        self.set_reward(reward)
-        self._starts = Starts(checked_start(start))
-        self.conditions = Conditions(delay, grip, mass)
+        self.set_reward(given["reward"])
+        self._starts = Starts(given["start"])
+        self.conditions = Conditions(given["conditions"])
         self.conditions.check(backend)
         self.delay = Delay(0, self.action_repeat)
         self.car: CarState | None = None
@@ -244,7 +196,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
 
     def set_conditions(self, choice: Mapping[str, Any]) -> dict[str, Any]:
         """
-        Change ``delay``, ``grip`` and ``mass`` from the next reset on.
+        Change the conditions from the next reset on.
 
         :param choice: those that change, by name, as in the constructor
         :return: all of them before

@@ -3,27 +3,26 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
-import numpy as np
-
-from sb3_torcs.actions import ActionName, GearboxName, used_gearbox
+from sb3_torcs.actions import used_gearbox
 from sb3_torcs.backends.native import load_race
 from sb3_torcs.backends.seats import LoadedRace, Seat, SeatWorld, SharedRace
 from sb3_torcs.backends.several import is_several, world_pool
 from sb3_torcs.car import (
-    DEFAULT_CAR,
     CarState,
     RangeFinderName,
     checked_flag,
     checked_laps,
     range_finder_angles,
 )
+from sb3_torcs.envs.arguments import read_options, select
+from sb3_torcs.envs.options import CONDITIONS, RACING, TORCS, TorcsOptions
 from sb3_torcs.envs.racing import RacingEnv
-from sb3_torcs.errors import InvalidOption, keywords_of, near_miss
+from sb3_torcs.errors import InvalidOption
 from sb3_torcs.torcs.drivers import crew_of
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.starting_list import guests_of, starting_list
@@ -31,11 +30,8 @@ from sb3_torcs.torcs.starting_list import guests_of, starting_list
 __all__ = ["RaceCarEnv", "load_shared_race", "make_race", "make_shared_race"]
 
 
-OF_ONE_AGENT = {
-    "backend": "native", "host": None, "port": None, "delay": 0, "grip": 1.0, "mass": 1.0,
-    "picture": "above", "view": "behind", "boards": True, "render_size": (640, 480),
-}  # fmt: skip
-"""Options of ``Torcs-v0`` that races of several agents do not have, and their usual values."""
+OF_ONE_AGENT = ("backend", "scr", "picture")
+"""Options of ``Torcs-v0`` that races of several agents do not have."""
 
 
 class RaceCarEnv(RacingEnv):
@@ -103,72 +99,50 @@ def load_shared_race(
 
 
 def make_race(
-    agents: int,
-    *,
-    track: str | Path | Sequence[str | Path] = "aalborg",
-    car: str | Sequence[str] = DEFAULT_CAR,
-    opponents: Sequence[str] | Sequence[Sequence[str]] = (),
-    grid_place: int | Sequence[int] | None = None,
-    range_finders: RangeFinderName | Sequence[float] = "scr",
-    action: ActionName = "pedals",
-    gearbox: GearboxName = "automatic",
-    laps: int | None = None,
-    sensor_noise: bool = False,
-    flagged: bool = False,
-    **options: Any,
+    agents: int, *, flagged: bool = False, **options: Unpack[TorcsOptions]
 ) -> list[RaceCarEnv]:
     """
     Make a race of several agents.
 
     :param agents: their number
-    :param track: as of :class:`~sb3_torcs.envs.torcs.TorcsEnv`; each race is on one of a list
-    :param car: of all agents; each race has one of a list
-    :param opponents: robots, e.g. ``"inferno"``, and shipped agents or paths of trained ones; each
-        race has one of a list of lists
-    :param grid_place: of the first agent, whom the others follow, 1 in front; ``None`` is behind
-        all opponents; each race has one of a list
-    :param range_finders: as of ``TorcsEnv``
-    :param action: as there
-    :param gearbox: as there
-    :param laps: after which the episode of an agent is truncated; ``None`` drives on
-    :param sensor_noise: as there
     :param flagged: whether agents are flagged off when the winner has finished, as robots are
-    :param options: of :class:`~sb3_torcs.envs.racing.RacingEnv`
+    :param options: of :class:`~sb3_torcs.envs.torcs.TorcsEnv`, for all agents. Each race has one of
+        a list of tracks, of cars, of lists of ``opponents``, and of places of the first agent on
+        the grid, whom the others follow
     :return: one environment for each agent
     :raises InvalidOption: if an option is for a race of one agent, or has a wrong value
     """
-    options = _of_several_agents(options)
-    checked_flag("sensor_noise", sensor_noise)
-    checked_flag("flagged", flagged)
+    given = read_options("make_race", TORCS, options)
+    _check_several_agents(given)
     race = make_shared_race(
-        agents, track, car, opponents, grid_place, sensor_noise=sensor_noise,
-        action_repeat=options.get("action_repeat", 5), range_finders=range_finders,
-        gearbox=used_gearbox(gearbox, action), laps=laps, flagged=flagged,
+        agents, given["track"], given["car"], given["opponents"], given["grid_place"],
+        sensor_noise=given["conditions"]["sensor_noise"], action_repeat=given["action_repeat"],
+        range_finders=given["range_finders"],
+        gearbox=used_gearbox(given["gearbox"], given["action"]), laps=given["laps"],
+        flagged=checked_flag("flagged", flagged),
     )  # fmt: skip
-    return [RaceCarEnv(seat, action=action, laps=laps, **options) for seat in race.seats]
+    return [RaceCarEnv(seat, **select(RACING, given)) for seat in race.seats]
 
 
-def _of_several_agents(options: dict[str, Any]) -> dict[str, Any]:
+def _check_several_agents(given: Mapping[str, Any]) -> None:
     """
-    Take out the options of a race of one agent, which have to have their usual values.
+    Refuse the options of a race of one agent.
 
-    :param options: that are not those of :func:`make_race` itself
-    :return: those of :class:`~sb3_torcs.envs.racing.RacingEnv`
-    :raises TypeError: if there is no such option
+    :param given: all options
+    :raises InvalidOption: if one has not its default
     """
-    known = {*keywords_of(RacingEnv), *OF_ONE_AGENT}
-    for name in options:
-        if name not in known:
-            every = known.union(keywords_of(make_race))
-            raise TypeError(f"a race has no option '{name}'{near_miss(name, sorted(every))}")
-    for name, usual in OF_ONE_AGENT.items():
-        given = options.get(name, usual)
-        if (tuple(given) if isinstance(given, (list, np.ndarray)) else given) != usual:
+    chosen = [(name, given[name], read_options("", TORCS, {})[name]) for name in OF_ONE_AGENT]
+    chosen += [
+        (name, given["conditions"][name], option.default)
+        for name, option in CONDITIONS.items()
+        if name != "sensor_noise"
+    ]
+    for name, value, usual in chosen:
+        if value != usual:
             raise InvalidOption(
-                f"{name} is {given!r}, which is for a race of one agent against robots; leave it "
+                f"{name} is {value!r}, which is for a race of one agent against robots; leave it "
                 "out"
             )
-    return {name: given for name, given in options.items() if name not in OF_ONE_AGENT}
 
 
 def make_shared_race(

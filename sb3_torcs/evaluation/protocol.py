@@ -16,7 +16,8 @@ import gymnasium as gym
 from sb3_torcs.agents.rollout import Driver, Timestep, drive
 from sb3_torcs.agents.saved.record import DRIVEN_WITH
 from sb3_torcs.car import CONTROL_TICK, MANY_LAPS, check_count
-from sb3_torcs.errors import BackendUnavailable, InvalidOption, keywords_of, near_miss
+from sb3_torcs.envs.options import TORCS
+from sb3_torcs.errors import BackendUnavailable, InvalidOption, near_miss
 from sb3_torcs.torcs.track_names import RANDOM_TRACK, kind_without_game
 
 __all__ = [
@@ -197,14 +198,10 @@ def race_environment(
 
 def _check_names(env_kwargs: Mapping[str, Any], env_id: str) -> None:
     """Refuse arguments that no racing environment has: a mistyped one would have no effect."""
-    from sb3_torcs.envs.torcs import TorcsEnv
-    from sb3_torcs.envs.torcs_lite import TorcsLiteEnv
-
     if env_id.rpartition(":")[2] not in (GAME, WITHOUT_GAME):
         return  # somebody's own, whose arguments are not known here
-    known = {"max_episode_steps", "flagged"}  # of gym.make, and of races of several agents
-    for kind in (TorcsEnv, TorcsLiteEnv):  # a record of one may be driven in the other
-        known.update(keywords_of(kind))
+    # A record of one may be driven in the other; and of gym.make, and of races of several agents.
+    known = {*TORCS, "max_episode_steps", "flagged"}
     for name in env_kwargs:
         if name not in known:
             raise InvalidOption(

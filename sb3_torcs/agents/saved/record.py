@@ -19,7 +19,6 @@ import yaml
 from sb3_torcs.agents.saved.file import as_mismatch
 from sb3_torcs.agents.saved.policy import Spaces, restored_space
 from sb3_torcs.car import DEFAULT_CAR
-from sb3_torcs.envs.aids import AIDS
 from sb3_torcs.errors import ModelMismatch
 from sb3_torcs.files import read_yaml
 
@@ -35,7 +34,7 @@ __all__ = [
     "record_within",
 ]
 
-DRIVEN_WITH = ("action_repeat", "range_finders", "sensors", "action", "gearbox", *AIDS)
+DRIVEN_WITH = ("action_repeat", "range_finders", "sensors", "action", "gearbox", "aids")
 """Options of its environment without which an agent does not drive as in its training."""
 
 RECORD = "sb3_torcs"
