@@ -33,7 +33,6 @@ cos, sin = map(maths.compiled, (maths.cos, maths.sin))
 BRAKING = 10.0  # [m/s²] a car on asphalt can do twice that, but not while it turns in
 BEND_SPEED = 12.0  # [m/s] in a bend behind which nothing is seen; the tightest hairpins need it
 NO_SLIDE = 0.1  # [-] speed across per speed along of a car that corners on asphalt
-ROOM = 0.5  # [m] that a car keeps to others
 
 Term = Callable[[CarState, CarState, Controls], float]
 
@@ -56,11 +55,6 @@ def speed_off_axis(before: CarState, after: CarState, controls: Controls) -> flo
 def progress(before: CarState, after: CarState, controls: Controls) -> float:
     """Metres of road gained per second [m/s]: exact over a timestep, where speeds are samples."""
     return (after.distance_raced - before.distance_raced) / (after.time - before.time)
-
-
-def time(before: CarState, after: CarState, controls: Controls) -> float:
-    """One per second [-]; a negative weight rewards speed."""
-    return 1.0
 
 
 def damage(before: CarState, after: CarState, controls: Controls) -> float:
@@ -105,14 +99,6 @@ def places(before: CarState, after: CarState, controls: Controls) -> float:
     return (before.race_position - after.race_position) / (after.time - before.time)
 
 
-def gap(before: CarState, after: CarState, controls: Controls) -> float:
-    """Metres gained per second on the car ahead, within 200 m [m/s]; 0 if places change."""
-    if before.race_position != after.race_position:
-        return 0.0
-    gained = min(before.gap_ahead, 200.0) - min(after.gap_ahead, 200.0)
-    return gained / (after.time - before.time)
-
-
 def contact(before: CarState, after: CarState, controls: Controls) -> float:
     """Contacts with other cars per second [1/s], whosever fault."""
     return (after.contacts - before.contacts) / (after.time - before.time)
@@ -121,23 +107,6 @@ def contact(before: CarState, after: CarState, controls: Controls) -> float:
 def fault(before: CarState, after: CarState, controls: Controls) -> float:
     """Contacts per second in which this car hits another with its front [1/s]."""
     return (after.faults - before.faults) / (after.time - before.time)
-
-
-def closing(before: CarState, after: CarState, controls: Controls) -> float:
-    """Speed above that from which braking at 10 m/s² avoids the car ahead, if that keeps its speed
-    [m/s].
-
-    Cars that would be passed do not count; of several the worst counts.
-    """
-    worst = 0.0
-    rivals = after.race[FIRST_RIVAL:]
-    for i in range(RIVALS):
-        along, across, faster, _, length, width = rival(rivals, i)
-        if along > 0.0 and abs(across) < width + ROOM:
-            # Between their centres lies half of each car; its own length is taken as the other's.
-            room = max(along - length - ROOM, 0.0)
-            worst = max(worst, -faster - math.sqrt(2.0 * BRAKING * room))
-    return float(worst)
 
 
 def passing(before: CarState, after: CarState, controls: Controls) -> float:
@@ -172,8 +141,8 @@ def leaving(before: CarState, after: CarState, controls: Controls) -> float:
 TERMS: dict[str, Term] = {
     term.__name__: term
     for term in (
-        speed_along, speed_across, speed_off_axis, progress, time, damage, pedals, steering,
-        sliding, overspeed, places, gap, contact, fault, closing, passing, off_line, leaving,
+        speed_along, speed_across, speed_off_axis, progress, damage, pedals, steering, sliding,
+        overspeed, places, contact, fault, passing, off_line, leaving,
     )
 }  # fmt: skip
 """By name. Own ones may be added: functions of the car before and after, and of the controls."""

@@ -3,10 +3,9 @@
 Its rows stand in groups, which an environment's ``sensors`` names: ``"base"`` are sensors of the
 SCR manual (arXiv:1304.1672, table 1), ``"preview"`` is the road ahead, ``"limits"`` are the speeds
 that it allows, ``"line"`` is the racing line, ``"opponents"``, ``"rivals"`` and ``"race"`` are the
-other cars, ``"car"`` is the car that is driven, ``"car_line"`` the racing line as fast as this car
-may be on it, and ``"motion"`` is how the car turns and jumps. The observation space, the encoder,
-the mirror image, the documentation and the policy's view of the observation are all derived from
-the table.
+other cars, ``"car"`` is the car that is driven, and ``"motion"`` is how the car turns and jumps.
+The observation space, the encoder, the mirror image, the documentation and the policy's view of the
+observation are all derived from the table.
 
 To add a group, write its rows, put them into :data:`GROUPS`, and its function into ``_WRITERS``.
 """
@@ -15,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache, partial
+from functools import lru_cache
 from itertools import accumulate, chain, combinations, pairwise
 from operator import attrgetter
 from typing import Any, Literal, NamedTuple
@@ -29,13 +28,7 @@ from sb3_torcs.car import FIRST_RIVAL, KMH, REST_HEIGHT, RIVALS, CarState, Float
 from sb3_torcs.errors import InvalidOption, near_miss
 from sb3_torcs.rivals import see_rivals
 from sb3_torcs.tracks.profile import RoadProfile
-from sb3_torcs.tracks.racing_line import (
-    LINE_PLACES,
-    USUAL_PACE,
-    look_along,
-    pace_of,
-    racing_line,
-)
+from sb3_torcs.tracks.racing_line import LINE_PLACES, look_along, racing_line
 from sb3_torcs.tracks.view_ahead import INTERVALS, QUANTITIES, look_ahead, speed_margins
 
 __all__ = [
@@ -60,7 +53,7 @@ __all__ = [
 ]
 
 SensorsName = Literal[
-    "base", "preview", "limits", "line", "opponents", "rivals", "race", "car", "car_line", "motion"
+    "base", "preview", "limits", "line", "opponents", "rivals", "race", "car", "motion"
 ]
 Mirror = Literal["same", "opposite", "reversed", "sides"]
 
@@ -167,15 +160,6 @@ CAR = (
 :class:`~sb3_torcs.torcs.car_file.CarFacts`. They stay the same all through an episode: the factors
 ``mass`` and ``grip`` of an episode's conditions are not in them, nor fuel that is burnt."""
 
-CAR_LINE = (
-    LINE[0]._replace(name="car_line_offsets", low=-25.0, high=25.0),
-    *(row._replace(name=f"car_{row.name}") for row in LINE[1:]),
-)
-"""The racing line ahead as in ``"line"``, but with margins of the car that is driven, by the grip
-of its tyres and its downforce, and with short crests. Margins of ``"line"`` are always those of the
-default car. Offsets have other bounds here, so that an observation space tells which line it has.
-"""
-
 MOTION = (
     Sensor("yaw_rate", "", 1, "rad/s", -5.0, 5.0, 1.0, "opposite"),
     Sensor("lift", "", 1, "m", -0.5, 1.0, 10.0),
@@ -183,10 +167,10 @@ MOTION = (
 """What else the car does: how fast it turns, which tells a spin as it begins, and how much higher
 it is than at rest, which tells that it is light over a crest, or flies."""
 
-NEEDS_CAR = frozenset({"car", "car_line"})
+NEEDS_CAR = frozenset({"car"})
 """Groups that only a world that knows its car's file can tell."""
 
-NEEDS_ROAD = frozenset({"preview", "limits", "line", "car_line", "motion"})
+NEEDS_ROAD = frozenset({"preview", "limits", "line", "motion"})
 """Groups that only a world that knows its track can tell: the yaw rate of ``"motion"`` is the turn
 of the road and of the car on it, where the SCR protocol tells the latter alone."""
 
@@ -199,7 +183,6 @@ GROUPS: Mapping[SensorsName, tuple[Sensor, ...]] = {
     "rivals": RIVAL_ROWS,
     "race": RACE,
     "car": CAR,
-    "car_line": CAR_LINE,
     "motion": MOTION,
 }
 """The whole table. An observation has the groups that are named, in this order."""
@@ -424,15 +407,12 @@ def _write_limits(world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -
     _scale_into(margins, _PARTS["limits"].start, numbers)
 
 
-def _write_line(
-    group: SensorsName, world: Any, car: CarState, numbers: npt.NDArray[np.float32]
-) -> None:
-    pace = pace_of(world.facts.grip, world.facts.downforce) if group == "car_line" else USUAL_PACE
-    table, step = racing_line(_profile(world), pace)
+def _write_line(world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> None:
+    table, step = racing_line(_profile(world))
     seen = np.empty((3, LINE_PLACES))
     look_along(table, step, car.distance_from_start, car.track_position, car.speed_x, seen)
     seen[1] /= np.abs(seen[1]) + USUAL_BEND
-    _scale_into(seen.ravel(), _PARTS[group].start, numbers)
+    _scale_into(seen.ravel(), _PARTS["line"].start, numbers)
 
 
 def _write_opponents(_world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> None:
@@ -460,12 +440,11 @@ def _write_motion(_world: Any, car: CarState, numbers: npt.NDArray[np.float32]) 
 _WRITERS: dict[str, Callable[[Any, CarState, npt.NDArray[np.float32]], None]] = {
     "preview": _write_preview,
     "limits": _write_limits,
-    "line": partial(_write_line, "line"),
+    "line": _write_line,
     "opponents": _write_opponents,
     "rivals": _write_rivals,
     "race": _write_race,
     "car": _write_car,
-    "car_line": partial(_write_line, "car_line"),
     "motion": _write_motion,
 }
 """Of each group but ``"base"``: fills its numbers, from the world and the state of the car."""

@@ -13,7 +13,7 @@ from vectors import assert_they_see_the_same, both_kinds
 import sb3_torcs  # noqa: F401  # registers the ids
 from sb3_torcs.envs.torcs_race import make_race
 from sb3_torcs.errors import CarFileError, InvalidOption
-from sb3_torcs.sensors import CAR, LINE, View, feature_slices, view_of
+from sb3_torcs.sensors import CAR, feature_slices
 from sb3_torcs.torcs.car_file import CarFacts, car_facts
 
 SENSORS = ("base", "car")
@@ -200,59 +200,10 @@ def test_agents_of_one_race_see_their_car(game):
         env.close()
 
 
-@pytest.mark.parametrize("group", ["car", "car_line"])
 @pytest.mark.parametrize(("env_id", "options"), [
     ("TorcsLite-v0", {}), ("Torcs-v0", {"backend": "scr"}),
 ])  # fmt: skip
-def test_a_world_that_does_not_read_the_file_refuses(game, group, env_id, options):
+def test_a_world_that_does_not_read_the_file_refuses(game, env_id, options):
     del game
-    with pytest.raises(InvalidOption, match=rf"sensors '{group}' are of the car's file.*'native'"):
-        gym.make(env_id, sensors=("base", group), **options)
-
-
-# --------------------------------------------------------------------------- the line of the car
-
-
-def seen_lines(car):
-    """Offsets and bends, and margins, of the usual line and of that of a car, at 30 m/s."""
-    sensors = ("base", "line", "car_line")
-    parts = feature_slices(sensors)
-    with contextlib.closing(gym.make("Torcs-v0", car=car, sensors=sensors)) as env:
-        seen, _ = env.reset(seed=0, options={"distance": 300.0, "speed": 30.0})
-    lines = []
-    for first in ("line", "car_line"):
-        where = slice(parts[f"{first}_offsets"].start, parts[f"{first}_bends"].stop)
-        lines.append((seen[where], seen[parts[f"{first}_margins"]] / LINE[2].scale))
-    return lines
-
-
-@pytest.mark.usefixtures("game")
-@pytest.mark.parametrize(("car", "faster"), [("car1-ow1", 1), ("p406", -1), ("baja-bug", -1)])
-def test_the_line_of_a_car_lies_where_all_do_and_is_as_fast_as_the_car(car, faster):
-    (usual, margins), (own, own_margins) = seen_lines(car)
-    np.testing.assert_array_equal(own, usual)
-    within = np.abs(margins) < 39.0
-    assert within.any()
-    assert np.all(faster * (own_margins - margins)[within] >= 0.0)
-    assert np.abs(own_margins - margins)[within].max() > 1.0
-
-
-@pytest.mark.usefixtures("game")
-def test_the_line_of_the_default_car_is_the_usual_one():
-    (_, margins), (_, own_margins) = seen_lines("car1-trb1")
-    within = np.abs(margins) < 39.0
-    np.testing.assert_allclose(own_margins[within], margins[within], atol=0.1)
-
-
-@pytest.mark.usefixtures("game")
-def test_races_driven_at_once_see_their_lines():
-    options = {"car": CARS, "start": "random", "max_episode_steps": 9, "track": ROADS}
-    with both_kinds("Torcs-v0", sensors=("base", "car_line"), **options) as (ours, theirs):
-        assert_they_see_the_same(ours, theirs)
-
-
-def test_a_space_tells_which_line_it_has():
-    """A model without a record is rebuilt by its space."""
-    for sensors in (("base", "line"), ("base", "car_line"), ("base", "line", "car")):
-        view = View(sensors)
-        assert view_of(view).sensors == sensors
+    with pytest.raises(InvalidOption, match=r"sensors 'car' are of the car's file.*'native'"):
+        gym.make(env_id, sensors=("base", "car"), **options)

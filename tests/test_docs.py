@@ -197,7 +197,6 @@ GENERATED = {
         "rivals": functools.partial(sensor_table, "rivals"),
         "race": functools.partial(sensor_table, "race"),
         "car": functools.partial(sensor_table, "car"),
-        "car-line": functools.partial(sensor_table, "car_line"),
         "motion": functools.partial(sensor_table, "motion"),
         "range-finders": range_finders_table,
         "terms": terms_table,

@@ -125,12 +125,15 @@ def test_an_episode_cut_by_the_time_limit_is_called_so():
 
 def test_each_term_of_the_reward_is_summed_over_an_episode(oval):
     """An episode that still runs counts when it ends, from its beginning."""
-    off, metrics = {"distance_from_axis": 6.0}, DrivingMetricsCallback()
-    model = scripted_model(oval, {}, off, off, {}, reward={"time": 10.0, "crash": -8.0})
+    on, metrics = {"speed_x": 10.0}, DrivingMetricsCallback()
+    off = {**on, "distance_from_axis": 6.0}
+    model = scripted_model(oval, on, off, off, on, reward={"speed_along": 1.0, "crash": -8.0})
     values = logged(model, [STILL] * 4, metrics)
     # Episodes of two timesteps and of one, of 0.1 s each; the third one has not ended yet.
     assert values["reward/crash"] == -8.0
-    assert values["reward/time"] == pytest.approx(1.5, rel=1e-12)  # 0.1 s is a rounded number
+    assert values["reward/speed_along"] == pytest.approx(
+        1.5, rel=1e-12
+    )  # 0.1 s is a rounded number
     assert sum(key.startswith("reward/") for key in values) == 2
 
 

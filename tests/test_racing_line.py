@@ -24,7 +24,6 @@ from sb3_torcs.tracks.racing_line import (
     TURN,
     driven,
     look_along,
-    pace_of,
     racing_line,
 )
 
@@ -128,20 +127,6 @@ def test_speed_goes_with_the_surface_and_the_banking():
     assert slowest(ring(banking=0.2, side=-1.0)) == pytest.approx(falls_to_the_left, rel=1e-3)
 
 
-def test_speed_goes_with_the_car():
-    """Its tyres count as the surface does, and its downforce by what it adds to the load."""
-    bend = 1.0 / 96.5
-    usual = racing_line(ring())
-    slow = racing_line(ring(), pace_of(0.8, 0.0))
-    assert slow.table[:, SPEED].min() == pytest.approx(0.7 * 9.81 / bend, rel=1e-3)
-    np.testing.assert_allclose(slow.table[:, SLOWING], 6.0)
-    fast = racing_line(ring(), pace_of(1.6, 0.00448))
-    pressed = 1.4 * 9.81 / (bend - 1.4 * 0.006)
-    assert fast.table[:, SPEED].min() == pytest.approx(pressed, rel=1e-3)
-    for line in (slow, fast):
-        np.testing.assert_array_equal(line.table[:, :SPEED], usual.table[:, :SPEED])
-
-
 def test_a_crest_is_slower_than_a_dip_and_brakes_do_more_uphill():
     """The road climbs by 20 m in its first half, and falls in its second."""
     table = racing_line(ring(climbs=(20.0, -20.0))).table
@@ -151,15 +136,6 @@ def test_a_crest_is_slower_than_a_dip_and_brakes_do_more_uphill():
     slope = 20.0 / (np.pi * 100.0)
     assert table[middle // 2, SLOWING] == pytest.approx(12.0 + 9.81 * slope, rel=1e-6)
     assert table[middle + middle // 2, SLOWING] == pytest.approx(12.0 - 9.81 * slope, rel=1e-6)
-
-
-def test_the_pace_of_a_car_minds_short_crests_and_no_short_dips():
-    """A kink counts by the distance over which it is measured: five times as much over a fifth."""
-    road = ring(climbs=(20.0, -20.0))
-    usual, careful = racing_line(road).table, racing_line(road, pace_of(1.6, 0.00224)).table
-    top = (len(usual) - 1) // 2
-    assert careful[top, SPEED] < 0.5 * usual[top, SPEED]
-    assert careful[0, SPEED] == usual[0, SPEED]
 
 
 def test_the_line_of_a_track_is_drawn_as_fast_as_brakes_allow(oval):

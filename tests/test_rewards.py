@@ -27,14 +27,12 @@ AFTER = car_state(
         ("speed_across", 10.0 * math.sin(math.pi / 6.0)),
         ("speed_off_axis", 5.0),
         ("progress", 8.0),
-        ("time", 1.0),
         ("damage", 0.0),
         ("pedals", 0.0),
         ("steering", 0.0),
         ("sliding", 0.0),
         ("overspeed", 0.0),
         ("places", 0.0),
-        ("gap", 0.0),
         ("contact", 0.0),
         ("fault", 0.0),
     ],
@@ -82,16 +80,6 @@ def test_a_place_gained_counts_once_however_long_the_timestep():
     ] == pytest.approx(-2.0)
 
 
-@pytest.mark.parametrize(
-    ("place", "was", "now", "value"),
-    [(4, 12.0, 7.0, 5.0), (4, 7.0, 12.0, -5.0), (4, 900.0, 190.0, 10.0), (3, 2.0, 80.0, 0.0)],
-)
-def test_a_gap_that_closes_is_a_gain(place, was, now, value):
-    """Beyond 200 m nothing counts, nor does the gap to another car after a place was gained."""
-    before, after = in_a_race(BEFORE, 4, was), in_a_race(AFTER, place, now)
-    assert Reward({"gap": 1.0})(before, after, GAS, None)["gap"] == value
-
-
 def test_a_contact_is_told_from_one_s_own_fault():
     before, after = in_a_race(BEFORE, 4, 9.0, 1.0, 0.0), in_a_race(AFTER, 4, 9.0, 3.0, 1.0)
     terms = Reward({"contact": -1.0, "fault": -1.0})(before, after, GAS, None)
@@ -103,25 +91,6 @@ def test_off_line_is_how_far_the_side_is_over_the_edge(offset, over):
     """Of a car of 1.94 m on a road of 10 m."""
     car = AFTER._replace(distance_from_axis=offset, speed_x=20.0, track_width=10.0)
     assert TERMS["off_line"](BEFORE, car, GAS) == pytest.approx(20.0 * over)
-
-
-@pytest.mark.parametrize(
-    ("along", "across", "faster", "over"),
-    [
-        (30.0, 0.0, -10.0, 0.0),  # far enough away to brake
-        (10.0, 1.0, -20.0, 10.0),
-        (10.0, -3.0, -20.0, 0.0),  # beside the way
-        (-10.0, 0.0, -20.0, 0.0),  # behind
-        (4.0, 0.0, -3.0, 3.0),  # too close already
-        (4.0, 0.0, 3.0, 0.0),  # drives away
-    ],
-)
-def test_closing_is_the_speed_that_cannot_be_lost_before_a_car(along, across, faster, over):
-    """It is 4.5 m long and 2 m wide, and half a metre is kept: 5 m are braked from 10 m/s."""
-    race = NO_RACE.copy()
-    for place, value in enumerate((along, across, faster, 0.0, 4.5, 2.0)):
-        race[5 + RIVALS * place + 1] = value
-    assert TERMS["closing"](BEFORE, AFTER._replace(race=race), GAS) == pytest.approx(over)
 
 
 @pytest.mark.parametrize(
@@ -214,7 +183,7 @@ def test_a_term_that_somebody_adds_is_a_function_and_has_a_name_of_its_own(monke
     monkeypatch.setitem(TERMS, "odd", lambda *_: np.float32(0.5))
     value = Reward({"odd": 2.0})(BEFORE, AFTER, GAS, None)["odd"]
     assert (value, type(value)) == (0.5, float)
-    monkeypatch.setitem(TERMS, "scale", TERMS["time"])
+    monkeypatch.setitem(TERMS, "scale", TERMS["pedals"])
     with pytest.raises(InvalidOption, match=r"called 'scale', .* by another name"):
         Reward("progress")
 

@@ -294,7 +294,7 @@ def test_changes_through_methods_and_attributes_count(env_id, make):
         envs.seed(5)
     assert_same(ours.reset(), theirs.reset())
     changes = [
-        lambda envs: envs.env_method("set_reward", {"damage": 1, "time": -1.0}, indices=[1]),
+        lambda envs: envs.env_method("set_reward", {"damage": 1, "steering": -1.0}, indices=[1]),
         lambda envs: envs.env_method("set_start", "random"),
         lambda envs: envs.env_method("reset", indices=[2], options={"speed": 30.0})[0][0],
         lambda envs: [env.unwrapped.step(GAS)[0] for env in envs.envs],
@@ -338,7 +338,7 @@ def test_a_term_that_somebody_adds_is_asked(make, monkeypatch):
         return -abs(controls.steering) * float(after.wheel_speeds[0]) - after.gear
 
     monkeypatch.setitem(rewards.TERMS, "gentle", gentle)
-    options = {"reward": {"progress": 1.0, "gentle": 0.3, "time": -0.1}, "start": "random"}
+    options = {"reward": {"progress": 1.0, "gentle": 0.3, "steering": -0.1}, "start": "random"}
     ours, theirs = make(2, env_id=LITE, **options), plain(2, LITE, **options)
     for envs in (ours, theirs):
         envs.seed(0)

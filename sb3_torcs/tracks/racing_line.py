@@ -26,12 +26,9 @@ from sb3_torcs.tracks.view_ahead import FASTEST, place_at
 __all__ = [
     "LINE_DISTANCES",
     "LINE_PLACES",
-    "USUAL_PACE",
-    "Pace",
     "RacingLine",
     "driven",
     "look_along",
-    "pace_of",
     "racing_line",
 ]
 
@@ -52,27 +49,13 @@ EDGE = 1.5  # [m] from the edge of the road to the middle of the car, at least
 
 GRAVITY = 9.81  # [m/s²]
 USUAL_FRICTION = 1.1  # [-] of asphalt
-USUAL_GRIP = 1.6  # [-] the default car's own factor on the friction of the ground
-USUAL_DOWNFORCE = 0.00224  # [1/m] of the default car by its file
+# What a careful driver dares in the default car on usual asphalt. The best agents and robots take
+# bends 10 to 30 % faster.
+TYRES = 1.4  # [-] force across per load
+DOWNFORCE = 0.003  # [1/m] load of the air per mass and speed²
+BRAKING = 12.0  # [m/s²]
 LEAST = 1.0  # [m/s²] across that every road bears
 HILLS = 20.0  # [m] before and after a place, over which the road's rise and fall are measured
-CREST = 4.0  # [m] the same for crests alone: short ones throw a car up, too
-
-
-class Pace(NamedTuple):
-    """
-    What a careful driver dares on usual asphalt, by default in the default car.
-
-    The best agents and robots take bends 10 to 30 % faster.
-    """
-
-    tyres: float = 1.4  # [-] force across per load
-    downforce: float = 0.003  # [1/m] load of the air per mass and speed²
-    braking: float = 12.0  # [m/s²]
-    crest: float = HILLS  # [m] before and after a place, over which a crest is measured
-
-
-USUAL_PACE = Pace()
 
 
 class RacingLine(NamedTuple):
@@ -156,18 +139,17 @@ class _Path(NamedTuple):
 
 
 @lru_cache(maxsize=512)
-def racing_line(road: RoadProfile, pace: Pace = USUAL_PACE) -> RacingLine:
+def racing_line(road: RoadProfile) -> RacingLine:
     """
     Find the racing line of a road, and how fast it may be driven.
 
-    It takes some hundredths of a second, once per road, and little more for each other pace.
+    It takes some hundredths of a second, once per road.
 
     :param road: closed
-    :param pace: of the driver; the usual one leaves short crests out
     :return: the line
     """
     path = _path(road)
-    speed, slowing = _limits(path, pace)
+    speed, slowing = _limits(path)
     table = np.stack([path.offsets, path.turned, speed, slowing, path.half_widths], axis=1)
     table = np.vstack([table, table[0]])
     table[-1, TURN] += path.lap
@@ -175,20 +157,6 @@ def racing_line(road: RoadProfile, pace: Pace = USUAL_PACE) -> RacingLine:
     return RacingLine(table, path.step)
 
 
-def pace_of(grip: float, downforce: float) -> Pace:
-    """
-    Return how a careful driver drives a car.
-
-    :param grip: its tyres' factor on the friction of the ground [-]
-    :param downforce: of the air, per speed squared and mass [1/m]
-    :return: the usual pace, changed as the car differs from the default one
-    """
-    holds, pressed = grip / USUAL_GRIP, downforce / USUAL_DOWNFORCE
-    usual = USUAL_PACE
-    return Pace(usual.tyres * holds, usual.downforce * pressed, usual.braking * holds, CREST)
-
-
-@lru_cache(maxsize=64)
 def _path(road: RoadProfile) -> _Path:
     """Find where the racing line of a closed road lies."""
     length = road.step * (len(road.sums) - 1)
@@ -255,7 +223,7 @@ def _turn(line: FloatArray, heading: float, lap: float) -> tuple[FloatArray, Flo
     return 0.5 * (before + after), 2.0 * (after - before) / (lengths + np.roll(lengths, 1))
 
 
-def _limits(path: _Path, pace: Pace) -> tuple[FloatArray, FloatArray]:
+def _limits(path: _Path) -> tuple[FloatArray, FloatArray]:
     """
     Find how fast the places of a line can be driven.
 
@@ -264,17 +232,16 @@ def _limits(path: _Path, pace: Pace) -> tuple[FloatArray, FloatArray]:
     v² · curvature = grip · tyres · (g + v² · (rounding + downforce)) + g · banking.
 
     :param path: of the line
-    :param pace: of the driver
     :return: (n,) squares of the speeds [m²/s²], and (n,) how fast brakes slow down [m/s²]
     """
     climb, step, curvature, banking = path.climb, path.step, path.curvature, path.banking
     level = (climb - climb[-1] * np.linspace(0.0, 1.0, len(climb)))[:-1]
-    rounding = np.minimum(_rounding(level, HILLS, step), _rounding(level, pace.crest, step))
-    tyres = path.grip * pace.tyres
+    rounding = _rounding(level, HILLS, step)
+    tyres = path.grip * TYRES
     held = GRAVITY * (tyres - np.sign(curvature) * banking)
-    needed = np.abs(curvature) - tyres * (rounding + pace.downforce)
+    needed = np.abs(curvature) - tyres * (rounding + DOWNFORCE)
     speed = np.maximum(held, LEAST) / np.maximum(needed, LEAST / FASTEST**2)
-    slowing = path.grip * pace.braking + GRAVITY * np.diff(climb) / step
+    slowing = path.grip * BRAKING + GRAVITY * np.diff(climb) / step
     return np.minimum(speed, FASTEST**2), np.maximum(slowing, LEAST)
 
 
