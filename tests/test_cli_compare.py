@@ -82,7 +82,7 @@ def test_a_ghost_drives_as_it_did(tmp_path):
 
 
 def test_the_documented_json_is_what_it_prints(saved, tmp_path, capsys):
-    page = Path(__file__).parent.parent / "docs" / "lap-report.md"
+    page = Path(__file__).parent.parent / "docs" / "compare.md"
     example = json.loads(page.read_text("utf-8").split("```json\n")[1].split("```")[0])
     _, out, _ = run(capsys, saved, "--html", tmp_path / "page.html", "--json")
     printed = json.loads(out)

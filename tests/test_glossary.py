@@ -1,7 +1,8 @@
-"""One word for one thing: what `docs/glossary.md` rules out stands in no file of the project."""
+"""One word for one thing, and plain words: what `docs/glossary.md` rules out stands nowhere."""
 
 from __future__ import annotations
 
+import ast
 import re
 
 import pytest
@@ -117,3 +118,103 @@ def test_the_glossary_has_every_word():
     page = (ROOT / "docs" / "glossary.md").read_text(encoding="utf-8")
     for word in BANNED:
         assert f"\n| {word.partition(',')[0]} |" in page
+
+
+# ------------------------------------------------------------------------------ plain words
+
+
+PLAIN = {  # what to write: the words not to use for it
+    "again, new": r"anew",
+    "the same, equal, both": r"alike",
+    "also, other than": r"besides",
+    "who, anyone who": r"whoever|whosever",
+    "no one, or name who": r"nobody",
+    "its own": r"of (?:its|their|one's) own",
+    "is, yields, reaches": r"(?:come|comes|came|coming) to(?! a (?:stand|stop)\b)",
+    "report, show, write, name": r"tell|tells|told|telling",
+    "print, write, report, name": r"say|says|said|saying",
+}
+DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+GENERATED = re.compile(r"<!-- ([\w-]+) -->\n.*?<!-- /\1 -->", re.DOTALL)  # from docstrings
+
+
+def stilted(text, name="page.md"):
+    """What a text writes in words that are not plain, with the lines' numbers."""
+    found = []
+    for number, line in enumerate(text.splitlines(), 1):
+        for better, pattern in PLAIN.items():
+            word = re.search(rf"\b(?:{pattern})\b", line, re.IGNORECASE)
+            if word:
+                found.append(f"{name}:{number}: '{word[0]}'; write: {better}")
+    return found
+
+
+def prose_of(path):
+    """A page without its generated tables, whose lines stay counted."""
+    return GENERATED.sub(lambda m: "\n" * m[0].count("\n"), path.read_text(encoding="utf-8"))
+
+
+def prose_in_code(path):
+    """
+    Docstrings, errors that are raised, and texts of ``--help``, each on its line.
+
+    To check a file of the package: ``stilted(prose_in_code(path), path.name)``.
+    """
+    lines = [""] * len(path.read_text(encoding="utf-8").splitlines())
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        parts = []
+        if isinstance(node, DOCUMENTED) and ast.get_docstring(node):
+            parts = [node.body[0].value]
+        elif isinstance(node, ast.Raise) and node.exc:
+            parts = [part for part in ast.walk(node.exc) if isinstance(part, ast.Constant)]
+        elif isinstance(node, ast.keyword) and node.arg in ("help", "description", "epilog"):
+            parts = [part for part in ast.walk(node.value) if isinstance(part, ast.Constant)]
+        for part in parts:
+            if isinstance(part.value, str):
+                for offset, line in enumerate(part.value.splitlines()):
+                    at = min(part.lineno - 1 + offset, len(lines) - 1)
+                    lines[at] += " " + line
+    return "\n".join(lines)
+
+
+def pages():
+    """All pages that people read: docs, those beside them, cards of agents."""
+    folders = (ROOT, ROOT / "docs", ROOT / "examples", ROOT / "tools")
+    yield from (page for folder in folders for page in sorted(folder.glob("*.md")))
+    yield from sorted((ROOT / "sb3_torcs" / "agents").glob("*/README.md"))
+
+
+def test_pages_are_written_in_plain_words():
+    found = [
+        fault for page in pages() for fault in stilted(prose_of(page), str(page.relative_to(ROOT)))
+    ]
+    assert not found, "\n".join(found)
+
+
+@pytest.mark.parametrize(
+    ("sentence", "word"),
+    [
+        ("It begins anew.", "anew"),
+        ("Besides, both look alike.", "alike"),
+        ("whoever drives", "whoever"),
+        ("a race of its own", "of its own"),
+        ("Its mean place comes to 1.35.", "comes to"),
+        ("The error tells what is wrong.", "tells"),
+        ("as the file says", "says"),
+    ],
+)
+def test_a_word_that_is_not_plain_is_caught(sentence, word):
+    assert any(f"'{word}'" in fault for fault in stilted(sentence))
+
+
+def test_plain_words_pass():
+    assert not stilted("A car comes to a stand. The essay lists sayings.")
+
+
+def test_prose_in_code_is_found(tmp_path):
+    file = tmp_path / "module.py"
+    file.write_text(
+        '"""It tells."""\nNAME = "told"\n\n\ndef fail(add):\n'
+        '    add(help="says")\n    raise ValueError(f"nobody {NAME}")\n'
+    )
+    assert [fault.split(":")[1] for fault in stilted(prose_in_code(file))] == ["1", "6", "7"]
