@@ -484,8 +484,8 @@ NOT_IN_THE_PACKAGE = {  # Python's, Gymnasium's, SB3's, PyTorch's, the game's
     "TD3Policy", "RecurrentPPO", "SCR", "Graphic",
     "NormalizeObservation", "ObservationWrapper", "ParallelTrainCallback", "RewardWrapper",
     "TimeAwareObservation", "VecVideoRecorder", "Wrapper",
-    "learn", "predict", "render", "reset", "env_method", "make", "make_vec", "load", "set_num_threads",
-    "parameters",
+    "learn", "predict", "render", "reset", "env_method", "make", "make_vec", "load",
+    "set_num_threads", "parameters",
 }  # fmt: skip
 FILE = (
     r"[\w./-]+\.(?:py|h|cpp|md|yml|csv|sha256|webp)"
