@@ -90,6 +90,9 @@ sanitize: install game ## run the engine's tests under AddressSanitizer and UBSa
 	  $(BIN)/python -m pytest -p no:xdist tests/test_native*.py
 	@$(MAKE) native
 
+docs: install ## build the documentation as a site, in build/docs/
+	$(BIN)/python tools/build_docs.py
+
 bench: install ## measure speeds
 	$(BIN)/sb3-torcs bench
 
@@ -121,4 +124,4 @@ clean: ## remove .venv/ and what was built; trainings stay
 	rm -rf build dist *.egg-info sb3_torcs/*.so $(VENV)
 
 .PHONY: help demo test test-rare install native game browser pytest lock test-newest test-oldest \
-  check-machines wheels sanitize bench format check-codestyle lint type commit-checks clean
+  check-machines wheels sanitize docs bench format check-codestyle lint type commit-checks clean
