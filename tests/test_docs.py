@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import ast
 import configparser
+import csv
 import functools
 import importlib.util
 import inspect
@@ -64,7 +65,8 @@ def markdown(headers, rows):
 
 def one_line(text):
     """Text in one line, with Markdown's code instead of reStructuredText's."""
-    return " ".join(text.split()).replace("``", "`")
+    text = re.sub(r":\w+:`(?:~[\w.]+\.)?([^`]+)`", r"`\1`", " ".join(text.split()))
+    return text.replace("``", "`")
 
 
 def arguments(environment):
@@ -610,6 +612,20 @@ def leads_somewhere(page, target):
 def test_local_links_lead_somewhere():
     pages = [*PAGES, *PACKAGE.glob("agents/*/README.md")]
     assert_none(fault for page in pages for fault in lost_links(page))
+
+
+def test_tables_of_results_are_whole_and_listed():
+    """Each file is a rectangle with a header, and the index has its number of rows."""
+    folder = ROOT / "docs" / "results"
+    index = (folder / "index.csv").read_text("utf-8").splitlines()
+    listed = {row["file"]: row for row in csv.DictReader(index)}
+    assert {"index.csv", *listed} == {path.name for path in folder.iterdir()}
+    for name, row in listed.items():
+        header, *rows = csv.reader((folder / name).read_text("utf-8").splitlines())
+        assert all(header), name
+        assert len(set(header)) == len(header), name
+        assert {len(cells) for cells in rows} == {len(header)}, name
+        assert len(rows) == int(row["rows"]), name
 
 
 def test_the_pictures_are_small_enough_for_a_first_look():
