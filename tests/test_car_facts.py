@@ -168,7 +168,7 @@ def shown(game, car):
 
 def test_each_episode_shows_the_car_that_it_draws(game):
     """All through, also with another mass and grip."""
-    options = {"car": CARS, "sensors": SENSORS, "mass": 1.5, "grip": 0.8}
+    options = {"car": CARS, "sensors": SENSORS, "conditions": {"mass": 1.5, "grip": 0.8}}
     with contextlib.closing(gym.make("Torcs-v0", **options)) as env:
         assert env.observation_space.shape == (35,)
         assert feature_slices(SENSORS)["car_grip"].start == FACTS.start

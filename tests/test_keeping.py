@@ -8,7 +8,6 @@ import random
 import resource
 import shlex
 import signal
-import sys
 import time
 from contextlib import nullcontext
 

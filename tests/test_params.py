@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sb3_torcs.torcs.params import Node
+from sb3_torcs.torcs.nodes import Node
 
 RACE = """<?xml version="1.0" encoding="UTF-8"?>
 <params name="race" type="param">

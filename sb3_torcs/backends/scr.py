@@ -297,13 +297,12 @@ class ScrBackend:
             with bound:
                 self._process = start_server(self._game, self._race, [bound])
                 self._address = bound.getsockname()
-        manners: dict[str, Any] = {
-            "patience": self.patience, "silence": SILENCE, "latencies": self.latencies,
-            "skips_broken": True,
-        }  # fmt: skip
+        manners: dict[str, Any] = {"name": self.driver_name, "watch": self.watch}
         if self._own:
-            manners = {"patience": PATIENCE, "pause": PAUSE}
-        manners |= {"name": self.driver_name, "watch": self.watch}
+            manners |= {"patience": PATIENCE, "pause": PAUSE}
+        else:
+            manners |= {"patience": self.patience, "silence": SILENCE, "skips_broken": True}
+            manners["latencies"] = self.latencies
         self._client = ScrClient(*self._address, self.range_finder_angles, **manners)
         self._client.identify(start)
 

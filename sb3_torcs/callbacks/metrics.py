@@ -247,8 +247,8 @@ class DrivingMetricsCallback(BaseCallback):
         listening: list[LineListener] = [
             callback
             for callback in others
-            if isinstance(callback, LineListener)
-            and not isinstance(callback, DrivingMetricsCallback)
+            if not isinstance(callback, DrivingMetricsCallback)
+            and isinstance(callback, LineListener)
         ]
         self.listeners = listening if first is self else []  # each line once
         self._evaluations = [

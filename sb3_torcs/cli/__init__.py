@@ -62,7 +62,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _name_process() -> None:
-    """Choose the name in lists of processes: SCR clients end games of theirs by `pkill torcs`."""
+    """Choose another name in lists of processes: SCR clients end what is called torcs."""
     with contextlib.suppress(OSError):  # only Linux has it
         Path("/proc/self/comm").write_text(PROCESS_NAME, encoding="utf-8")
 

@@ -11,7 +11,7 @@ from sb3_torcs.actions import SHIFT_DOWN_RPM, SHIFT_UP_RPM, automatic_gear, laun
 from sb3_torcs.car import LIMITER_RPM, Controls, FloatArray
 from sb3_torcs.errors import CarFileError
 from sb3_torcs.scr.protocol import MotorReading
-from sb3_torcs.torcs.params import Node
+from sb3_torcs.torcs.nodes import Node
 
 __all__ = ["Gearbox", "read_gearbox"]
 

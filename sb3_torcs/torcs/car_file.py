@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from sb3_torcs import maths
 from sb3_torcs.errors import CarFileError
-from sb3_torcs.torcs.params import Node
+from sb3_torcs.torcs.nodes import Node
 
 __all__ = ["CarFacts", "car_facts"]
 

@@ -28,7 +28,7 @@ from sb3_torcs.torcs.track_names import TrackFile, find_track
 
 __all__ = ["PROCESS_NAME", "GameProcess", "TrackCheck", "compiled_library", "game_environment"]
 
-PROCESS_NAME = "racing-game"  # as `ps` lists it, and `pkill` finds it
+PROCESS_NAME = "racing-game"  # in lists of processes
 PREFIX = "sb3-torcs-game-"  # of private folders
 LAST_LINES = 5  # [lines] of the game's output, for an error
 OWN_TRACKS = "own"  # the category of a track that is not the game's
@@ -114,7 +114,7 @@ class GameProcess:
                 call += ["-r", str(self.folder / RACE_FILE)]
             else:
                 variables["SB3_TORCS_RACE"] = str(self.folder / RACE_FILE)
-            # Scripts of gym_torcs call `pkill torcs`: that shall end what they have started.
+            # Clients end games of their own by the name torcs.
             (self.folder / PROCESS_NAME).symlink_to(game.program)
             self._process = _start(call, self.folder, data, variables, descriptors)
         except BaseException:

@@ -12,7 +12,7 @@ from typing import Literal
 from sb3_torcs.car import DEFAULT_CAR, MANY_LAPS, checked_choice, checked_laps
 from sb3_torcs.errors import GameIncomplete, InvalidOption
 from sb3_torcs.torcs.installation import Game
-from sb3_torcs.torcs.params import Node
+from sb3_torcs.torcs.nodes import Node
 from sb3_torcs.torcs.starting_list import GRID_SLOTS
 
 __all__ = [

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from sb3_torcs.errors import GameFailed
-from sb3_torcs.torcs.params import Node
+from sb3_torcs.torcs.nodes import Node
 from sb3_torcs.torcs.process import GameProcess
 from sb3_torcs.torcs.race_results import Lap, RobotResult
 from sb3_torcs.torcs.race_setup import RACE_FILE, SCR_SERVER, RaceSetup

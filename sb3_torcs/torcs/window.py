@@ -10,7 +10,7 @@ from typing import Literal, TypedDict
 
 from sb3_torcs.errors import GameIncomplete, InvalidOption, near_miss
 from sb3_torcs.torcs.installation import Game
-from sb3_torcs.torcs.params import Node
+from sb3_torcs.torcs.nodes import Node
 from sb3_torcs.torcs.process import compiled_library
 
 __all__ = ["VIEWS", "ViewName", "Window", "WindowArguments", "window_arguments", "window_files"]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.files import IN_A_FOLDER, whole_file
-from sb3_torcs.torcs.params import Node
+from sb3_torcs.torcs.nodes import Node
 from sb3_torcs.tracks.compact import surfaces_of
 from sb3_torcs.tracks.track import Segment, Track
 
