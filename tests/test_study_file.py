@@ -110,15 +110,6 @@ def test_a_file_that_is_no_study_is_told(tmp_path, text, says):
         read_study(tmp_path / "none.yml")
 
 
-def test_an_older_name_of_an_argument_changes_the_newer_one():
-    """Study files of older versions say what they said, also of an entry with the newer name."""
-    path = "sb3_torcs.callbacks.NoiseDecayCallback"
-    entry = {"callback": [{path: {"timesteps": 5, "floor": 0.1}}]}
-    with pytest.warns(DeprecationWarning, match="'frames' is now called 'timesteps'"):
-        changed = merged(entry, {"callback": {path: {"frames": 9}}})
-    assert changed == {"callback": [{path: {"timesteps": 9, "floor": 0.1}}]}
-
-
 def test_changes_are_merged_into_an_entry():
     noise, brake = "x.Noise", "x.Brake"
     entry = {"gamma": 0.9, "kwargs": {"a": 1, "b": 2}, "callback": ["x.First", {noise: {"dt": 1}}]}

@@ -33,11 +33,6 @@ def accepted(entry, algo="ddpg"):
     zoo.check_entry({**MINIMAL, **entry}, algo, "TorcsLite-v0", zoo.Place(zoo.Path("x"), "here"))
 
 
-def test_an_older_name_of_an_argument_is_read():
-    """By the constructor, which warns; an older hyperparameter file goes on working."""
-    accepted({"callback": [{"sb3_torcs.callbacks.NoiseDecayCallback": {"timesteps": 9}}]})
-
-
 def test_a_file_is_shipped_for_ddpg():
     assert "ddpg" in [path.stem for path in SHIPPED]
 

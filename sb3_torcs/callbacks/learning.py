@@ -157,6 +157,8 @@ class LeanUpdatesCallback(WhileLearning):
             lean = LeanPPO(model)
             lean.read_parameters()
             vars(model.policy)["forward"] = LeanForward(lean)
+        elif isinstance(model, TD3) and self._updates is None and updates.is_for(model):
+            self._updates = LeanUpdates(model)  # the actor decides in another way, too
 
     def _change(self) -> Callable[..., None] | None:
         self._undo()
