@@ -176,7 +176,7 @@ def verbs() -> list[str]:
 
 def help_of(verb: str) -> str:
     """Return what ``sb3-torcs VERB --help`` prints."""
-    os.environ["COLUMNS"] = "96"
+    os.environ["COLUMNS"] = "90"
     with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.suppress(SystemExit):
         sb3_torcs.cli.main([verb, "--help"])
     return out.getvalue()
