@@ -18,6 +18,7 @@ import yaml
 from processes import Program, processes_of
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_torcs.agents.saved.record import BEST_MODEL
 from sb3_torcs.cli import main
 from sb3_torcs.cli.study import Board
 from sb3_torcs.errors import RayUnavailable, StudyError
@@ -102,7 +103,8 @@ def begun(tmp_path):
     study = read_study(study_file(tmp_path))
     store = StudyFolder(tmp_path / "out", study)
     store.begin()
-    store.put(study.trials[0], {"state.json": b"1"}, [evaluated(study.trials[0])])
+    files = {"state.json": b"1", BEST_MODEL: b"2"}
+    store.put(study.trials[0], files, [evaluated(study.trials[0])])
     return study, store
 
 
@@ -341,7 +343,7 @@ def test_another_recipe_is_told_by_what_is_different(begun, tmp_path, changes, t
 def test_what_the_file_names_no_more_stays_in_the_table(begun, tmp_path):
     """Fewer seeds, or another variant: nothing that was measured gets lost."""
     study, store = begun
-    store.put(study.trials[1], {"state.json": b"1"}, [evaluated(study.trials[1])])
+    store.put(study.trials[1], {"state.json": b"1", BEST_MODEL: b"2"}, [evaluated(study.trials[1])])
     fewer = StudyFolder(store.path, read_study(study_file(tmp_path, seeds=[1, 2])))
     fewer.begin()
     fewer.write_results()

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import secrets
 import shutil
 import signal
 import sys
@@ -61,6 +62,10 @@ SETTINGS = {
     "RAY_gcs_server_port_wait_time_s": "120",
     "RAY_worker_register_timeout_seconds": "600",
 }
+
+TOKEN = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
+"""Ray listens at all network addresses of the machine, and its tasks run any code: those of a study
+answer this process alone."""
 
 IMPATIENT = {"RAY_NUM_REDIS_GET_RETRIES": "1"}
 """A cluster that does not answer is reported within a minute; Ray would try for eight."""
@@ -189,7 +194,7 @@ def require_ray(address: str | None = None) -> None:
             f"'{address}' is for clients outside of a cluster; type the command on one of its "
             "machines, with --address auto"
         )
-    settings = SETTINGS if address is None else {**SETTINGS, **IMPATIENT}
+    settings = {**SETTINGS, **(TOKEN if address is None else IMPATIENT)}
     for name, value in settings.items():
         os.environ.setdefault(name, value)
     try:
@@ -230,7 +235,7 @@ def _ray(
     if address is None:
         options.update(
             address="local", num_cpus=jobs or cores.number(),
-            include_dashboard=False, _temp_dir=str(scratch), resources={PRIVATE: 1},
+            include_dashboard=False, _temp_dir=str(scratch / "ray"), resources={PRIVATE: 1},
         )  # fmt: skip
     else:
         options["address"] = address
