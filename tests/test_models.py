@@ -284,7 +284,7 @@ def test_what_does_not_belong_together_is_not_gone_on_with(learned):
         check(n_envs=4)
     buffer = path.parent / "replay_buffer.pkl"
     buffer.write_bytes(buffer.read_bytes()[:-10])
-    with pytest.raises(ModelMismatch, match=r"replay_buffer.pkl' is no replay buffer"):
+    with pytest.raises(ModelMismatch, match=r"replay_buffer.pkl' is not a replay buffer"):
         check()
 
 

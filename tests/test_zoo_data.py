@@ -54,7 +54,7 @@ def test_an_activation_may_be_named_as_in_the_zoos_own_files():
     ("vec_env_wrapper", "stable_baselines3.common.vec_env.DummyVecEnv"),
 ])  # fmt: skip
 def test_a_dotted_path_stands_for_what_its_key_needs(tmp_path, key, path):
-    with pytest.raises(ZooConfigError, match=f"{key} '{path}' is none: expected a class derived"):
+    with pytest.raises(ZooConfigError, match=f"{key} '{path}' is not a subclass of"):
         study(tmp_path, **{key: path})
 
 

@@ -88,7 +88,7 @@ class Display:
         lap_length: float,
     ) -> None:
         """
-        Draw everything anew.
+        Draw everything again.
 
         :param timesteps: that were learned from
         :param text: below the bar

@@ -53,7 +53,7 @@ class _FirstOf:
         return observation, {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Step each of them; those that end begin anew."""
+        """Step each of them; those that end begin again."""
         observation, rewards, self._begun, infos = self._env.step(action)
         return observation, rewards[0], self._begun[0], False, infos[0]
 

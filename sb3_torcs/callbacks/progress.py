@@ -55,7 +55,7 @@ class RacingProgressCallback(BaseCallback):
     On a terminal this is a bar; elsewhere (a log file, CI) a line every ``every`` seconds. The
     training does not depend on the clock. With the
     :class:`~sb3_torcs.callbacks.DrivingMetricsCallback` of the same training, there are a line for
-    each evaluation, and on a terminal curves of them. The first whole lap is told at once.
+    each evaluation, and on a terminal curves of them. The first whole lap is reported at once.
 
     :param every: seconds between two lines where there is no terminal [s]
     :param stream: where to write; ``None`` is the standard error
@@ -75,7 +75,7 @@ class RacingProgressCallback(BaseCallback):
         self._forget()
 
     def _forget(self) -> None:
-        """Begin to count anew."""
+        """Begin to count from zero."""
         self.episodes = 0
         self.distance: float | None = None  # [m] of the last episode
         self.best_lap_time: float | None = None  # [s]

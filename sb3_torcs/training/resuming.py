@@ -65,7 +65,7 @@ def restore_statistics(env: VecNormalize, model: Path) -> None:
     """
     record = training_record(model)
     if record.statistics_file is not None:
-        said = f"'{record.statistics_file}' holds no statistics that can be gone on with"
+        said = f"'{record.statistics_file}' holds no statistics to continue with"
         with as_mismatch(said, "give"), record.statistics_file.open("rb") as file:
             saved = pickle.load(file)
             env.obs_rms, env.ret_rms = saved.obs_rms, saved.ret_rms
@@ -102,7 +102,7 @@ def check_resumable(
     if record.driver_only:
         raise ModelMismatch(
             f"'{model}' holds what drives and not what learns: its critics and optimizers were "
-            "left out; train anew, with the hyperparameters in the config.yml beside it"
+            "left out; train again, with the hyperparameters in the config.yml beside it"
         )
     if not record.known and not trust:
         raise ModelNotTrusted(
@@ -141,7 +141,7 @@ def check_resumable(
     if not file.is_file():
         return False
     n_envs = int(entry.get("n_envs", 1))
-    said = f"'{file}' is no replay buffer that can be gone on with"
+    said = f"'{file}' is not a replay buffer to continue with"
     with as_mismatch(said, "remove it, or give"), file.open("rb") as content:
         buffer = load_from_pkl(content)
         if buffer.n_envs != n_envs:

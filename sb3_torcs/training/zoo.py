@@ -33,7 +33,7 @@ from sb3_torcs.training.zoo_data import (
     check_numbers,
     check_sight,
     policy_arguments,
-    told_entries,
+    suggest_entries,
 )
 
 __all__ = [
@@ -162,7 +162,7 @@ def read_entry(path: Path, name: str) -> Entry:
     if name in gym.registry and name not in entries and "default" in entries:
         name = "default"
     if name not in entries:
-        raise ZooConfigError(f"{path} has no entry '{name}'{told_entries(name, entries, path)}")
+        raise ZooConfigError(f"{path} has no entry '{name}'{suggest_entries(name, entries, path)}")
     return as_data(entries[name])
 
 

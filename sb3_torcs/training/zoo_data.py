@@ -31,7 +31,7 @@ __all__ = [
     "check_sight",
     "policy_arguments",
     "policy_classes",
-    "told_entries",
+    "suggest_entries",
 ]
 
 EVALUATED = (
@@ -99,8 +99,8 @@ def check_class(found: Callable[..., Any], path: str, key: str, place: str) -> N
     kind = kinds[key]
     if not isinstance(found, type) or not issubclass(found, kind):
         raise ZooConfigError(
-            f"{place}: {key} '{path}' is none: expected a class derived from "
-            f"{kind.__module__}.{kind.__qualname__}"
+            f"{place}: {key} '{path}' is not a subclass of {kind.__module__}.{kind.__qualname__}; "
+            "correct the dotted path"
         )
 
 
@@ -330,7 +330,7 @@ def _with_activations(text: str) -> Any:
     return plain_python(text, Named())
 
 
-def told_entries(name: str, known: Iterable[str], path: Path) -> str:
+def suggest_entries(name: str, known: Iterable[str], path: Path) -> str:
     """
     Complete a message about an entry that a hyperparameter file lacks.
 
