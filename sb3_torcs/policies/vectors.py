@@ -89,4 +89,4 @@ class Vector:
     def release(self) -> None:
         """Give each tensor numbers of its own, contiguous ones."""
         for own in self.tensors:
-            own.data = own.detach().contiguous().clone()
+            own.data = own.detach().clone(memory_format=th.contiguous_format)
