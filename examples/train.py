@@ -7,7 +7,12 @@ from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 
 import sb3_torcs  # noqa: F401  (registers the environments)
-from sb3_torcs.callbacks import NoiseCallback, NoiseDecayCallback, RandomStartCallback
+from sb3_torcs.callbacks import (
+    NoiseCallback,
+    NoiseDecayCallback,
+    RandomStartCallback,
+    RecordCallback,
+)
 from sb3_torcs.policies import SplitHeadPolicy
 
 parser = argparse.ArgumentParser(description=__doc__)
@@ -32,6 +37,7 @@ model = DDPG(
 )
 pedal = [0.0, 1.0, 0.3]  # mu, theta [1/s], sigma
 callbacks = [
+    RecordCallback(),  # so that all commands drive the model as it was trained, without --trust
     RandomStartCallback(),  # an episode may begin anywhere, so that every corner is practised
     NoiseCallback(kind="ou", dt=0.1, steering=[0.0, 1.0, 0.2], throttle=pedal, brake=pedal),
     NoiseDecayCallback(timesteps=int(0.7 * args.timesteps), floor=0.2),

@@ -4,6 +4,7 @@ import runpy
 import sys
 
 import pytest
+import torch as th
 import yaml
 
 from sb3_torcs.agents.saved.file import saved_weights
@@ -45,6 +46,7 @@ def trained_by_the_zoo(monkeypatch, folder, algo, env_id, entry):
 @pytest.mark.slow
 @pytest.mark.parametrize(("algo", "name"), ENTRIES)
 def test_both_end_with_equal_weights(tmp_path, monkeypatch, algo, name):
+    th.set_num_threads(1)  # as the zoo's script does below
     env_id = world_of(name)
     entry = zoo.read_entry(zoo.config_file(algo), name)
     changes = shortened(algo, entry)

@@ -22,7 +22,7 @@ def test_every_figure_is_measured_once_or_empty(monkeypatch):
     measurements = stages(0.01)
     figures = measurements["resets"]()
     assert list(figures) == ["lite_reset_ms"]
-    assert len(set(KEYS)) == len(KEYS) == 26
+    assert len(set(KEYS)) == len(KEYS) == 24
 
 
 def test_the_environments_are_measured_in_the_same_run(monkeypatch):

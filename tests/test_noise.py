@@ -229,17 +229,6 @@ def test_a_pickled_noise_goes_on_as_if_nothing_had_happened(cls, n_envs):
     assert noises_of(twin)[0].timesteps == noises_of(model)[0].timesteps == 10 * n_envs
 
 
-def test_a_noise_that_was_saved_by_an_older_version_goes_on_counting():
-    """It counted in frames, which are timesteps now."""
-    noise = OUNoise(seed=0)
-    state = {**noise.__getstate__(), "frames": 70}
-    del state["timesteps"]
-    noise.__setstate__(state)
-    noise()
-    assert noise.timesteps == 71
-    assert not hasattr(noise, "frames")
-
-
 def test_a_deep_copy_of_a_bound_noise_does_not_copy_the_model():
     """SB3 deep-copies noises; the model behind the binding is large and must not come along."""
     noise = bound(SetPointNoise(seed=0)).action_noise

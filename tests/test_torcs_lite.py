@@ -84,7 +84,9 @@ def test_places_of_files_with_one_name_are_told_apart(tmp_path):
 
 
 def test_an_argument_of_something_else_is_told():
-    with pytest.raises(TypeError, match="no argument 'frame_skip'; it is called 'action_repeat'"):
+    with pytest.raises(
+        TypeError, match="unexpected keyword argument 'frame_skip'; it is called 'action_repeat'"
+    ):
         gym.make("TorcsLite-v0", frame_skip=4)
 
 

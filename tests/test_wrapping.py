@@ -95,7 +95,16 @@ def run(tmp_path_factory):
     }  # fmt: skip
     conf_file = folder / "own.yml"
     conf_file.write_text(yaml.safe_dump({"TorcsLite-v0": entry}))
-    words = ["train", "--algo", "ppo", "--conf-file", str(conf_file), "--no-progress"]
+    words = [
+        "train",
+        "--algo",
+        "ppo",
+        "--env",
+        "TorcsLite-v0",
+        "--conf-file",
+        str(conf_file),
+        "--no-progress",
+    ]
     assert main([*words, "--folder", str(folder / "logs"), "--eval-freq", "1000"]) == 0
     return folder / "logs" / "ppo" / "TorcsLite-v0_1"
 
