@@ -22,16 +22,16 @@ MAX_EPISODE_STEPS = 3000
 def register_envs() -> None:
     """Register both ids; calling it again changes nothing."""
     for name, entry_point, vector_entry_point in (
-        ("TorcsLite-v0", "sb3_torcs.envs.torcs_lite:TorcsLiteEnv", None),
-        ("Torcs-v0", "sb3_torcs.envs.torcs:TorcsEnv", "sb3_torcs.envs.torcs_vector:TorcsVectorEnv"),
+        ("TorcsLite-v0", "torcs_lite:TorcsLiteEnv", "torcs_vector:TorcsLiteVectorEnv"),
+        ("Torcs-v0", "torcs:TorcsEnv", "torcs_vector:TorcsVectorEnv"),
     ):
         if name not in registry:
             # Gymnasium's passive checker would look at the first timesteps of each environment and
             # then stand in the way of all others; the tests run both libraries' full checks.
             register(
                 name,
-                entry_point=entry_point,
-                vector_entry_point=vector_entry_point,
+                entry_point=f"sb3_torcs.envs.{entry_point}",
+                vector_entry_point=f"sb3_torcs.envs.{vector_entry_point}",
                 max_episode_steps=MAX_EPISODE_STEPS,
                 disable_env_checker=True,
             )

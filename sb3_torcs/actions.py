@@ -10,6 +10,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 import numpy.typing as npt
 from numba import njit
+from numba.extending import register_jitable
 
 from sb3_torcs.car import Controls, FloatArray, checked_choice
 from sb3_torcs.errors import InvalidAction, InvalidOption, near_miss
@@ -36,6 +37,7 @@ __all__ = [
     "launch_clutch",
     "layout_of_width",
     "listed_actions",
+    "read_actions",
     "used_gearbox",
 ]
 
@@ -106,16 +108,19 @@ class ActionLayout(NamedTuple):
     """From numbers within their limits to the fields of :class:`~sb3_torcs.car.Controls`."""
 
 
+@register_jitable
 def _read_pedals(numbers: Sequence[float]) -> tuple[float, float, float, int | None, float]:
     steering, throttle, brake = numbers
     return steering, throttle, brake, None, 0.0
 
 
+@register_jitable
 def _read_pedal(numbers: Sequence[float]) -> tuple[float, float, float, int | None, float]:
     steering, pedal = numbers
     return steering, pedal if pedal > 0.0 else 0.0, -pedal if pedal < 0.0 else 0.0, None, 0.0
 
 
+@register_jitable
 def _read_manual(numbers: Sequence[float]) -> tuple[float, float, float, int | None, float]:
     steering, throttle, brake, gear, clutch = numbers
     return steering, throttle, brake, math.floor(gear + 0.5), clutch
@@ -223,6 +228,44 @@ def controls_from_action(
             numbers[place] = min(max(number, low), high)
     # As Controls(...) does, without the call that a NamedTuple puts in front of it.
     return tuple.__new__(Controls, read(numbers))
+
+
+@njit(cache=True)
+def read_actions(asked: Any, low: FloatArray, high: FloatArray, controls: FloatArray) -> bool:
+    """
+    Turn actions into controls, as :func:`controls_from_action` does for one.
+
+    :param asked: (n, numbers of an action)
+    :param low: of the layout
+    :param high: of the layout
+    :param controls: (n, 5) filled
+    :return: whether all are numbers
+    """
+    numbers = np.empty(len(low))
+    for row in range(len(asked)):
+        for i in range(len(low)):
+            number = float(asked[row, i])
+            if number != number:
+                return False
+            if not low[i] <= number <= high[i]:
+                number = min(max(number, low[i]), high[i])
+            numbers[i] = number
+        shift = np.nan
+        if len(low) == 2:
+            steering, throttle, brake, _, clutch = _read_pedal((numbers[0], numbers[1]))
+        elif len(low) == 3:
+            steering, throttle, brake, _, clutch = _read_pedals(
+                (numbers[0], numbers[1], numbers[2])
+            )
+        else:
+            steering, throttle, brake, gear, clutch = _read_manual(
+                (numbers[0], numbers[1], numbers[2], numbers[3], numbers[4])
+            )
+            shift = gear
+        fields = (steering, throttle, brake, shift, clutch)
+        for i in range(5):
+            controls[row, i] = fields[i]
+    return True
 
 
 def action_rows(actions: Any, shape: tuple[int, ...]) -> npt.NDArray[np.floating]:

@@ -19,12 +19,18 @@ from sb3_torcs.errors import InvalidOption, near_miss
 
 __all__ = [
     "CAR_LENGTH",
+    "CAR_NUMBERS",
     "CAR_RECORD",
     "CAR_WIDTH",
+    "CONTACTS",
     "CONTROL_TICK",
     "DEFAULT_CAR",
+    "FAULTS",
     "FIRST_RIVAL",
+    "GAP_AHEAD",
+    "GAP_BEHIND",
     "KMH",
+    "LAPS_LEFT",
     "LIMITER_RPM",
     "MANY_LAPS",
     "MAX_DAMAGE",
@@ -55,10 +61,13 @@ __all__ = [
     "checked_laps",
     "checked_start",
     "checked_start_speed",
+    "controls_from_record",
     "is_count",
     "is_number",
+    "is_off_track",
     "look_both_ways",
     "range_finder_angles",
+    "track_position",
 ]
 
 FloatArray = npt.NDArray[np.float64]
@@ -305,6 +314,8 @@ def checked_factor(name: str, choice: Any) -> Range:
 
 RIVALS = 4
 """How many cars around it a car knows."""
+GAP_AHEAD, GAP_BEHIND, LAPS_LEFT, CONTACTS, FAULTS = range(5)
+"""Where in ``CarState.race`` the numbers of the properties with such names are."""
 FIRST_RIVAL = 5
 """Where in ``CarState.race`` their numbers begin: of all of them along the road, across it, ..."""
 
@@ -395,37 +406,57 @@ class CarState(NamedTuple):
     @property
     def track_position(self) -> float:
         """Lateral position [-]: 0 on the axis, 1 on the left edge, -1 on the right edge."""
-        return 2.0 * self.distance_from_axis / self.track_width
+        return track_position(self)
 
     @property
     def off_track(self) -> bool:
         """Whether the mass centre has left the road, as the SCR server judges it."""
-        return abs(self.distance_from_axis) > 0.5 * self.track_width
+        return is_off_track(self)
 
     @property
     def gap_ahead(self) -> float:
         """To the car a place before [m of road], also if that is out; 200 if this is the first."""
-        return float(self.race[0])
+        return float(self.race[GAP_AHEAD])
 
     @property
     def gap_behind(self) -> float:
         """To the car a place after [m of road], also if that is out; 200 if this is the last."""
-        return float(self.race[1])
+        return float(self.race[GAP_BEHIND])
 
     @property
     def laps_left(self) -> float:
         """Laps until the race ends, the present one included; 2**30 if it does not end."""
-        return float(self.race[2])
+        return float(self.race[LAPS_LEFT])
 
     @property
     def contacts(self) -> float:
         """How often this car and another have touched; 0.5 s apart, it is another contact."""
-        return float(self.race[3])
+        return float(self.race[CONTACTS])
 
     @property
     def faults(self) -> float:
         """In how many of them this car has hit the other one with its front."""
-        return float(self.race[4])
+        return float(self.race[FAULTS])
+
+
+def track_position(car: CarState) -> float:
+    """
+    Return the lateral position [-]: 0 on the axis, 1 on the left edge, -1 on the right edge.
+
+    Compiled code calls it, too, with a record of a car.
+
+    :param car: any state
+    """
+    return 2.0 * car.distance_from_axis / car.track_width
+
+
+def is_off_track(car: CarState) -> bool:
+    """
+    Check whether the mass centre has left the road. Compiled code calls it, too.
+
+    :param car: any state
+    """
+    return abs(car.distance_from_axis) > 0.5 * car.track_width
 
 
 _ARRAYS = {"wheel_speeds": 4, "range_finders": 19, "opponents": 36, "race": len(NO_RACE)}
@@ -436,6 +467,9 @@ _PARTS = tuple(slice(end - size, end) for end, size in zip(_ENDS, _ARRAYS.values
 
 CAR_RECORD = np.dtype([(name, "f8", _ARRAYS.get(name, ())) for name in CarState._fields])
 """A :class:`CarState` as a record of an array, for many cars at once; the engine writes such."""
+
+CAR_NUMBERS = CAR_RECORD.itemsize // 8
+"""[-] numbers of one."""
 
 
 def car_from_record(numbers: FloatArray) -> CarState:
@@ -452,3 +486,13 @@ def car_from_record(numbers: FloatArray) -> CarState:
     arrays.flags.writeable = False
     # As CarState(...) does, without the call that a NamedTuple puts in front of it.
     return tuple.__new__(CarState, (*values, *[arrays[part] for part in _PARTS]))
+
+
+def controls_from_record(numbers: Any) -> Controls:
+    """
+    Read controls from a record.
+
+    :param numbers: of ``Controls``, with a gear of nan for ``None``
+    """
+    steering, throttle, brake, gear, clutch = numbers.tolist()
+    return Controls(steering, throttle, brake, None if gear != gear else int(gear), clutch)

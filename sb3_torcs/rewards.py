@@ -8,12 +8,31 @@ return of a drive does not depend on the length of a timestep.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from functools import partial
-from typing import Literal
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache, partial
+from typing import Any, Literal
+
+import numpy as np
+from numba import njit
+from numba.extending import register_jitable
 
 from sb3_torcs import maths
-from sb3_torcs.car import CAR_WIDTH, FIRST_RIVAL, RIVALS, CarState, Controls, is_number
+from sb3_torcs.car import (
+    CAR_NUMBERS,
+    CAR_WIDTH,
+    CONTACTS,
+    FAULTS,
+    FIRST_RIVAL,
+    RIVALS,
+    CarState,
+    Controls,
+    FloatArray,
+    car_from_record,
+    controls_from_record,
+    is_number,
+    is_off_track,
+    track_position,
+)
 from sb3_torcs.errors import InvalidOption, UnknownRewardTerm, near_miss
 from sb3_torcs.rivals import clarity, rival
 
@@ -24,11 +43,14 @@ __all__ = [
     "Reward",
     "RewardChoice",
     "RewardName",
+    "Rewards",
     "Term",
     "safe_speed",
 ]
 
 cos, sin = map(maths.compiled, (maths.cos, maths.sin))
+for _function in (is_off_track, track_position):
+    register_jitable(_function)
 
 BRAKING = 10.0  # [m/s²] a car on asphalt can do twice that, but not while it turns in
 BEND_SPEED = 12.0  # [m/s] in a bend behind which nothing is seen; the tightest hairpins need it
@@ -49,7 +71,7 @@ def speed_across(before: CarState, after: CarState, controls: Controls) -> float
 
 def speed_off_axis(before: CarState, after: CarState, controls: Controls) -> float:
     """Vx · trackPos, without its sign [m/s]: speed off the road's middle, of the post's reward."""
-    return abs(after.speed_x * after.track_position)
+    return abs(after.speed_x * track_position(after))
 
 
 def progress(before: CarState, after: CarState, controls: Controls) -> float:
@@ -77,6 +99,7 @@ def sliding(before: CarState, after: CarState, controls: Controls) -> float:
     return max(abs(after.speed_y) - NO_SLIDE * abs(after.speed_x), 0.0)
 
 
+@register_jitable
 def safe_speed(sight: float) -> float:
     """
     Return the speed from which 10 m/s² slow down to 12 m/s within a distance [m/s].
@@ -101,12 +124,12 @@ def places(before: CarState, after: CarState, controls: Controls) -> float:
 
 def contact(before: CarState, after: CarState, controls: Controls) -> float:
     """Contacts with other cars per second [1/s], whosever fault."""
-    return (after.contacts - before.contacts) / (after.time - before.time)
+    return (after.race[CONTACTS] - before.race[CONTACTS]) / (after.time - before.time)
 
 
 def fault(before: CarState, after: CarState, controls: Controls) -> float:
     """Contacts per second in which this car hits another with its front [1/s]."""
-    return (after.faults - before.faults) / (after.time - before.time)
+    return (after.race[FAULTS] - before.race[FAULTS]) / (after.time - before.time)
 
 
 def passing(before: CarState, after: CarState, controls: Controls) -> float:
@@ -135,7 +158,7 @@ def leaving(before: CarState, after: CarState, controls: Controls) -> float:
     """
     # As products: Python's power differs in the last bit from what compiled code makes of it.
     speed_x, speed_y = after.speed_x, after.speed_y
-    return speed_x * speed_x + speed_y * speed_y if after.off_track else 0.0
+    return speed_x * speed_x + speed_y * speed_y if is_off_track(after) else 0.0
 
 
 TERMS: dict[str, Term] = {
@@ -148,7 +171,7 @@ TERMS: dict[str, Term] = {
 """By name. Own ones may be added: functions of the car before and after, and of the controls."""
 
 OWN_TERMS: tuple[Term, ...] = tuple(TERMS.values())
-"""Those of this package, which return numbers."""
+"""Those of this package, which are compiled."""
 
 # So that no reward is infinite in single precision, in which SB3 sums them up.
 LARGEST = 1e9  # of a weight
@@ -226,46 +249,94 @@ class Reward:
             for name, weight in weights.items()
             if name in TERMS
         )
+        self.names = tuple(name for name, _, _ in self.terms)
 
-    def nothing(self) -> dict[str, float]:
+    def explain(self, terms: Sequence[float], end: str | None) -> dict[str, float]:
         """
-        Return the terms of an episode that has just begun.
+        Name the weighted terms of a timestep, and add what its end costs.
 
-        :return: all terms, each 0
-        """
-        return dict.fromkeys((*(name for name, _, _ in self.terms), "crash"), 0.0)
-
-    def __call__(
-        self, before: CarState, after: CarState, controls: Controls, end: str | None
-    ) -> dict[str, float]:
-        """
-        Value one timestep.
-
-        :param before: the car at the beginning of the timestep
-        :param after: the car at its end
-        :param controls: that were asked for, after the aids have changed them; with a delay,
-            earlier ones were held meanwhile
+        :param terms: one for each of the names
         :param end: why the episode ended, or ``None``
-        :return: the weighted terms, ``crash`` last; their sum is the reward
+        :return: the terms, ``crash`` last; their sum is the reward
+        """
+        # Rewards of a batch may have more terms than this one: zeros after its own.
+        named = dict(zip(self.names, terms, strict=False))
+        named["crash"] = self._crash if end in CRASHES else 0.0
+        return named
+
+
+class Rewards:
+    """
+    The rewards of some cars, which are valued at once.
+
+    :param rewards: of each car
+    """
+
+    def __init__(self, rewards: Sequence[Reward]) -> None:
+        self.rewards = list(rewards)
+        self._shape = len(self.rewards), max(len(reward.terms) for reward in self.rewards)
+        compiled: dict[Term, FloatArray] = {}
+        self._in_python: list[tuple[int, int, Term, float]] = []
+        for row, reward in enumerate(self.rewards):
+            for column, (_, term, weight) in enumerate(reward.terms):
+                if term in OWN_TERMS:
+                    weights = compiled.setdefault(term, np.full(self._shape, np.nan))
+                    weights[row, column] = weight
+                else:
+                    self._in_python.append((row, column, term, weight))
+        self._compiled = [(_compiled(term), weights) for term, weights in compiled.items()]
+
+    def __reduce__(self) -> tuple[type[Rewards], tuple[list[Reward]]]:
+        return Rewards, (self.rewards,)  # without compiled functions, which are of this process
+
+    def value(self, before: Any, after: Any, going: Any = None) -> list[list[float]]:
+        """
+        Value a timestep of each car.
+
+        :param before: (n,) records with the fields ``car`` and ``controls``, before the timestep
+        :param after: (n,) at its end, with the controls that were asked for in it, after the aids
+            have changed them; with a delay, earlier ones were held meanwhile
+        :param going: (n,) of which cars to ask terms that were added; ``None`` is all
+        :return: the weighted terms of each car
         :raises InvalidOption: if a term that was added returns no finite number
         """
-        seconds = after.time - before.time
-        terms = {}  # filled in a loop: a comprehension is one more call per timestep
-        for name, term, weight in self.terms:
-            # The state of a lost car does not advance: without time there is no rate.
-            terms[name] = weight * seconds * term(before, after, controls) if seconds else 0.0
-        return self.ended(terms, end)
+        terms = np.zeros(self._shape)
+        for fill, weights in self._compiled:
+            fill(before, after, weights, terms)
+        for row, column, term, weight in self._in_python:
+            if going is None or going[row]:
+                terms[row, column] = _ask(term, weight, before, after, row)
+        return terms.tolist()
 
-    def ended(self, terms: dict[str, float], end: str | None) -> dict[str, float]:
-        """
-        Add what an end costs.
 
-        :param terms: the weighted terms of a timestep, changed
-        :param end: why the episode ended, or ``None``
-        :return: the same, with ``crash`` last
-        """
-        terms["crash"] = self._crash if end in CRASHES else 0.0
-        return terms
+@lru_cache
+def _compiled(term: Term) -> Callable[[Any, Any, FloatArray, FloatArray], None]:
+    """Compile what values a term of this package for all cars, but where its weight is nan."""
+    rate = register_jitable(term)
+
+    @njit(cache=True)
+    def fill(before: Any, after: Any, weights: FloatArray, terms: FloatArray) -> None:
+        for row in range(len(after)):
+            was, car, controls = before[row].car, after[row].car, after[row].controls
+            seconds = car.time - was.time
+            for column in range(weights.shape[1]):
+                weight = weights[row, column]
+                # The state of a lost car does not advance: without time there is no rate.
+                if weight == weight and seconds != 0.0:
+                    terms[row, column] = weight * seconds * rate(was, car, controls)
+
+    return fill
+
+
+def _ask(term: Term, weight: float, before: Any, after: Any, row: int) -> float:
+    """Value a term that was added for one car."""
+    was, car = (
+        car_from_record(each[row : row + 1].view(np.float64)[:CAR_NUMBERS])
+        for each in (before, after)
+    )
+    seconds = car.time - was.time
+    controls = controls_from_record(after["controls"][row])
+    return weight * seconds * term(was, car, controls) if seconds else 0.0
 
 
 def _checked_term(name: str, term: Term) -> Term:

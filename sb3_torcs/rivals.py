@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 from numba import njit
+from numba.extending import register_jitable
 
 from sb3_torcs.car import CAR_WIDTH, FIRST_RIVAL, RIVALS, CarState, FloatArray
 
@@ -93,6 +94,7 @@ def see_rivals(rivals: FloatArray) -> FloatArray:
     return seen
 
 
+@register_jitable
 def needed_brake(car: CarState) -> float:
     """
     Return the least brake that keeps a car from the one ahead, 0 to 0.6.
@@ -122,6 +124,7 @@ def needed_brake(car: CarState) -> float:
     return STRONGEST * float(most)
 
 
+@register_jitable
 def needed_turn(car: CarState) -> float:
     """
     Return how much to steer away from cars beside, left positive, at most 0.25 to either side.

@@ -7,7 +7,7 @@ other cars, ``"car"`` is the car that is driven, and ``"motion"`` is how the car
 The observation space, the encoder, the mirror image, the documentation and the policy's view of the
 observation are all derived from the table.
 
-To add a group, write its rows, put them into :data:`GROUPS`, and its function into ``_WRITERS``.
+To add a group, write its rows, put them into :data:`GROUPS`, and its functions into ``_FILLERS``.
 """
 
 from __future__ import annotations
@@ -15,16 +15,27 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
-from itertools import accumulate, chain, combinations, pairwise
-from operator import attrgetter
+from itertools import accumulate, chain, combinations
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import literal_unroll, njit, types
-from numba.extending import overload
+from numba import njit
+from numba.extending import register_jitable
 
-from sb3_torcs.car import FIRST_RIVAL, KMH, REST_HEIGHT, RIVALS, CarState, FloatArray
+from sb3_torcs.car import (
+    CAR_RECORD,
+    FIRST_RIVAL,
+    GAP_AHEAD,
+    GAP_BEHIND,
+    KMH,
+    LAPS_LEFT,
+    REST_HEIGHT,
+    RIVALS,
+    CarState,
+    FloatArray,
+    track_position,
+)
 from sb3_torcs.errors import InvalidOption, near_miss
 from sb3_torcs.rivals import see_rivals
 from sb3_torcs.tracks.profile import RoadProfile
@@ -41,13 +52,13 @@ __all__ = [
     "OBSERVATION_SIZE",
     "SCR_RPM",
     "SENSORS",
+    "Eyes",
     "Sensor",
     "SensorsName",
     "View",
     "checked_sensors",
     "choices_of_size",
     "encode",
-    "encode_record",
     "feature_slices",
     "view_of",
 ]
@@ -267,187 +278,147 @@ def view_of(space: Any) -> View | None:
     return next((v for v in views if np.array_equal((v.low, v.high), bounds)), None)
 
 
-_measure = attrgetter(*(sensor.name for sensor in SENSORS))
-_SIZES = tuple(sensor.size for sensor in SENSORS)
+register_jitable(track_position)
+
+Rows = npt.NDArray[np.int64]
+Constants = tuple[Any, ...]
+"""What a group needs of a world, the same all through an episode: arrays and numbers."""
 
 
-def _numbers(value: Any) -> Any:
-    """Return the values of a sensor as an iterable."""
-    return value if isinstance(value, np.ndarray) else (value,)
+@register_jitable
+def _copy(numbers: FloatArray, values: FloatArray, at: int) -> None:
+    """Do what ``values[at:at + len(numbers)] = numbers`` does, which takes long to compile."""
+    for i in range(len(numbers)):
+        values[at + i] = numbers[i]
 
 
-@overload(_numbers)
-def _compiled_numbers(value: Any) -> Callable[[Any], Any]:
-    """The same for compiled code, which chooses by type when it is compiled."""
+def _write_base(car: CarState, values: FloatArray) -> None:
+    values[0] = car.heading_error
+    _copy(car.range_finders, values, 1)
+    values[20] = track_position(car)
+    values[21] = car.speed_x
+    values[22] = car.speed_y
+    values[23] = car.speed_z
+    _copy(car.wheel_speeds, values, 24)
+    values[28] = car.engine_speed
 
-    def several(value: Any) -> Any:
-        return value
 
-    def one(value: Any) -> Any:
-        return (value,)
+def _write_preview(car: CarState, values: FloatArray, sums: FloatArray, step: float) -> None:
+    means = np.empty((QUANTITIES, INTERVALS))
+    look_ahead(sums, step, car.distance_from_start, means)
+    width = means[1, 0]
+    for i in range(INTERVALS):
+        values[i] = means[0, i] / (abs(means[0, i]) + USUAL_BEND)
+        values[INTERVALS + i] = means[1, i] - width
+        values[2 * INTERVALS + i] = means[2, i]
 
-    return several if isinstance(value, types.Array) else one
+
+def _write_limits(car: CarState, values: FloatArray, sums: FloatArray, step: float) -> None:
+    speed_margins(sums, step, car.distance_from_start, car.speed_x, values)
+
+
+def _write_line(car: CarState, values: FloatArray, table: FloatArray, step: float) -> None:
+    seen = values.reshape((3, LINE_PLACES))
+    look_along(table, step, car.distance_from_start, track_position(car), car.speed_x, seen)
+    for i in range(LINE_PLACES):
+        seen[1, i] /= abs(seen[1, i]) + USUAL_BEND
+
+
+def _write_opponents(car: CarState, values: FloatArray) -> None:
+    _copy(car.opponents, values, 0)
+
+
+def _write_rivals(car: CarState, values: FloatArray) -> None:
+    _copy(see_rivals(car.race[FIRST_RIVAL:]), values, 0)
+
+
+def _write_race(car: CarState, values: FloatArray) -> None:
+    values[0] = car.race_position
+    values[1] = car.race[GAP_AHEAD]
+    values[2] = car.race[GAP_BEHIND]
+    values[3] = car.race[LAPS_LEFT]
+
+
+def _write_car(_car: CarState, values: FloatArray, facts: FloatArray) -> None:
+    _copy(facts, values, 0)
+
+
+def _write_motion(car: CarState, values: FloatArray) -> None:
+    values[0] = car.yaw_rate
+    values[1] = car.height - REST_HEIGHT
+
+
+def _nothing(_world: Any) -> Constants:
+    return ()
+
+
+def _road(world: Any) -> RoadProfile:
+    """The road of a world, with hills if it has some."""
+    return getattr(world, "profile", None) or world.track.profile
+
+
+def _profile(world: Any) -> Constants:
+    road = _road(world)
+    return road.sums, road.step
+
+
+def _line(world: Any) -> Constants:
+    return tuple(racing_line(_road(world)))
+
+
+def _facts(world: Any) -> Constants:
+    return (np.array(world.facts),)
+
+
+_FILLERS: Mapping[SensorsName, tuple[Callable[..., None], Callable[[Any], Constants]]] = {
+    "base": (_write_base, _nothing),
+    "preview": (_write_preview, _profile),
+    "limits": (_write_limits, _profile),
+    "line": (_write_line, _line),
+    "opponents": (_write_opponents, _nothing),
+    "rivals": (_write_rivals, _nothing),
+    "race": (_write_race, _nothing),
+    "car": (_write_car, _facts),
+    "motion": (_write_motion, _nothing),
+}
+"""Of each group: a function that writes its values in the table's units, from a car and what it
+needs of the car's world; and one that returns that. The first is compiled."""
 
 
 @njit(cache=True)
 def _scaled(number: float, index: int) -> float:
-    """Return a number of the observation, by its index there."""
+    """Return a number of the observation, by its index in the table."""
     scaled = number * _SCALE[index]
     if scaled <= _LOW[index]:
         return _LOW[index]
     return _HIGH[index] if scaled >= _HIGH[index] else scaled
 
 
-@njit(cache=True)
-def _scale(values: tuple[float | FloatArray, ...], observation: npt.NDArray[np.float32]) -> int:
+@lru_cache
+def _compiled(name: SensorsName) -> Callable[..., None]:
     """
-    Scale and clip. Compiled, since operations on small arrays cost more than what they compute.
+    Compile what fills the numbers of a group in the observations of many cars.
 
-    :param values: one number or array per row of the table
-    :param observation: (29,) filled
-    :return: number of rows before the first whose size differs from the table's
+    :param name: of the group
     """
-    row = i = 0
-    for value in literal_unroll(values):
-        numbers = _numbers(value)
-        if len(numbers) != _SIZES[row]:
-            return row
-        row += 1
-        for number in numbers:
-            observation[i] = _scaled(number, i)
-            i += 1
-    return row
+    write = register_jitable(_FILLERS[name][0])
+    first, size = _PARTS[name].start, _PARTS[name].stop - _PARTS[name].start
 
+    @njit(cache=True)
+    def fill(
+        cars: Any,
+        rows: Rows,
+        at: int,
+        observations: npt.NDArray[np.float32],
+        *constants: Any,
+    ) -> None:
+        values = np.empty(size)
+        for row in rows:
+            write(cars[row].car, values, *constants)
+            for i in range(size):
+                observations[row, at + i] = _scaled(values[i], first + i)
 
-_NAMES = tuple(sensor.name for sensor in SENSORS)
-
-
-@njit(cache=True)
-def encode_record(car: Any, observation: npt.NDArray[np.float32]) -> None:
-    """
-    Do what :func:`encode` does, for compiled code.
-
-    :param car: a :data:`~sb3_torcs.car.CAR_RECORD`, whose sizes are those of the table
-    :param observation: (29,) filled
-    """
-    i = 0
-    for name in literal_unroll(_NAMES):
-        for number in _numbers(getattr(car, name)):
-            observation[i] = _scaled(number, i)
-            i += 1
-
-
-def encode(car: CarState) -> npt.NDArray[np.float32]:
-    """
-    Turn the car's state into an observation.
-
-    :param car: any state
-    :return: (29,) numbers within ``OBSERVATION_LOW`` and ``OBSERVATION_HIGH``
-    :raises ValueError: if the size of a sensor differs from the table's
-    """
-    return _encode(car, OBSERVATION_SIZE)
-
-
-def _encode(car: CarState, size: int) -> npt.NDArray[np.float32]:
-    """Make an observation of a size, of which the group ``"base"`` is filled."""
-    observation = np.empty(size, np.float32)
-    done = _scale(_measure(car), observation)
-    if done < len(SENSORS):
-        name, expected = SENSORS[done].name, SENSORS[done].size
-        raise ValueError(f"{name} has {np.size(getattr(car, name))} numbers, expected {expected}")
-    return observation
-
-
-_PREVIEW_AT = _PARTS["preview"].start
-
-
-@njit(cache=True)
-def _scale_preview(
-    sums: FloatArray, step: float, distance: float, numbers: npt.NDArray[np.float32]
-) -> None:
-    """
-    Look ahead, scale and clip.
-
-    :param sums: of the road's profile
-    :param step: of the road's profile [m]
-    :param distance: of the car from the start line [m]
-    :param numbers: of the group ``"preview"``, filled
-    """
-    means = np.empty((QUANTITIES, INTERVALS))
-    look_ahead(sums, step, distance, means)
-    width = means[1, 0]
-    for i in range(INTERVALS):
-        means[0, i] /= abs(means[0, i]) + USUAL_BEND
-        means[1, i] -= width
-    for i in range(means.size):
-        numbers[i] = _scaled(means[i // INTERVALS, i % INTERVALS], _PREVIEW_AT + i)
-
-
-def _profile(world: Any) -> RoadProfile:
-    """The road of a world, with hills if it has some."""
-    return getattr(world, "profile", None) or world.track.profile
-
-
-def _write_preview(world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> None:
-    road = _profile(world)
-    _scale_preview(road.sums, road.step, car.distance_from_start, numbers)
-
-
-@njit(cache=True)
-def _scale_into(values: FloatArray, first: int, numbers: npt.NDArray[np.float32]) -> None:
-    """Scale and clip values of a group, whose place in the table is given."""
-    for i in range(len(values)):
-        numbers[i] = _scaled(values[i], first + i)
-
-
-def _write_limits(world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> None:
-    road = _profile(world)
-    margins = np.empty(INTERVALS)
-    speed_margins(road.sums, road.step, car.distance_from_start, car.speed_x, margins)
-    _scale_into(margins, _PARTS["limits"].start, numbers)
-
-
-def _write_line(world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> None:
-    table, step = racing_line(_profile(world))
-    seen = np.empty((3, LINE_PLACES))
-    look_along(table, step, car.distance_from_start, car.track_position, car.speed_x, seen)
-    seen[1] /= np.abs(seen[1]) + USUAL_BEND
-    _scale_into(seen.ravel(), _PARTS["line"].start, numbers)
-
-
-def _write_opponents(_world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> None:
-    _scale_into(car.opponents, _PARTS["opponents"].start, numbers)
-
-
-def _write_rivals(_world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> None:
-    _scale_into(see_rivals(car.race[FIRST_RIVAL:]), _PARTS["rivals"].start, numbers)
-
-
-def _write_race(_world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> None:
-    values = np.array([car.race_position, car.gap_ahead, car.gap_behind, car.laps_left], np.float64)
-    _scale_into(values, _PARTS["race"].start, numbers)
-
-
-def _write_car(world: Any, _car: CarState, numbers: npt.NDArray[np.float32]) -> None:
-    _scale_into(np.array(world.facts), _PARTS["car"].start, numbers)
-
-
-def _write_motion(_world: Any, car: CarState, numbers: npt.NDArray[np.float32]) -> None:
-    values = np.array([car.yaw_rate, car.height - REST_HEIGHT])
-    _scale_into(values, _PARTS["motion"].start, numbers)
-
-
-_WRITERS: dict[str, Callable[[Any, CarState, npt.NDArray[np.float32]], None]] = {
-    "preview": _write_preview,
-    "limits": _write_limits,
-    "line": _write_line,
-    "opponents": _write_opponents,
-    "rivals": _write_rivals,
-    "race": _write_race,
-    "car": _write_car,
-    "motion": _write_motion,
-}
-"""Of each group but ``"base"``: fills its numbers, from the world and the state of the car."""
+    return fill
 
 
 class View:
@@ -465,36 +436,79 @@ class View:
         self.low = np.concatenate(low).astype(np.float32)
         self.high = np.concatenate(high).astype(np.float32)
         self.size = len(self.low)
-        ends = accumulate(part.stop - part.start for part in parts)
-        self._more = [
-            (_WRITERS[name], slice(begin, end))
-            for name, (begin, end) in zip(self.sensors[1:], pairwise(ends), strict=True)
-        ]
-
-    @property
-    def has_more(self) -> bool:
-        """Whether there are groups besides ``"base"``."""
-        return len(self._more) > 0
 
     def encode(self, car: CarState, world: Any) -> npt.NDArray[np.float32]:
         """
-        Turn a state into an observation.
+        Turn one state into an observation. :class:`Eyes` does so for many, and faster.
 
         :param car: the agent's
         :param world: in which it drives
         :return: (size,) numbers within ``low`` and ``high``
+        :raises ValueError: if an array of the state has another size than in ``CAR_RECORD``
         """
-        observation = _encode(car, self.size)
-        self.add(car, world, observation)
-        return observation
+        cars = np.empty(1, [("car", CAR_RECORD)])
+        cars["car"] = car
+        eyes = Eyes(self, 1)
+        eyes.open(0, world)
+        return eyes.see(cars)[0]
 
-    def add(self, car: CarState, world: Any, observation: npt.NDArray[np.float32]) -> None:
-        """
-        Fill the groups of an observation that come after ``"base"``.
 
-        :param car: the agent's
-        :param world: in which it drives
-        :param observation: (size,)
+class Eyes:
+    """
+    Makes the observations of some cars, each in a world.
+
+    :param view: what all of them see
+    :param number: of the cars
+    """
+
+    def __init__(self, view: View, number: int) -> None:
+        self._view = view
+        self._constants: list[list[Constants]] = [[()] * number for _ in view.sensors]
+        self._jobs: list[tuple[Callable[..., None], Rows, int, Constants]] = []
+
+    def open(self, index: int, world: Any) -> None:
         """
-        for write, where in self._more:
-            write(world, car, observation[where])
+        Begin an episode of one car.
+
+        :param index: of the car
+        :param world: in which it drives until the next call
+        """
+        for name, constants in zip(self._view.sensors, self._constants, strict=True):
+            constants[index] = _FILLERS[name][1](world)
+        self._jobs = []
+
+    def see(self, cars: Any) -> npt.NDArray[np.float32]:
+        """
+        Turn states into observations.
+
+        :param cars: (number,) records with a field ``car``, a :data:`~sb3_torcs.car.CAR_RECORD`
+        :return: (number, size) numbers within ``low`` and ``high`` of the view
+        """
+        observations = np.empty((len(cars), self._view.size), np.float32)
+        for fill, rows, at, constants in self._jobs or self._plan():
+            fill(cars, rows, at, observations, *constants)
+        return observations
+
+    def _plan(self) -> list[tuple[Callable[..., None], Rows, int, Constants]]:
+        """Find which cars share what a group needs of a world: one call fills it for them all."""
+        at = 0
+        for name, each in zip(self._view.sensors, self._constants, strict=True):
+            shared: dict[tuple[int, ...], list[int]] = {}
+            for index, constants in enumerate(each):
+                shared.setdefault(tuple(map(id, constants[:1])), []).append(index)
+            self._jobs += [
+                (_compiled(name), np.array(rows), at, each[rows[0]]) for rows in shared.values()
+            ]
+            at += _PARTS[name].stop - _PARTS[name].start
+        return self._jobs
+
+
+def encode(car: CarState) -> npt.NDArray[np.float32]:
+    """
+    Turn the car's state into an observation of the group ``"base"``.
+
+    :param car: any state
+    :return: (29,) numbers within ``OBSERVATION_LOW`` and ``OBSERVATION_HIGH``
+    :raises ValueError: if an array of the state has another size than in ``CAR_RECORD``
+    """
+    return View().encode(car, None)

@@ -16,8 +16,7 @@ from vectors import assert_they_see_the_same, both_kinds
 
 import sb3_torcs  # noqa: F401  # registers the ids
 from sb3_torcs.callbacks import RandomStartCallback
-from sb3_torcs.car import RESTING
-from sb3_torcs.envs.conditions import Delay
+from sb3_torcs.car import RESTING, controls_from_record
 from sb3_torcs.envs.racing import RacingEnv
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.vec_env import TorcsVecEnv
@@ -61,7 +60,7 @@ def test_the_reward_and_the_picture_know_what_was_asked(oval):
     env.reset(seed=0)
     env.step(GAS)
     assert env.controls.throttle == 1.0
-    assert env.delay.waiting[0] == RESTING
+    assert controls_from_record(env.episode["waiting"][0, 0]) == RESTING
 
 
 def test_each_episode_draws_its_delay_from_the_seed(oval):
@@ -71,10 +70,10 @@ def test_each_episode_draws_its_delay_from_the_seed(oval):
     drawn = []
     for race in (env, other):
         race.reset(seed=4)
-        rows = [race.delay.ticks]
+        rows = [race.episode["delay"].item()]
         for _ in range(40):
             race.reset()
-            rows.append(race.delay.ticks)
+            rows.append(race.episode["delay"].item())
         drawn.append(rows)
     assert drawn[0] == drawn[1]
     assert set(drawn[0]) == {0, 1, 2, 3}
@@ -117,7 +116,7 @@ def test_late_races_driven_at_once_drive_as_single_ones(env_id, threads):
             assert one.tobytes() == other.tobytes(), step
         if step % 7 == 0:
             assert ours.get_attr("controls") == theirs.get_attr("controls")
-            waiting = [[env.delay.waiting for env in envs.get_attr("unwrapped")]
+            waiting = [[env.episode["waiting"].tobytes() for env in envs.get_attr("unwrapped")]
                        for envs in (ours, theirs)]  # fmt: skip
             assert waiting[0] == waiting[1]
     ours.close()
@@ -155,11 +154,6 @@ def test_a_copy_goes_on_with_the_controls_on_their_way(env_id):
 def test_other_delays_are_refused(choice):
     with pytest.raises(InvalidOption, match=r"delay is .* expected whole control ticks"):
         gym.make("TorcsLite-v0", conditions={"delay": choice})
-
-
-def test_no_delay_waits_for_nothing():
-    delay = Delay(0, 5)
-    assert delay.hold(RESTING._replace(throttle=1.0)) == [(RESTING._replace(throttle=1.0), 5)]
 
 
 # ---------------------------------------------------------------------------------- grip and mass

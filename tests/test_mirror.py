@@ -314,7 +314,7 @@ def test_whole_numbers_drive_in_the_mirror_too():
     cars = MirrorVecEnv(TorcsVecEnv(2, env_id="TorcsLite-v0"))
     cars.reset()
     cars.step([[1, 1, 0], [1, 1, 0]])
-    assert [car.steering for car in cars.get_attr("_controls")] == [1.0, -1.0]
+    assert [car.steering for car in cars.get_attr("controls")] == [1.0, -1.0]
     with pytest.raises(InvalidAction, match=r"shape \(3,\); expected \(2, 3\)"):
         cars.step(np.zeros(3))
     cars.close()

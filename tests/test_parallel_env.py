@@ -120,11 +120,20 @@ def test_a_race_that_is_lost_ends_for_all(make, monkeypatch):
     env = make(2)
     env.reset(seed=0)
 
-    def lose(ticks):
-        raise CarLost("the car is nowhere")
+    fleet = env._batch._fleet
+
+    class Losing:
+        def __getattr__(self, name):
+            return getattr(fleet, name)
+
+        def step(self, *order):
+            return [0, 1]
+
+        def failure(self, place):
+            return CarLost("the car is nowhere")
 
     with monkeypatch.context() as patch:
-        patch.setattr(env._race, "drive", lose)
+        patch.setattr(env._batch, "_fleet", Losing())
         _, _, terminations, _, infos = env.step({name: GAS for name in env.agents})
     assert all(terminations.values())
     assert {info["end"] for info in infos.values()} == {"lost"}

@@ -10,8 +10,9 @@ import pytest
 from conftest import car_state
 
 from sb3_torcs.car import NO_RACE, RIVALS, Controls
+from sb3_torcs.envs.episode import new_episodes
 from sb3_torcs.errors import InvalidOption, UnknownRewardTerm
-from sb3_torcs.rewards import PRESETS, TERMS, Reward
+from sb3_torcs.rewards import PRESETS, TERMS, Reward, Rewards
 
 GAS = Controls(0.0, 1.0, 0.0)
 BEFORE = car_state(time=1.0)
@@ -20,8 +21,16 @@ AFTER = car_state(
 )
 
 
+def value(choice, before=BEFORE, after=AFTER, end=None):
+    """Value one timestep of full throttle: the weighted terms by name."""
+    reward = Reward(choice)
+    first, then = new_episodes(1), new_episodes(1)
+    first["car"], then["car"], then["controls"] = before, after, GAS
+    return reward.explain(*Rewards([reward]).value(first, then), end)
+
+
 @pytest.mark.parametrize(
-    ("term", "value"),
+    ("term", "expected"),
     [
         ("speed_along", 10.0 * math.cos(math.pi / 6.0)),
         ("speed_across", 10.0 * math.sin(math.pi / 6.0)),
@@ -37,8 +46,9 @@ AFTER = car_state(
         ("fault", 0.0),
     ],
 )
-def test_a_term_has_its_known_value(term, value):
-    assert TERMS[term](BEFORE, AFTER, GAS) == value
+def test_a_term_has_its_known_value(term, expected):
+    assert TERMS[term](BEFORE, AFTER, GAS) == expected
+    assert value({term: 1.0})[term] == 0.5 * expected
 
 
 def test_steering_counts_either_way_and_more_at_speed():
@@ -69,20 +79,20 @@ def test_overspeed_is_what_cannot_be_lost_within_sight(sight, speed, value):
 
 
 def in_a_race(car, place, ahead, contacts=0.0, faults=0.0):
-    return car._replace(race_position=place, race=np.array([ahead, 50.0, 3.0, contacts, faults]))
+    race = np.array([ahead, 50.0, 3.0, contacts, faults, *NO_RACE[5:]])
+    return car._replace(race_position=place, race=race)
 
 
 def test_a_place_gained_counts_once_however_long_the_timestep():
     before, after = in_a_race(BEFORE, 5, 10.0), in_a_race(AFTER, 3, 10.0)
-    assert Reward({"places": 1.0})(before, after, GAS, None)["places"] == 2.0
-    assert Reward({"places": 1.0})(after._replace(time=0.0), before._replace(time=0.5), GAS, None)[
-        "places"
-    ] == pytest.approx(-2.0)
+    assert value({"places": 1.0}, before, after)["places"] == 2.0
+    lost = value({"places": 1.0}, after._replace(time=0.0), before._replace(time=0.5))
+    assert lost["places"] == pytest.approx(-2.0)
 
 
 def test_a_contact_is_told_from_one_s_own_fault():
     before, after = in_a_race(BEFORE, 4, 9.0, 1.0, 0.0), in_a_race(AFTER, 4, 9.0, 3.0, 1.0)
-    terms = Reward({"contact": -1.0, "fault": -1.0})(before, after, GAS, None)
+    terms = value({"contact": -1.0, "fault": -1.0}, before, after)
     assert (terms["contact"], terms["fault"]) == (-2.0, -1.0)
 
 
@@ -124,7 +134,7 @@ def test_squares_are_products_as_in_compiled_code():
 
 
 def test_a_weight_multiplies_duration_and_scale():
-    assert Reward({"speed_off_axis": -2.0, "scale": 0.1})(BEFORE, AFTER, GAS, None) == {
+    assert value({"speed_off_axis": -2.0, "scale": 0.1}) == {
         "speed_off_axis": -2.0 * 0.1 * 0.5 * 5.0,
         "crash": 0.0,
     }
@@ -132,18 +142,18 @@ def test_a_weight_multiplies_duration_and_scale():
 
 def test_the_post_is_the_sum_of_its_three_terms():
     along, across = 10.0 * math.cos(math.pi / 6.0), 10.0 * math.sin(math.pi / 6.0)
-    terms = Reward("blog")(BEFORE, AFTER, GAS, None)
+    terms = value("blog")
     assert sum(terms.values()) == pytest.approx(0.05 * (along - across - 5.0), rel=1e-15)
 
 
 @pytest.mark.parametrize("end", ["off_track", "backwards", "stuck", "damage"])
 def test_a_crash_costs_once(end):
-    assert Reward("progress")(BEFORE, AFTER, GAS, end)["crash"] == -1.0
+    assert value("progress", end=end)["crash"] == -1.0
 
 
 @pytest.mark.parametrize("end", [None, "laps"])
 def test_a_good_end_costs_nothing(end):
-    assert Reward("progress")(BEFORE, AFTER, GAS, end)["crash"] == 0.0
+    assert value("progress", end=end)["crash"] == 0.0
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -166,14 +176,13 @@ def test_a_weight_must_be_a_number(weight):
         Reward({"progress": weight})
 
 
-@pytest.mark.parametrize("value", [None, "1", np.ones(1), math.nan, math.inf, -1e30])
-def test_a_term_that_somebody_adds_returns_a_finite_number(monkeypatch, value):
+@pytest.mark.parametrize("returned", [None, "1", np.ones(1), math.nan, math.inf, -1e30])
+def test_a_term_that_somebody_adds_returns_a_finite_number(monkeypatch, returned):
     """So it is the same in one environment and in a batch of them, and the message names it."""
-    monkeypatch.setitem(TERMS, "odd", lambda *_: value)
-    reward = Reward({"odd": 1.0})
-    message = f"reward term 'odd' returned {re.escape(repr(value))}; expected a finite number"
+    monkeypatch.setitem(TERMS, "odd", lambda *_: returned)
+    message = f"reward term 'odd' returned {re.escape(repr(returned))}; expected a finite number"
     with pytest.raises(InvalidOption, match=message):
-        reward(BEFORE, AFTER, GAS, None)
+        value({"odd": 1.0})
 
 
 def test_a_term_that_somebody_adds_is_a_function_and_has_a_name_of_its_own(monkeypatch):
@@ -181,8 +190,8 @@ def test_a_term_that_somebody_adds_is_a_function_and_has_a_name_of_its_own(monke
     with pytest.raises(InvalidOption, match="reward term 'odd' is 3; expected a function"):
         Reward({"odd": 1.0})
     monkeypatch.setitem(TERMS, "odd", lambda *_: np.float32(0.5))
-    value = Reward({"odd": 2.0})(BEFORE, AFTER, GAS, None)["odd"]
-    assert (value, type(value)) == (0.5, float)
+    valued = value({"odd": 2.0})["odd"]
+    assert (valued, type(valued)) == (0.5, float)
     monkeypatch.setitem(TERMS, "scale", TERMS["pedals"])
     with pytest.raises(InvalidOption, match=r"called 'scale', .* by another name"):
         Reward("progress")

@@ -390,7 +390,7 @@ import gymnasium as gym
 from numba.core.dispatcher import Dispatcher
 from processes import PATIENCE, Program, gone, runs
 from scr_loopback import Loopback
-import sb3_torcs.actions, sb3_torcs.sensors
+import sb3_torcs.actions, sb3_torcs.envs.ends, sb3_torcs.sensors
 from sb3_torcs.agents.remote import Agent
 
 def loaded():
@@ -421,7 +421,7 @@ with Watching(ticks=300) as server:
     modules, compiled = loaded()
     assert not modules - server.seen[0], modules - server.seen[0]
     assert compiled == server.seen[1], (compiled, server.seen[1])
-    assert compiled["sb3_torcs.sensors", "_scale"] == 1
+    assert compiled["sb3_torcs.envs.ends", "end_episodes"] == 1
 """
 
 

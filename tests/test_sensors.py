@@ -81,7 +81,7 @@ def test_whole_numbers_and_single_precision_are_numbers_too():
 @pytest.mark.parametrize(("name", "size"), [("range_finders", 18), ("wheel_speeds", 5)])
 def test_a_sensor_of_another_size_is_refused(name, size):
     """The compiled encoder would otherwise write beside the observation."""
-    with pytest.raises(ValueError, match=f"{name} has {size} numbers, expected"):
+    with pytest.raises(ValueError, match=rf"\({size},\)"):
         encode(car_state(**{name: np.zeros(size)}))
 
 

@@ -19,6 +19,8 @@ from sb3_torcs.agents.scripted import ScriptedDriver
 from sb3_torcs.backends.native import NativeFleet, make_engine
 from sb3_torcs.backends.seats import REJOIN_SPEED
 from sb3_torcs.car import CAR_RECORD, CONTROL_TICK, RIVALS
+from sb3_torcs.envs.batch import Replay
+from sb3_torcs.envs.parallel_env import parallel_env
 from sb3_torcs.envs.torcs_race import load_shared_race, make_race
 from sb3_torcs.errors import CarLost, InvalidAction, InvalidOption
 from sb3_torcs.evaluation.ticks import log_drives
@@ -383,10 +385,14 @@ def by_hand(agents, actions, **options):
     rewards, ended = [], False
     for row in actions:
         for env, action in zip(envs, row, strict=True):
-            ((controls, _),) = env.begin_step(action)
-            engine.hold(env.backend.world.seat, *controls)
+            env.hold(action)
         engine.drive(5)
-        answers = [env.finish_step(lambda env=env: _read(env)) for env in envs]
+        answers = []
+        for env, action in zip(envs, row, strict=True):
+            seat = env.backend
+            env.backend = Replay(seat, seat.read())
+            answers.append(env.step(action))
+            env.backend = seat
         rewards.append([np.float32(answer[1]) for answer in answers])
         ended = any(answer[2] or answer[3] for answer in answers)
         if ended:
@@ -396,11 +402,6 @@ def by_hand(agents, actions, **options):
         env.close()
     assert ended, "no episode ended: little was compared"
     return observations, rewards
-
-
-def _read(env):
-    world = env.backend.world
-    return world.engine.read(world.seat)
 
 
 def random_actions(steps, cars):
@@ -756,6 +757,25 @@ class TestAgentsAsOpponents:
         with pytest.raises(InvalidOption, match=message):
             gym.make("sb3_torcs:Torcs-v0", **{"opponents": ["scripted"], **options})
 
-    def test_gymnasium_s_threads_would_not_ask_them(self):
-        with pytest.raises(InvalidOption, match=r"with agents among them.*TorcsVecEnv"):
-            gym.make_vec("sb3_torcs:Torcs-v0", 2, opponents=["scripted"])
+    def test_they_race_in_a_vector_of_gymnasium(self):
+        """To the bit as against each alone, across the ends of episodes."""
+        kwargs = {"track": TRACK, "opponents": ["bt", "scripted"], "max_episode_steps": 15}
+        kinds = [
+            gym.make_vec("sb3_torcs:Torcs-v0", 2, vectorization_mode=mode, **kwargs)
+            for mode in (None, "sync")
+        ]
+        seen = [envs.reset(seed=0)[0] for envs in kinds]
+        for action in random_actions(40, 2):
+            assert np.array_equal(*seen)
+            seen = [envs.step(action)[0] for envs in kinds]
+        for envs in kinds:
+            envs.close()
+
+    def test_they_race_in_a_parallel_environment(self):
+        env = parallel_env(2, track=TRACK, opponents=["scripted"])
+        env.reset(seed=0)
+        for action in random_actions(20, 2):
+            *_, infos = env.step(dict(zip(env.agents, action, strict=True)))
+        assert {infos[name]["place"] for name in env.possible_agents} < {1, 2, 3}
+        assert env._envs["agent_0"].seat.world.engine.read(0).distance_raced > 1.0
+        env.close()

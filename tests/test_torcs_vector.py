@@ -7,7 +7,6 @@ import gc
 import multiprocessing
 import pickle
 import threading
-from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -108,6 +107,17 @@ def test_threads_change_nothing_but_the_time(make, threads, mode, seed, options)
         assert_same(one, other, f"step {step}")
         ends += 0 if step == 0 else int((one[2] | one[3]).sum())
     assert ends > 0, "no episode ended, so that no reset was compared"
+
+
+def test_the_fallback_is_driven_at_once_too():
+    options = {"num_envs": 3, "start": "random", "max_episode_steps": 30}
+    kinds = [gym.make_vec("sb3_torcs:TorcsLite-v0", **options)]
+    kinds.append(gym.make_vec("sb3_torcs:TorcsLite-v0", vectorization_mode="sync", **options))
+    assert isinstance(kinds[0], TorcsVectorEnv)
+    for step, answers in enumerate(zip(*(drive(envs, 2, 80) for envs in kinds), strict=True)):
+        assert_same(*answers, f"step {step}")
+    for envs in kinds:
+        envs.close()
 
 
 def test_laps_are_told_as_by_gymnasium(make):
@@ -219,10 +229,10 @@ def test_a_wrong_action_is_told_and_leaves_the_races_usable(make):
 def test_a_wrong_action_does_not_arrive_late(make):
     envs = make(num_envs=2, conditions={"delay": 6})
     envs.reset(seed=0)
-    waiting = [env.delay.waiting for env in envs.envs]
+    waiting = [env.episode["waiting"].tobytes() for env in envs.envs]
     with pytest.raises(InvalidAction, match="throttle is nan"):
         envs.step(np.array([GAS, [0.0, np.nan, 0.0]], np.float32))
-    assert [env.delay.waiting for env in envs.envs] == waiting
+    assert [env.episode["waiting"].tobytes() for env in envs.envs] == waiting
 
 
 @pytest.mark.parametrize("threads", [1, 2])
@@ -238,14 +248,20 @@ def test_a_fault_of_one_engine_is_raised_with_its_class(make, threads):
 def test_a_car_that_is_lost_ends_its_own_race_only(make):
     envs = make(num_envs=2)
     envs.reset(seed=0)
-    fleet = envs._fleet
+    fleet = envs._batch._fleet
 
-    def wait(place):
-        if place == 1:
-            raise CarLost("the car is nowhere")
-        return fleet.wait(place)
+    class Losing:
+        def __getattr__(self, name):
+            return getattr(fleet, name)
 
-    envs._fleet = SimpleNamespace(put=fleet.put, begin=fleet.begin, finish=fleet.finish, wait=wait)
+        def step(self, *order):
+            fleet.step(*order)
+            return [1]
+
+        def failure(self, place):
+            return CarLost("the car is nowhere")
+
+    envs._batch._fleet = Losing()
     _, _, terminated, truncated, infos = envs.step(np.stack([GAS] * 2))
     assert (terminated.tolist(), truncated.tolist()) == ([False, True], [False, False])
     assert infos["end"].tolist() == ["", "lost"]

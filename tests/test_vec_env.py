@@ -25,6 +25,7 @@ from sb3_torcs.agents.scripted import ScriptedDriver
 from sb3_torcs.callbacks import DrivingMetricsCallback
 from sb3_torcs.car import CAR_RECORD, car_from_record
 from sb3_torcs.envs import batch
+from sb3_torcs.envs.episode import car_of
 from sb3_torcs.envs.torcs_lite import TorcsLiteEnv
 from sb3_torcs.errors import (
     CarLost,
@@ -223,9 +224,7 @@ def test_an_info_that_is_read_late_is_of_its_own_timestep(env_id, make):
 
 def test_infos_are_made_when_somebody_asks(make, monkeypatch):
     made = []
-    monkeypatch.setattr(
-        batch, "car_from_record", lambda row: made.append(1) or car_from_record(row)
-    )
+    monkeypatch.setattr(batch, "car_of", lambda *place: made.append(1) or car_of(*place))
     envs = make(2, env_id=LITE)
     envs.reset()
     *_, infos = envs.step(np.stack([GAS, GAS]))
@@ -237,9 +236,7 @@ def test_infos_are_made_when_somebody_asks(make, monkeypatch):
 
 def test_a_glance_reads_what_the_info_holds_and_makes_nothing(make, monkeypatch):
     made = []
-    monkeypatch.setattr(
-        batch, "car_from_record", lambda row: made.append(1) or car_from_record(row)
-    )
+    monkeypatch.setattr(batch, "car_of", lambda *place: made.append(1) or car_of(*place))
     envs = make(2, env_id=LITE)
     envs.reset()
     *_, infos = envs.step(np.stack([GAS, GAS]))
@@ -632,7 +629,7 @@ def test_an_interrupt_leaves_races_that_can_be_reset(env_id, make, monkeypatch):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(batch, "value_timesteps", interrupt)
+        patch.setattr(batch, "end_episodes", interrupt)
         with pytest.raises(KeyboardInterrupt):
             envs.step(np.stack([GAS, GAS]))
     assert_same(envs.reset(), fresh.reset())

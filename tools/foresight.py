@@ -34,33 +34,30 @@ class Racer:
     def __init__(self, driver, env):
         self.driver, self.env, self.world = driver, env, env.backend
 
-    def act(self, change):
+    def act(self, seen, change):
         """Return the agent's action, changed."""
-        seen = self.env.view.encode(self.env.car, self.world)
         (turn, pedal), action = change, self.driver.predict(seen, deterministic=True)[0].copy()
         action[0] = np.clip(action[0] + turn, -1.0, 1.0)
         if pedal is not None:
             action[1] = pedal if pedal > 0.0 else min(action[1], pedal)
         return action
 
-    def worth(self, change):
+    def worth(self, seen, change):
         """Look ahead, and return the damage that a change brings, and what it is worth [m]."""
-        begin, moment = self.env.car, self.world.save()
+        begin, episode, moment = self.env.car, self.env.episode, self.world.save()
         for timestep in range(AHEAD):
-            action = self.act(change if timestep < HELD else CHANGES[0])
-            ((controls, ticks),) = self.env.begin_step(action)
-            self.env.car = self.world.step(controls, ticks)
-        end, self.env.car = self.env.car, begin
+            seen = self.env.step(self.act(seen, change if timestep < HELD else CHANGES[0]))[0]
+        end, self.env.episode = self.env.car, episode
         self.world.restore(moment)
         damage = end.damage - begin.damage
         way = end.distance_raced - begin.distance_raced + 0.5 * min(end.speed_x, 60.0)
         return damage, way - PRICE * damage
 
-    def best_change(self):
+    def best_change(self, seen):
         """Choose a change if a hit is coming."""
-        if self.worth(CHANGES[0])[0] <= HIT:
+        if self.worth(seen, CHANGES[0])[0] <= HIT:
             return CHANGES[0]
-        return max(CHANGES, key=lambda change: self.worth(change)[1])
+        return max(CHANGES, key=lambda change: self.worth(seen, change)[1])
 
 
 def race(args, seed):
@@ -73,12 +70,13 @@ def race(args, seed):
     }  # a car that spins or leaves the road races on
     env = gym.make("sb3_torcs:Torcs-v0", **{**kept, **options})
     racer = Racer(load_driver(args.agent, env), env.unwrapped)
-    env.reset(seed=seed)
+    seen, _ = env.reset(seed=seed)
+    env.unwrapped.warns_after_end = False  # a look ahead may go beyond it
     timestep, over, change = 0, False, CHANGES[0]
     while not over:
         if timestep % LOOK == 0 and not args.blind:
-            change = racer.best_change()
-        _, _, ended, cut, info = env.step(racer.act(change))
+            change = racer.best_change(seen)
+        seen, _, ended, cut, info = env.step(racer.act(seen, change))
         timestep, over = timestep + 1, ended or cut
     env.close()
     return info

@@ -123,11 +123,7 @@ class Pilots:
 
     def _ask(self, team: _Team, race_begins: bool) -> None:
         """Ask a team's policy once, for all its cars."""
-        seen = []
-        for number in team.members:
-            env = self._envs[number]
-            env.car = env.seat.read()
-            seen.append(env.view.encode(env.car, env.seat))
+        seen = [self._envs[number].look() for number in team.members]
         begins = np.full(len(team.members), race_begins)
         try:
             actions, team.state = team.driver.predict(
@@ -141,11 +137,9 @@ class Pilots:
             if number in self.failed:
                 continue
             try:
-                ((controls, _),) = self._envs[number].begin_step(action)
+                self._envs[number].hold(action)
             except InvalidAction as error:
                 self._take_out(number, error)
-                continue
-            self._envs[number].seat.hold(controls)
 
     def _take_out(self, number: int, error: InvalidAction) -> None:
         """Take a car out of the race, and note why."""

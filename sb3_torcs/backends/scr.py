@@ -37,7 +37,6 @@ from sb3_torcs.scr.gearbox import read_gearbox
 from sb3_torcs.scr.protocol import ScrAction, format_action, parse_motor, parse_state
 from sb3_torcs.scr.rehearsal import Rehearsal
 from sb3_torcs.scr.server import SCR_PORT, open_ports, start_server
-from sb3_torcs.sensors import encode
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.process import GameProcess, compiled_library
 from sb3_torcs.torcs.race_setup import SCR_DRIVER, RaceSetup
@@ -268,10 +267,10 @@ class ScrBackend:
             self.step(controls, ticks)
 
     def _rehearse(self) -> None:
-        """Call everything that an environment calls."""
+        """Call everything that an environment calls of this world."""
         with self.rehearsal():
-            encode(self.reset(np.random.default_rng(), None))
-            encode(self.step(controls_from_action(np.zeros(3, np.float32)), 5))
+            self.reset(np.random.default_rng(), None)
+            self.step(controls_from_action(np.zeros(3, np.float32)), 5)
 
     def _connect(self, start: Start | None) -> None:
         """

@@ -2,59 +2,67 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
-from dataclasses import astuple
-from functools import partial
-from typing import Any, NamedTuple
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from sb3_torcs.actions import controls_from_action, listed_actions
+from sb3_torcs.actions import controls_from_action, listed_actions, read_actions
 from sb3_torcs.backends.base import Backend, Fleet
 from sb3_torcs.backends.lite.backend import LiteBackend
 from sb3_torcs.backends.lite.fleet import LiteFleet
 from sb3_torcs.backends.native import NativeBackend, NativeFleet
-from sb3_torcs.backends.seats import SeatWorld
+from sb3_torcs.backends.seats import Seat, SeatWorld, SharedRace
 from sb3_torcs.backends.several import present_world
-from sb3_torcs.car import CAR_RECORD, CarState, Controls, FloatArray, car_from_record
-from sb3_torcs.envs.compiled import COMPILED, RULES, aid_cars, read_actions, value_timesteps
+from sb3_torcs.car import CAR_NUMBERS, CarState, Controls, FloatArray, controls_from_record
+from sb3_torcs.envs.aids import help_cars
+from sb3_torcs.envs.conditions import hold_controls
+from sb3_torcs.envs.ends import LOST, end_episodes
+from sb3_torcs.envs.episode import (
+    EPISODE,
+    RULES,
+    Episodes,
+    car_of,
+    copy_of,
+    new_episodes,
+    numbers_of,
+)
 from sb3_torcs.envs.info import racing_info
 from sb3_torcs.envs.options import AIDS
 from sb3_torcs.envs.racing import RacingEnv
 from sb3_torcs.errors import CarLost, InvalidAction, InvalidOption
-from sb3_torcs.rewards import Term
-from sb3_torcs.sensors import View
+from sb3_torcs.rewards import Rewards
+from sb3_torcs.sensors import Eyes, View
 
-__all__ = ["Batch", "Outcome", "fleet_of"]
+__all__ = ["Batch", "Outcome", "Replay", "fleet_of"]
 
 Counts = npt.NDArray[np.int64]
 
 Held = tuple[FloatArray, Counts]
 """Controls of all, (n, 5), and for how many control ticks each of them is held, (n,)."""
 
-Parts = list[Held]
-"""A timestep, whose controls may change once: where those that were late arrive."""
-
-CONTROLS_RECORD = np.dtype([(name, "f8") for name in Controls._fields])
-CAR_NUMBERS = CAR_RECORD.itemsize // 8
-NO_TERM = -1
+ASKED = slice(CAR_NUMBERS, CAR_NUMBERS + len(Controls._fields))  # in the numbers of an episode
+SPEED_X = CarState._fields.index("speed_x")
+LAP_TIME = EPISODE.fields["lap_time"][1] // 8  # type: ignore[index]  # of a record it is not None
 
 
-class Outcome(NamedTuple):
+@dataclass(slots=True)
+class Outcome:
     """The outcome of a timestep of all environments."""
 
-    before: FloatArray  # (n, 111) cars
-    after: FloatArray  # (n, 111) cars
+    before: Episodes  # (n,)
+    after: Episodes  # (n,) whose ``over`` does not know of time limits
     observations: npt.NDArray[np.float32]  # (n, size)
-    rewards: list[float]
-    terms: list[list[float]]  # of the rewards, in the order of `names`
-    names: list[tuple[str, ...]]  # of the terms
-    rules: npt.NDArray[np.void]  # (n,) of RULES, before
-    waiting: list[tuple[Controls, ...]]  # controls that had not arrived before, of each
-    ended: npt.NDArray[np.bool_]  # (n,) also by a failure; time limits are not known here
     failures: dict[int, Exception]  # what stopped cars, by index
+    valued: Rewards  # of the environments
+    terms: list[list[float]] = field(default_factory=list)  # of the rewards, once they are valued
+
+    @property
+    def ended(self) -> npt.NDArray[np.bool_]:
+        """Which episodes are over, (n,), also by a failure."""
+        return self.after["over"] != 0.0
 
     def info(self, index: int) -> dict[str, Any]:
         """
@@ -63,7 +71,7 @@ class Outcome(NamedTuple):
         :param index: of the environment
         """
         _, lap_time, terms = self.glance(index)
-        return racing_info(car_from_record(self.after[index]), lap_time, terms)
+        return racing_info(car_of(self.after, index), lap_time, terms)
 
     def glance(self, index: int) -> tuple[float, float, dict[str, float]]:
         """
@@ -73,26 +81,37 @@ class Outcome(NamedTuple):
         :return: speed [m/s], time of the lap that the timestep completed, or 0 [s], and terms of
             the reward
         """
-        number = self.after.item  # no view of the row: this is asked of each
-        has_lapped = number(index, LAPS) > self.before.item(index, LAPS)
-        # Who has fewer terms than another has zeros after its own.
-        terms = dict(zip(self.names[index], self.terms[index], strict=False))
-        terms["crash"] = 0.0
-        return number(index, SPEED_X), number(index, LAST_LAP_TIME) if has_lapped else 0.0, terms
+        terms = self.valued.rewards[index].explain(self.terms[index], None)
+        number = numbers_of(self.after).item
+        return number(index, SPEED_X), number(index, LAP_TIME), terms
 
-    def car(self, index: int) -> CarState:
+
+class Replay:
+    """
+    A world whose next timestep has been driven already.
+
+    :param world: that was driven
+    :param arrival: the car after it, or what stopped it
+    """
+
+    def __init__(self, world: Backend, arrival: CarState | Exception) -> None:
+        self._world, self._arrival = world, arrival
+
+    def step(self, controls: Controls, ticks: int) -> CarState:
         """
-        Return the car of an environment, as the backend's ``step`` does.
+        Return the car after the timestep.
 
-        :param index: of the environment
+        :param controls: not used
+        :param ticks: not used
         :raises Exception: that stopped the car
         """
-        if index in self.failures:
-            raise self.failures[index]
-        return car_from_record(self.after[index])
+        del controls, ticks
+        if isinstance(self._arrival, Exception):
+            raise self._arrival
+        return self._arrival
 
-
-LAPS, LAST_LAP_TIME, SPEED_X = map(CarState._fields.index, ("laps", "last_lap_time", "speed_x"))
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._world, name)
 
 
 class Batch:
@@ -101,18 +120,22 @@ class Batch:
 
     Those that share a race stand side by side.
 
-    This object holds the state of an environment while :meth:`step` drives it. Call :meth:`leave`
-    before the environment is used alone: it gives the state back. :meth:`enter` takes it over
+    This object holds the episode of an environment while :meth:`step` drives it. Call :meth:`leave`
+    before the environment is used alone: it gives the episode back. :meth:`enter` takes it over
     again.
 
     :param envs: of one kind and with the same layout of actions
     :param threads: that drive, at least 1; those beyond one per race are left out
+    :param names: of the environments in errors; by default their indices
     :raises InvalidOption: if they cannot be driven together
     """
 
-    def __init__(self, envs: Sequence[RacingEnv], threads: int = 1) -> None:
+    def __init__(
+        self, envs: Sequence[RacingEnv], threads: int = 1, names: Sequence[str] | None = None
+    ) -> None:
         self.envs = list(envs)
         number = len(self.envs)
+        self._names = names or [f"environment {index}" for index in range(number)]
         races = {id(getattr(env.backend, "race", env)) for env in self.envs}
         self.threads = min(threads, len(races))
         layouts = {(env.layout.names, env.layout.high) for env in self.envs}
@@ -127,134 +150,101 @@ class Batch:
                 f"the environments have observations of {len(views)} kinds; give all the same "
                 "sensors"
             )
-        self._layout, self._view = self.envs[0].layout, View(*views)
+        self._layout, self._eyes = self.envs[0].layout, Eyes(View(*views), number)
         self._bounds = np.array(self._layout.low), np.array(self._layout.high)
         self._fleet = fleet_of([present_world(env.backend) for env in self.envs], self.threads)
-        self._indices = np.arange(number)
-        self._cars = np.zeros((number, CAR_NUMBERS))
-        self._rules = np.zeros(number, RULES)
-        self._aids = np.zeros((number, len(AIDS)), np.bool_)
-        self._driven: list[list[Parts]] = [[] for _ in self.envs]  # timesteps since `enter`
-        self._controls = np.zeros((number, len(Controls._fields)))
-        self._rewards = [env.reward for env in self.envs]
-        self._read_rewards()
-
-    def _read_rewards(self) -> None:
-        """Look up which terms the rewards have, and which of them are compiled."""
-        number, most = len(self.envs), max(len(reward.terms) for reward in self._rewards)
-        self._choices = np.full((number, most), NO_TERM)
-        self._weights = np.zeros((number, most))
-        self._in_python: list[tuple[int, int, Term, float]] = []
-        for index, reward in enumerate(self._rewards):
-            for column, (_, term, weight) in enumerate(reward.terms):
-                self._weights[index, column] = weight
-                if term in COMPILED:
-                    self._choices[index, column] = COMPILED.index(term)
-                else:
-                    self._in_python.append((index, column, term, weight))
-        self._names = [tuple(name for name, _, _ in reward.terms) for reward in self._rewards]
-
-    def renew(self) -> None:
-        """Take an array of its own before states are taken over: earlier outcomes look at this."""
-        self._cars = self._cars.copy()
+        self._all = np.arange(number)
+        self._races: dict[SharedRace, list[int]] = {}
+        for index, env in enumerate(self.envs):
+            seat: Any = env.backend
+            if isinstance(seat, Seat):
+                self._races.setdefault(seat.race, []).append(index)
+        self.episodes = new_episodes(number)
+        self._rules: Episodes = np.zeros(number, RULES)
+        self._rewards = Rewards([env.reward for env in self.envs])
+        self._driven: list[list[list[Held]]] = [[] for _ in self.envs]  # since `enter`
 
     def enter(self, index: int) -> None:
         """
-        Take the state of an environment over, which has been reset.
+        Take over the episode of an environment, which has been reset.
 
         :param index: of the environment
         """
         env = self.envs[index]
-        assert env.car is not None, "step raises before the first reset"
         self._fleet.put(index, present_world(env.backend))
-        self._cars[index] = np.hstack(env.car)
-        self._rules[index] = (
-            math.inf if env.laps is None else env.laps,
-            env.runoff,
-            env.recovery_ticks,
-            env.action_repeat,
-            env.patience,
-            env.standing,
-        )
-        self._aids[index] = astuple(env.aids)
+        self._eyes.open(index, env.backend)
+        self.episodes = copy_of(self.episodes)  # outcomes of earlier timesteps look at the old ones
+        self.episodes[index], self._rules[index] = env.episode[0], env.rules[0]
+        self._ticks = self._rules["ticks"].astype(np.int64)
+        self._helps = any(self._rules[aid].any() for aid in AIDS)
+        self._late = bool(self.episodes["delay"].any())
         self._driven[index] = []
-        if env.reward is not self._rewards[index]:
-            self._rewards[index] = env.reward
-            self._read_rewards()
+        if env.reward is not self._rewards.rewards[index]:
+            self._rewards = Rewards([env.reward for env in self.envs])
 
     def leave(self, index: int) -> None:
         """
-        Give the state of an environment back to it.
+        Give the episode of an environment back to it.
 
         :param index: of the environment
         """
         if not self._driven[index]:
             return
-        env, car = self.envs[index], car_from_record(self._cars[index])
         steps = (
-            (_controls(controls[index]), int(ticks[index]))
+            (controls_from_record(controls[index]), int(ticks[index]))
             for parts in self._driven[index]
             for controls, ticks in parts
             if ticks[index]
         )
-        self._fleet.arrive(index, steps, car)
-        env.arrive(car, _controls(self._controls[index]), *_clocks(self._rules[index]))
+        self._fleet.arrive(index, steps, car_of(self.episodes, index))
+        self.envs[index].episode = copy_of(self.episodes[index : index + 1])
         self._driven[index] = []
 
-    def step(self, asked: npt.NDArray[np.floating]) -> Outcome:
+    def step(
+        self, actions: npt.NDArray[np.floating] | Sequence[Any], indices: Counts | None = None
+    ) -> Outcome:
         """
         Hold an action in each environment.
 
-        :param asked: (n, numbers of an action)
-        :return: the outcome; an environment that has ended or failed has to be finished
+        :param actions: (n, numbers of an action)
+        :param indices: (n,) of the environments that take the timestep; by default all
+        :return: the outcome; an environment that has ended or failed has to be finished, and then
+            the others are to be valued
         :raises InvalidAction: if there is not one action per environment, or one is invalid; then
             no car has been driven
         """
-        controls = self._read(asked)
-        if self._aids.any():
-            aid_cars(self._cars.view(CAR_RECORD)[:, 0], self._aids, controls)
-        before, after = self._cars, np.empty_like(self._cars)
-        waiting = [env.delay.waiting for env in self.envs]
-        parts = self._parts(controls)
-        failed = self._drive(parts, after)
-        after[failed] = before[failed]
-        self._cars, self._controls = after, controls  # driven, even if a term of a reward fails
-        for driven in self._driven:
-            driven.append(parts)
-        number = len(self.envs)
-        observations = np.empty((number, self._view.size), np.float32)
-        values, ended = np.empty_like(self._weights), np.empty(number, np.bool_)
-        rules = self._rules.copy()
-        value_timesteps(
-            before.view(CAR_RECORD)[:, 0],
-            after.view(CAR_RECORD)[:, 0],
-            controls.view(CONTROLS_RECORD)[:, 0],
-            self._choices,
-            self._weights,
-            self._rules,
-            observations,
-            values,
-            ended,
-        )
-        if self._view.has_more:
-            for env, row, seen in zip(self.envs, after, observations, strict=True):
-                self._view.add(car_from_record(row), env.backend, seen)
-        for index, column, term, weight in self._in_python:
-            values[index, column] = _ask(term, weight, before[index], after[index], controls[index])
-        ended[failed] = True
-        terms = values.tolist()
-        return Outcome(
-            before,
-            after,
-            observations,
-            [sum(row) for row in terms],
-            terms,
-            self._names,
-            rules,
-            waiting,
-            ended,
-            {index: self._fleet.failure(index) for index in failed},
-        )
+        indices = self._all if indices is None else indices
+        before, after = self.episodes, copy_of(self.episodes)
+        numbers = numbers_of(after)
+        numbers[indices, ASKED] = self._read(actions, indices)
+        if self._helps:
+            help_cars(after, self._rules)
+        parts = self._hold(after, numbers)
+        races = [race for race, seats in self._races.items() if np.isin(seats, indices).any()]
+        for race in races:
+            race.ask()
+        failed = self._drive(parts, indices, numbers)
+        for race in races:
+            race.advance(self.envs[self._races[race][0]].action_repeat)
+        end_episodes(after, self._rules)
+        for index in failed:
+            after["over"][index] = LOST
+        self.episodes = after
+        for index in indices.tolist():
+            self._driven[index].append(parts)
+        failures = {index: self._fleet.failure(index) for index in failed}
+        return Outcome(before, after, self._eyes.see(after), failures, self._rewards)
+
+    def value(self, timestep: Outcome, going: npt.NDArray[np.bool_]) -> list[float]:
+        """
+        Value a timestep of the environments whose episodes go on; the others value it themselves.
+
+        :param timestep: the outcome of the latest ``step``
+        :param going: (n,) which they are
+        :return: rewards
+        """
+        timestep.terms = self._rewards.value(timestep.before, timestep.after, going)
+        return [sum(terms) for terms in timestep.terms]
 
     def finish(self, index: int, timestep: Outcome, act: Callable[[], Any]) -> Any:
         """
@@ -266,108 +256,83 @@ class Batch:
         :return: what ``act`` returns
         :raises Exception: the error that stopped the car; its state is that before the timestep
         """
-        env = self.envs[index]
+        env, world = self.envs[index], self.envs[index].backend
         failure = timestep.failures.get(index)
         if failure is not None and not isinstance(failure, CarLost):
             self._driven[index].pop()
-            env.delay.waiting = timestep.waiting[index]
-            self._rules[index] = timestep.rules[index]
+            self.episodes[index] = timestep.before[index]
             raise failure
-        before = car_from_record(timestep.before[index])
-        env.arrive(before, env.controls, *_clocks(timestep.rules[index]))
-        env.delay.waiting = timestep.waiting[index]
-        env.driven = partial(timestep.car, index)
-        env.valued = dict(zip(timestep.names[index], timestep.terms[index], strict=False))
+        env.episode = copy_of(timestep.before[index : index + 1])
+        env.episode["race_end"] = timestep.after["race_end"][index]
+        env.backend = Replay(world, failure or car_of(timestep.after, index))
         try:
             return act()
         finally:
-            env.driven = env.valued = None
+            env.backend = world
             self._driven[index] = []
 
     def close(self) -> None:
         """End the threads."""
         self._fleet.close()
 
-    def _parts(self, controls: FloatArray) -> Parts:
+    def _hold(self, after: Episodes, numbers: FloatArray) -> list[Held]:
         """
         Split the timestep where controls arrive.
 
-        :param controls: (n, 5) that were asked for
-        :return: what is held, one part if no controls arrive during the timestep, else two
+        :param after: whose controls set out
+        :param numbers: the same as a matrix
+        :return: what is held: one part if no controls arrive during the timestep, else two
         """
-        if not any(env.delay.ticks for env in self.envs):
-            return [(controls, self._rules["ticks"].copy())]
-        first, second = np.zeros((2, *controls.shape))
-        ticks = np.zeros((2, len(self.envs)), np.int64)
-        for index, env in enumerate(self.envs):
-            *begun, (held, ticks[1, index]) = env.delay.hold(_controls(controls[index]))
-            second[index] = _row(held)
-            for held, number in begun:
-                first[index], ticks[0, index] = _row(held), number
-        return [(first, ticks[0]), (second, ticks[1])]
+        if not self._late:
+            return [(numbers[:, ASKED].copy(), self._ticks)]
+        held, ticks = np.empty((2, len(after), 5)), np.empty((2, len(after)), np.int64)
+        hold_controls(after, self._rules, held, ticks)
+        return list(zip(held, ticks, strict=True))
 
-    def _drive(self, parts: Parts, after: FloatArray) -> list[int]:
+    def _drive(self, parts: list[Held], indices: Counts, numbers: FloatArray) -> list[int]:
         """
-        Drive all cars.
+        Drive cars.
 
         :param parts: of the timestep
-        :param after: (n, 111) filled
-        :return: who failed, whose rows are not
+        :param indices: of the cars
+        :param numbers: (all, numbers of an episode) whose cars change
+        :return: who failed, whose cars stay as they were
         """
-        if len(parts) == 1:
-            return self._fleet.step(self._indices, *parts[0], after)
-        going, failed = np.ones(len(self.envs), np.bool_), []
+        failed: list[int] = []
+        arrivals = np.empty((len(numbers), CAR_NUMBERS))
         for controls, ticks in parts:
-            indices = np.flatnonzero(going & (ticks > 0))
-            cars = np.empty((len(indices), CAR_NUMBERS))
-            lost = self._fleet.step(indices, controls[indices], ticks[indices], cars)
-            after[indices] = cars
-            failed += indices[lost].tolist()
-            going[indices[lost]] = False
+            driving = indices if len(parts) == 1 else indices[ticks[indices] > 0]
+            cars = np.empty((len(driving), CAR_NUMBERS))
+            lost = self._fleet.step(driving, controls[driving], ticks[driving], cars)
+            arrivals[driving] = cars
+            if lost:
+                failed += driving[lost].tolist()
+                indices = np.setdiff1d(indices, driving[lost])
+        numbers[indices, :CAR_NUMBERS] = arrivals[indices]
         return failed
 
-    def _read(self, asked: npt.NDArray[np.floating]) -> FloatArray:
-        """Turn the actions into controls, (n, 5)."""
+    def _read(
+        self, actions: npt.NDArray[np.floating] | Sequence[Any], indices: Counts
+    ) -> FloatArray:
+        """Turn the actions of some environments into controls, (n, 5)."""
         low, high = self._bounds
-        controls = np.empty((len(self.envs), len(Controls._fields)))
-        if isinstance(asked, np.ndarray) and asked.dtype.char in "fd" and asked.dtype.isnative:
-            fits = asked.shape == (len(self.envs), len(low))
-            if fits and read_actions(np.ascontiguousarray(asked), low, high, controls):
+        controls = np.empty((len(indices), len(Controls._fields)))
+        if (
+            isinstance(actions, np.ndarray)
+            and actions.dtype.char in "fd"
+            and actions.dtype.isnative
+        ):
+            fits = actions.shape == (len(indices), len(low))
+            if fits and read_actions(np.ascontiguousarray(actions), low, high, controls):
                 return controls
-        shape = len(self.envs), len(low)
-        rows = listed_actions(asked, shape, ", as of model.predict(observations)")
-        for index, row in enumerate(rows):
+        shape = len(indices), len(low)
+        rows = listed_actions(actions, shape, ", as of model.predict(observations)")
+        for place, row in enumerate(rows):
             try:
-                controls[index] = _row(controls_from_action(row, self._layout))
+                controls[place] = controls_from_action(row, self._layout)
             except InvalidAction as error:
-                raise InvalidAction(f"environment {index}: {error}") from error
+                raise InvalidAction(f"{self._names[indices[place]]}: {error}") from error
         return controls
-
-
-def _ask(
-    term: Term, weight: float, before: FloatArray, after: FloatArray, controls: FloatArray
-) -> float:
-    """Return the weighted value of a term that is not compiled."""
-    was, car = car_from_record(before), car_from_record(after)
-    seconds = car.time - was.time
-    return weight * seconds * term(was, car, _controls(controls)) if seconds else 0.0
-
-
-def _clocks(rules: Any) -> tuple[int, int]:
-    """Read for how many control ticks a car has been standing, and how many it may."""
-    return int(rules["standing"]), int(rules["patience"])
-
-
-def _row(controls: Controls) -> tuple[float, ...]:
-    """Write controls as a row of an array, (5,)."""
-    steering, throttle, brake, gear, clutch = controls
-    return steering, throttle, brake, math.nan if gear is None else gear, clutch
-
-
-def _controls(row: FloatArray) -> Controls:
-    """Read controls from an array, (5,)."""
-    steering, throttle, brake, gear, clutch = row.tolist()
-    return Controls(steering, throttle, brake, None if gear != gear else int(gear), clutch)
 
 
 def fleet_of(worlds: Sequence[Backend], threads: int) -> Fleet:

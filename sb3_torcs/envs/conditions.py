@@ -6,48 +6,55 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
+from numba import njit
 
 from sb3_torcs.backends.base import optional
-from sb3_torcs.car import RESTING, Controls, checked_delay, checked_factor
+from sb3_torcs.car import FloatArray, checked_delay, checked_factor
 from sb3_torcs.envs.arguments import read_group
+from sb3_torcs.envs.episode import Episodes
 from sb3_torcs.envs.options import CONDITIONS, ConditionOptions
 from sb3_torcs.errors import InvalidOption
 
-__all__ = ["Conditions", "Delay", "Part"]
-
-Part = tuple[Controls, int]
-"""Controls, and the control ticks for which they are held."""
+__all__ = ["Conditions", "hold_controls"]
 
 
 FACTORS = ("grip", "mass")
 
 
-class Delay:
+@njit(cache=True)
+def hold_controls(
+    episodes: Episodes, rules: Episodes, held: FloatArray, ticks: npt.NDArray[np.int64]
+) -> None:
     """
-    Controls that arrive late: a timestep goes on with earlier ones until they do.
+    Begin a timestep: let controls set out, and find out which of them the cars hold in it.
 
-    :param ticks: from an observation to the arrival of the controls that answer it
-    :param repeat: control ticks per timestep
+    Controls that arrive late are those of an earlier timestep. Two are held if the later ones
+    arrive within the timestep.
+
+    :param episodes: (n,) of :data:`~sb3_torcs.envs.episode.EPISODE`, whose ``controls`` set out
+    :param rules: (n,) of :data:`~sb3_torcs.envs.episode.RULES`
+    :param held: (2, n, 5) filled, one set of controls after the other
+    :param ticks: (2, n) filled, for how many control ticks each is held; may be 0
     """
-
-    def __init__(self, ticks: int = 0, repeat: int = 1) -> None:
-        self.ticks = ticks
-        whole, self._rest = divmod(ticks, repeat)
-        self._repeat = repeat
-        self.waiting: tuple[Controls, ...] = (RESTING,) * (whole + 1)
-        """Controls that are held or on their way, oldest first."""
-
-    def hold(self, controls: Controls) -> list[Part]:
-        """
-        Begin a timestep.
-
-        :param controls: that set out now
-        :return: what is held in it, one part or two
-        """
-        earlier, later, *_ = *self.waiting, controls
-        self.waiting = (*self.waiting[1:], controls)
-        parts = [(earlier, self._rest), (later, self._repeat - self._rest)]
-        return parts if self._rest else parts[1:]
+    for row in range(len(episodes)):
+        episode, controls = episodes[row], episodes[row].controls
+        waiting = episode.waiting
+        last = int(episode.delay // rules[row].ticks)
+        late = episode.delay % rules[row].ticks
+        for i in range(waiting.shape[1]):
+            held[0, row, i] = waiting[0, i]
+        for j in range(last):
+            for i in range(waiting.shape[1]):
+                waiting[j, i] = waiting[j + 1, i]
+        waiting[last, 0] = controls.steering
+        waiting[last, 1] = controls.throttle
+        waiting[last, 2] = controls.brake
+        waiting[last, 3] = controls.gear
+        waiting[last, 4] = controls.clutch
+        for i in range(waiting.shape[1]):
+            held[1, row, i] = waiting[0, i]
+        ticks[0, row], ticks[1, row] = int(late), int(rules[row].ticks - late)
 
 
 class Conditions:
@@ -104,14 +111,13 @@ class Conditions:
                     "leave it out, or use backend 'native' of Torcs-v0, with no agents as opponents"
                 )
 
-    def draw(self, rng: np.random.Generator, world: Any, repeat: int) -> Delay:
+    def draw(self, rng: np.random.Generator, world: Any) -> int:
         """
         Draw the conditions of an episode. Equal bounds draw nothing.
 
         :param rng: the environment's
         :param world: a backend, in which they are set
-        :param repeat: control ticks per timestep
-        :return: the delay
+        :return: by how many control ticks controls arrive late
         """
         low, high = map(int, self._delays)
         ticks = low if low == high else int(rng.integers(low, high + 1))
@@ -121,4 +127,4 @@ class Conditions:
                 for low, high in self._factors.values()
             )
             world.set_conditions(self.grip, self.mass)
-        return Delay(ticks, repeat)
+        return ticks

@@ -13,8 +13,10 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from sb3_torcs.car import CarState, check_count
+from sb3_torcs.envs.batch import Batch
+from sb3_torcs.envs.ends import FINISHED
 from sb3_torcs.envs.making import NO_LIMIT, checked_time_limit
-from sb3_torcs.envs.torcs_race import RaceCarEnv, make_race
+from sb3_torcs.envs.torcs_race import make_race
 from sb3_torcs.errors import EnvClosed, InvalidAction, InvalidOption, needs_extra
 
 with needs_extra("parallel_env"):
@@ -71,7 +73,7 @@ class TorcsParallelEnv(ParallelEnv[str, Observation, Action]):
         self._envs = dict(zip(self.possible_agents, envs, strict=True))
         self._race = envs[0].seat.race
         self._limit = math.inf if limit == NO_LIMIT else limit
-        self._steps = 0
+        self._batch = Batch(envs, names=self.possible_agents)
         self._closed = False
         self.observation_spaces: dict[str, spaces.Space[Any]] = {
             name: env.observation_space for name, env in self._envs.items()
@@ -122,8 +124,9 @@ class TorcsParallelEnv(ParallelEnv[str, Observation, Action]):
             name: env.reset(seed=None if seed is None else int(seed) + number, options=options)
             for number, (name, env) in enumerate(self._envs.items())
         }
+        for index in range(len(self._envs)):
+            self._batch.enter(index)
         self.agents = list(self.possible_agents)
-        self._steps = 0
         observations = {name: seen for name, (seen, _) in answers.items()}
         return observations, {name: _with_race(info) for name, (_, info) in answers.items()}
 
@@ -139,68 +142,61 @@ class TorcsParallelEnv(ParallelEnv[str, Observation, Action]):
         self._check_open("step")
         if not self.agents:
             raise EnvClosed("step before reset or after the race; call reset first")
-        racing = {name: self._envs[name] for name in self.agents}
-        self._hold(racing, actions)
-        failure = self._drive(next(iter(racing.values())))
-        self._steps += 1
-        late = self._steps >= self._limit
+        given = actions if isinstance(actions, Mapping) else ()
+        missing = [name for name in self.agents if name not in given]
+        if missing:
+            raise InvalidAction(f"no action of {', '.join(missing)}; give one of each in `agents`")
+        racing = {name: self.possible_agents.index(name) for name in self.agents}
+        indices = np.array(list(racing.values()))
+        timestep = self._batch.step([actions[name] for name in racing], indices)
+        for name, index in racing.items():
+            if self._envs[name].seat.finished:
+                timestep.after["race_end"][index] = FINISHED
+        over = timestep.ended | (timestep.after["race_end"] != 0.0)
+        rewards = self._batch.value(timestep, ~over)
+        late = timestep.after["timesteps"] >= self._limit
         answers: tuple[dict[str, Any], ...] = ({}, {}, {}, {}, {})
-        over = []
-        for name, env in racing.items():
-            seen, reward, terminated, truncated, info = env.finish_step(partial(_car, env, failure))
-            truncated = truncated or (late and not terminated)
+        leaving = []
+        for name, index in racing.items():
+            if over[index]:
+                act = partial(self._envs[name].step, actions[name])
+                answer = self._batch.finish(index, timestep, act)
+                seen, reward, terminated, truncated, info = answer
+            else:
+                seen, reward, terminated, truncated = (
+                    timestep.observations[index],
+                    rewards[index],
+                    False,
+                    False,
+                )
+                info = timestep.info(index)
+            truncated = truncated or bool(late[index] and not terminated)
             values = seen, reward, terminated, truncated, _with_race(info)
             for part, value in zip(answers, values, strict=True):
                 part[name] = value
             if terminated or truncated:
-                over.append(name)
-        for name in over:  # only now, since the others have still seen these cars
+                leaving.append(name)
+        for name in leaving:  # only now, since the others have still seen these cars
             self.agents.remove(name)
-            racing[name].seat.retire()
+            self._envs[name].seat.retire()
         return answers
 
     def _check_open(self, what: str) -> None:
         if self._closed:
             raise EnvClosed(f"{what} after close; make a new environment with parallel_env")
 
-    def _hold(self, racing: Mapping[str, RaceCarEnv], actions: Mapping[str, Action]) -> None:
-        given = actions if isinstance(actions, Mapping) else ()
-        missing = [name for name in racing if name not in given]
-        if missing:
-            raise InvalidAction(f"no action of {', '.join(missing)}; give one of each in `agents`")
-        controls = {}
-        for name, env in racing.items():
-            try:
-                ((controls[name], _),) = env.begin_step(actions[name])
-            except InvalidAction as error:
-                raise InvalidAction(f"{name}: {error}") from error
-        for name, env in racing.items():
-            env.seat.hold(controls[name])
-
-    def _drive(self, env: RaceCarEnv) -> Exception | None:
-        """Drive the whole race on; return what stopped it."""
-        try:
-            self._race.drive(env.action_repeat)
-        except Exception as error:
-            return error
-        return None
-
     def render(self) -> None:
         """Draw nothing: there are no modes."""
 
     def close(self) -> None:
         """Close the race, whatever one of its cars raises. A second call does nothing."""
+        if not self._closed:
+            self._batch.close()
         self._closed = True
         self.agents = []
         with ExitStack() as closing:
             for env in self._envs.values():
                 closing.callback(env.close)
-
-
-def _car(env: RaceCarEnv, failure: Exception | None) -> CarState:
-    if failure is not None:
-        raise failure
-    return env.seat.read()
 
 
 def _with_race(info: dict[str, Any]) -> dict[str, Any]:

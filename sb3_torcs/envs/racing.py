@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
 from typing import Any, Unpack, get_args
 
 import gymnasium as gym
@@ -16,7 +15,6 @@ from sb3_torcs.actions import ActionName, action_layout, controls_from_action
 from sb3_torcs.backends.base import Backend, optional
 from sb3_torcs.car import (
     CONTROL_TICK,
-    RESTING,
     CarState,
     Controls,
     FloatArray,
@@ -24,17 +22,27 @@ from sb3_torcs.car import (
     checked_hard_starts,
     checked_start,
     checked_start_speed,
+    controls_from_record,
 )
-from sb3_torcs.envs.aids import NEED_RIVALS, Aids
+from sb3_torcs.envs.aids import NEED_RIVALS, Aids, help_cars
 from sb3_torcs.envs.arguments import read_options, takes_options
-from sb3_torcs.envs.conditions import Conditions, Delay, Part
-from sb3_torcs.envs.ends import GRACE_TICKS, REASONS, STUCK_TICKS, TRUNCATING, end_of, waited
+from sb3_torcs.envs.conditions import Conditions, hold_controls
+from sb3_torcs.envs.ends import GRACE_TICKS, LOST, REASONS, STUCK_TICKS, TRUNCATING, end_episodes
+from sb3_torcs.envs.episode import (
+    RULES,
+    Episodes,
+    begin_episode,
+    car_of,
+    copy_of,
+    new_episodes,
+    numbers_of,
+)
 from sb3_torcs.envs.info import racing_info
-from sb3_torcs.envs.options import RACING, RacingOptions, RenderMode
+from sb3_torcs.envs.options import AIDS, RACING, RacingOptions, RenderMode
 from sb3_torcs.envs.starts import Starts, read_start
 from sb3_torcs.errors import CarLost, EnvClosed, InvalidOption, StartBlocked
-from sb3_torcs.rewards import CRASHES, Reward, RewardChoice
-from sb3_torcs.sensors import NEEDS_CAR, NEEDS_RACE, NEEDS_ROAD, SensorsName, View
+from sb3_torcs.rewards import CRASHES, Reward, RewardChoice, Rewards
+from sb3_torcs.sensors import NEEDS_CAR, NEEDS_RACE, NEEDS_ROAD, Eyes, SensorsName, View
 from sb3_torcs.tracks.track import Track
 
 __all__ = ["Observation", "RacingEnv", "RenderMode"]
@@ -107,22 +115,25 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         self._starts = Starts(given["start"])
         self.conditions = Conditions(given["conditions"])
         self.conditions.check(backend)
-        self.delay = Delay(0, self.action_repeat)
-        self.car: CarState | None = None
-        self._controls = RESTING
+        self.episode: Episodes = new_episodes(1)
+        """The state of the episode, an array of one record."""
+        self.rules: Episodes = np.zeros(1, RULES)
+        """What stays the same all through the episode, an array of one record."""
+        self._eyes = Eyes(self.view, 1)
+        self._begun = self._closed = False
         self._viewer: Any = None
-        self._closed = self._race_is_over = False
-        self._over = False
         self.warns_after_end = True
         """Whether the next step after the end of an episode is worth a warning."""
-        self.driven: Callable[[], CarState] | None = None
-        """Returns the car after a timestep that a batch of races has driven."""
-        self.valued: dict[str, float] | None = None
-        """The terms of the reward for it, which are asked once, since a term may have a state."""
 
     def __getstate__(self) -> dict[str, Any]:
-        # pygame's surfaces cannot be pickled; a copy makes its own.
-        return {**self.__dict__, "_viewer": None}
+        # pygame's surfaces cannot be pickled; and the eyes look at what a copied world makes.
+        return {**self.__dict__, "_viewer": None, "_eyes": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._eyes = Eyes(self.view, 1)
+        if self._begun:
+            self._eyes.open(0, self.backend)
 
     @property
     def track(self) -> Track:
@@ -133,6 +144,19 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
     def sensors(self) -> tuple[SensorsName, ...]:
         """Names of the groups of sensors in an observation."""
         return self.view.sensors
+
+    @property
+    def car(self) -> CarState | None:
+        """The car now; ``None`` before the first reset."""
+        return car_of(self.episode) if self._begun else None
+
+    @property
+    def controls(self) -> Controls:
+        """What the driver asked for in the last timestep, after the aids have changed it.
+
+        With a delay, earlier controls were held meanwhile.
+        """
+        return controls_from_record(self.episode["controls"][0])
 
     @property
     def range_finder_angles(self) -> FloatArray:
@@ -148,6 +172,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         """
         previous = getattr(self, "_reward_choice", None)
         self.reward = Reward(reward)
+        self._rewards = Rewards([self.reward])
         self._reward_choice = reward
         return previous
 
@@ -221,7 +246,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
             raise EnvClosed("reset after close; make a new environment")
         is_given = self.check_start(options)  # a wrong one leaves the episode as it is
         super().reset(seed=seed)
-        self.car = None  # if the reset fails, no step is possible
+        self._begun = False  # if the reset fails, no step is possible
         if self._draw_track is not None:
             self._draw_track(self.np_random)
         start = (
@@ -229,24 +254,40 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
             if is_given
             else self._starts.draw(self.np_random, self.track)
         )
-        self.delay = self.conditions.draw(self.np_random, self.backend, self.action_repeat)
+        self._late = self.conditions.draw(self.np_random, self.backend)
+        aids = [getattr(self.aids, name) for name in AIDS]
+        laps = math.inf if self.laps is None else self.laps
+        self.rules[0] = laps, self.runoff, self.recovery_ticks, self.action_repeat, *aids
+        self._helps = any(aids)
+        self._eyes.open(0, self.backend)
+        self._compile()
         try:
-            self.car = self.backend.reset(self.np_random, start)
+            car = self.backend.reset(self.np_random, start)
         except StartBlocked:
             if start is None or is_given:
                 raise
             # A wall stands where a start was drawn: rare, but a training draws thousands.
             start = None
-            self.car = self.backend.reset(self.np_random, start)
-        self._controls = RESTING
+            car = self.backend.reset(self.np_random, start)
         grace = STUCK_TICKS if start is not None and start.speed > 0.0 else GRACE_TICKS
-        self.patience = max(grace, self.recovery_ticks)
-        self.standing = 0
-        self._race_is_over = self._over = False
+        begin_episode(self.episode, car, self._late, max(grace, self.recovery_ticks))
+        self._begun = True
         if self.render_mode == "human":
             self.render()
-        seen = self.view.encode(self.car, self.backend)
-        return seen, racing_info(self.car, 0.0, self.reward.nothing(), None)
+        nothing = self.reward.explain([0.0] * len(self.reward.names), None)
+        return self._eyes.see(self.episode)[0], racing_info(car, 0.0, nothing, None)
+
+    def _compile(self) -> None:
+        """Call what a step calls: a game over the network does not wait for a compiler."""
+        episode = new_episodes(1)
+        numbers_of(episode)[:] = 1.0
+        if self._helps:
+            help_cars(episode, self.rules)
+        if self._late:
+            hold_controls(episode, self.rules, np.empty((2, 1, 5)), np.empty((2, 1), np.int64))
+        end_episodes(episode, self.rules)
+        self._rewards.value(episode, episode, [False])
+        self._eyes.see(episode)
 
     def check_start(self, options: dict[str, Any] | None) -> bool:
         """
@@ -272,52 +313,56 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         :return: observation, reward, terminated, truncated, info
         :raises InvalidAction: if the action has another shape or is not a number
         """
-        was_over = self._over
-        parts = self.begin_step(action)
-        result = self.finish_step(partial(self._hold, parts))
-        # Whoever has gone back to a saved moment may step on.
-        if was_over and self._over and self.warns_after_end:
-            self.warns_after_end = False
-            gym.logger.warn(
-                "step after the end of an episode, where rewards mean nothing; call reset when "
-                "terminated or truncated is true"
-            )
-        return result
-
-    def _hold(self, parts: list[Part]) -> CarState:
-        """Drive what ``begin_step`` returned, unless that has been driven already."""
-        if self.driven is not None:
-            return self.driven()
-        for controls, ticks in parts[:-1]:
-            self.backend.step(controls, ticks)
-        return self.backend.step(*parts[-1])
-
-    def begin_step(self, action: npt.NDArray[np.float32]) -> list[Part]:
-        """
-        Do the part of ``step`` before the world moves. Used to drive several worlds at once.
-
-        :param action: as of ``step``
-        :return: the arguments of the calls of the backend's ``step``: one, or two if the controls
-            arrive during the timestep
-        """
-        self.read_action(action)
-        return self.held_parts()
-
-    def read_action(self, action: npt.NDArray[np.float32]) -> None:
-        """
-        Take note of an action, without letting it set out: the next one may come instead.
-
-        :param action: as of ``step``
-        """
         self.check_ready()
-        assert self.car is not None, "check_ready raises before the first reset"
-        asked = controls_from_action(action, self.layout)
-        self._controls = self.aids.change(asked, self.car)
+        before, episode = self.episode, copy_of(self.episode)
+        controls = self._ask(action, episode)
+        lost = False
+        try:
+            car = episode["car"][0] = self._drive(controls, episode)
+        except CarLost:  # end the episode, and not a training of millions of timesteps
+            car, lost = car_of(before), True
+        end_episodes(episode, self.rules)
+        if lost:
+            episode["over"] = LOST
+        self.episode = episode
+        end = REASONS[int(episode["over"].item())]
+        if end in CRASHES:
+            self._starts.remember(self.track, car.distance_from_start)
+        (values,) = self._rewards.value(before, episode)
+        terms = self.reward.explain(values, end)
+        info = racing_info(car, episode["lap_time"].item(), terms, end)
+        if self.render_mode == "human":
+            self.render()
+        if end and before["over"].item() and self.warns_after_end:
+            self._warn_after_end()
+        truncated = end in TRUNCATING
+        seen = self._eyes.see(episode)[0]
+        return seen, sum(terms.values()), bool(end) and not truncated, truncated, info
 
-    def held_parts(self) -> list[Part]:
-        """Let the controls set out that were asked for; return as ``begin_step``."""
-        at_once = (self._controls, self.action_repeat)
-        return self.delay.hold(self._controls) if self.delay.ticks else [at_once]
+    def _ask(self, action: npt.NDArray[np.float32], episode: Episodes) -> Controls:
+        """Read an action; driver aids may change what it asks for."""
+        episode["controls"][0] = controls = controls_from_action(action, self.layout)
+        if not self._helps:
+            return controls
+        help_cars(episode, self.rules)
+        return controls_from_record(episode["controls"][0])
+
+    def _drive(self, controls: Controls, episode: Episodes) -> CarState:
+        """Hold the controls, or those that were late before; return the car at the end."""
+        if not self._late:
+            return self.backend.step(controls, self.action_repeat)
+        held, ticks = np.empty((2, 1, 5)), np.empty((2, 1), np.int64)
+        hold_controls(episode, self.rules, held, ticks)
+        if ticks[0, 0]:
+            self.backend.step(controls_from_record(held[0, 0]), int(ticks[0, 0]))
+        return self.backend.step(controls_from_record(held[1, 0]), int(ticks[1, 0]))
+
+    def _warn_after_end(self) -> None:
+        self.warns_after_end = False
+        gym.logger.warn(
+            "step after the end of an episode, where rewards mean nothing; call reset when "
+            "terminated or truncated is true"
+        )
 
     def check_ready(self, what: str = "step") -> None:
         """
@@ -328,50 +373,8 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         """
         if self._closed:
             raise EnvClosed(f"{what} after close; make a new environment")
-        if self.car is None:
+        if not self._begun:
             raise EnvClosed(f"{what} before reset; call reset first")
-
-    @property
-    def controls(self) -> Controls:
-        """What the driver asked for in the last timestep, after the aids have changed it.
-
-        With a delay, earlier controls were held meanwhile.
-        """
-        return self._controls
-
-    def finish_step(
-        self, drive: Callable[[], CarState]
-    ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """
-        Do the rest of ``step``: let the world move, and value the result.
-
-        :param drive: returns what the backend's ``step`` does
-        :return: as ``step``
-        """
-        before = self.car
-        assert before is not None, "begin_step raises before the first reset"
-        try:
-            after = drive()
-            end = self._end(after)
-        except CarLost:
-            # End the episode, and not a training of millions of timesteps.
-            after, end = before, "lost"
-        self.car = after
-        if end in CRASHES:
-            self._starts.remember(self.track, after.distance_from_start)
-        if self.valued is None:
-            terms = self.reward(before, after, self._controls, end)
-        else:
-            terms = self.reward.ended(self.valued, end)
-        lap_time = after.last_lap_time if after.laps > before.laps else 0.0
-        info = racing_info(after, lap_time, terms, end)
-        if self.render_mode == "human":
-            self.render()
-        truncated = end in TRUNCATING
-        terminated = end is not None and not truncated
-        self._over = end is not None
-        seen = self.view.encode(after, self.backend)
-        return seen, sum(terms.values()), terminated, truncated, info
 
     def render(self) -> npt.NDArray[np.uint8] | None:
         """
@@ -383,14 +386,13 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
             gym.logger.warn('render without a mode: gym.make(..., render_mode="rgb_array")')
             return None
         self.check_ready("render")
-        assert self.car is not None
         if self._viewer is None:
             # Imported here because graphics take long to load.
             from sb3_torcs.rendering.viewer import Viewer
 
             self._viewer = Viewer(mode=self.render_mode, fps=self.metadata["render_fps"])
         frame: npt.NDArray[np.uint8] = self._viewer.frame(
-            self.track, self.car, self._controls, self.range_finder_angles
+            self.track, car_of(self.episode), self.controls, self.range_finder_angles
         )
         return frame if self.render_mode == "rgb_array" else None
 
@@ -404,32 +406,3 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
                 self._viewer.close()
         finally:
             self.backend.close()
-
-    def arrive(self, car: CarState, controls: Controls, standing: int, patience: int) -> None:
-        """
-        Take over the state of a car that has been driven without ``step``, in a batch of races.
-
-        :param car: the car now
-        :param controls: the last that it was driven with
-        :param standing: control ticks for which it has been standing
-        :param patience: control ticks for which it may stand
-        """
-        self.car, self._controls = car, controls
-        self.standing, self.patience = standing, patience
-
-    def end_race(self) -> None:
-        """Truncate the episode with the next timestep: the race that others share is over."""
-        self._race_is_over = True
-
-    def _end(self, car: CarState) -> str | None:
-        """Return why the episode ends, or ``None`` if it goes on."""
-        laps = math.inf if self.laps is None else self.laps
-        reason = end_of(car, laps, self.runoff, self.recovery_ticks)
-        if reason:
-            return REASONS[reason]
-        self.standing, self.patience = waited(
-            car, self.standing, self.patience, self.action_repeat, self.recovery_ticks
-        )
-        if self.standing > self.patience:
-            return "stuck"
-        return "race" if self._race_is_over else None

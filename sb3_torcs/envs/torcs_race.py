@@ -8,12 +8,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Unpack
 
+import numpy as np
+import numpy.typing as npt
+
 from sb3_torcs.actions import used_gearbox
 from sb3_torcs.backends.native import load_race
 from sb3_torcs.backends.seats import LoadedRace, Seat, SeatWorld, SharedRace
 from sb3_torcs.backends.several import is_several, world_pool
 from sb3_torcs.car import (
-    CarState,
     RangeFinderName,
     checked_flag,
     checked_laps,
@@ -21,7 +23,7 @@ from sb3_torcs.car import (
 )
 from sb3_torcs.envs.arguments import read_options, select
 from sb3_torcs.envs.options import CONDITIONS, RACING, TORCS, TorcsOptions
-from sb3_torcs.envs.racing import RacingEnv
+from sb3_torcs.envs.racing import Observation, RacingEnv
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.torcs.drivers import crew_of
 from sb3_torcs.torcs.installation import find_game
@@ -47,9 +49,20 @@ class RaceCarEnv(RacingEnv):
         super().__init__(world, **options)
         self.seat = seat
 
-    def _end(self, car: CarState) -> str | None:
-        """Return why the episode ends; a car that is laps behind is flagged off with the others."""
-        return super()._end(car) or ("laps" if self.seat.finished else None)
+    def look(self) -> Observation:
+        """Return what the agent sees, whose race is driven elsewhere."""
+        self.episode["car"][0] = self.seat.read()
+        return self._eyes.see(self.episode)[0]
+
+    def hold(self, action: npt.NDArray[np.float32]) -> None:
+        """
+        Let the car do what an action asks for, when its race is driven on.
+
+        :param action: as of ``step``
+        :raises InvalidAction: as ``step`` does
+        """
+        self._ask(action, self.episode)
+        self.seat.hold(self.controls)
 
 
 def load_shared_race(

@@ -1,12 +1,11 @@
-"""Many ``Torcs-v0`` in one process, driven on threads, as ``gym.make_vec`` makes them."""
+"""Many races in one process, driven on threads, as ``gym.make_vec`` makes them."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from contextlib import suppress
 from functools import partial
-from typing import Any, NoReturn
+from typing import Any, ClassVar, NoReturn
 
 import numpy as np
 import numpy.typing as npt
@@ -14,25 +13,22 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from sb3_torcs.actions import listed_actions
-from sb3_torcs.backends.native import NativeFleet
-from sb3_torcs.backends.several import present_world, shared_worlds
-from sb3_torcs.car import CarState, check_count
-from sb3_torcs.envs.conditions import Part
+from sb3_torcs.backends.several import shared_worlds
+from sb3_torcs.car import check_count
+from sb3_torcs.envs.batch import Batch, Outcome
 from sb3_torcs.envs.making import (
     MANY_RACES,
     NO_LIMIT,
     checked_threads,
     checked_time_limit,
 )
-from sb3_torcs.envs.racing import Observation
+from sb3_torcs.envs.racing import Observation, RacingEnv
 from sb3_torcs.envs.torcs import TorcsEnv
-from sb3_torcs.errors import CarLost, EnvClosed, InvalidAction, InvalidOption
-from sb3_torcs.torcs.installation import find_game
-from sb3_torcs.torcs.starting_list import guests_of
+from sb3_torcs.envs.torcs_lite import TorcsLiteEnv
+from sb3_torcs.errors import EnvClosed, InvalidOption
 
-__all__ = ["TorcsVectorEnv"]
+__all__ = ["TorcsLiteVectorEnv", "TorcsVectorEnv"]
 
-Answer = tuple[Observation, float, bool, bool, dict[str, Any]]
 Answers = tuple[
     npt.NDArray[np.float32],  # (n, size) observations
     npt.NDArray[np.float64],  # (n,) rewards
@@ -47,17 +43,20 @@ class TorcsVectorEnv(SyncVectorEnv):
     Several races of the real TORCS, driven at once by threads of this process.
 
     It does what :class:`gymnasium.vector.SyncVectorEnv` over ``Torcs-v0`` does, to the bit, in less
-    time: rewards and observations of races that are ready are computed while others still drive.
+    time.
 
     :param num_envs: races
     :param threads: that share the work, at least 1; ``None`` is one per core, and one per race at
         most
     :param max_episode_steps: timesteps after which an episode is truncated, as in ``gym.make``:
-        ``None`` is the limit that ``Torcs-v0`` is registered with, -1 is none
-    :param autoreset_mode: when a race that has ended begins anew
+        ``None`` is the limit that the environment is registered with, -1 is none
+    :param autoreset_mode: when a race that has ended begins again
     :param options: of :class:`~sb3_torcs.envs.torcs.TorcsEnv`, the same for all races
     :raises InvalidOption: if an option has a value that is not allowed
     """
+
+    env_id: ClassVar[str] = "Torcs-v0"
+    kind: ClassVar[Callable[..., RacingEnv]] = TorcsEnv
 
     @shared_worlds()
     def __init__(
@@ -76,23 +75,29 @@ class TorcsVectorEnv(SyncVectorEnv):
                 f"backend is {options['backend']!r}; races on threads are for backend 'native', "
                 "others drive with gym.make_vec(..., vectorization_mode='async')"
             )
-        opponents = options.get("opponents", ())
-        if guests_of(opponents, find_game()):
-            raise InvalidOption(
-                f"opponents is {opponents!r}, with agents among them; such races drive by "
-                "sb3_torcs.vec_env.TorcsVecEnv, or gym.make_vec(..., vectorization_mode='async')"
-            )
-        limit = checked_time_limit(max_episode_steps, "Torcs-v0")
-        timesteps = math.inf if limit == NO_LIMIT else limit
-        self.envs: list[_LimitedRace]  # type: ignore[assignment]  # a list of Env, says Gymnasium
+        limit = checked_time_limit(max_episode_steps, self.env_id)
+        self._limit = math.inf if limit == NO_LIMIT else limit
+        self._batch: Batch | None = None
+        self._driving = False
         self._env_obs: list[Observation | None]  # type: ignore[assignment]  # of None, says Gymnasium
-        super().__init__(
-            [lambda: _LimitedRace(timesteps, **options)] * int(num_envs),
-            autoreset_mode=autoreset_mode,
-        )
-        self.threads = min(most, self.num_envs)
-        worlds: list[Any] = [present_world(env.backend) for env in self.envs]
-        self._fleet: Any = NativeFleet(worlds, self.threads)
+        make = partial(type(self).kind, **options)
+        super().__init__([make] * int(num_envs), autoreset_mode=autoreset_mode)
+        self._batch = Batch(self._envs, most)
+        self.threads = self._batch.threads
+
+    @property  # type: ignore[override]  # a list of Env, says Gymnasium
+    def envs(self) -> list[RacingEnv]:
+        """The environments, brought up to date."""
+        if self._driving and self._batch is not None:
+            for index in range(len(self._envs)):
+                self._batch.leave(index)
+        self._driving = False
+        return self._envs
+
+    @envs.setter
+    def envs(self, envs: list[RacingEnv]) -> None:
+        """Set the environments, as ``SyncVectorEnv`` does once."""
+        self._envs = envs
 
     def step(self, actions: Iterable[npt.NDArray[np.float32]]) -> Answers:
         """
@@ -102,72 +107,76 @@ class TorcsVectorEnv(SyncVectorEnv):
         :return: observations, rewards, terminated, truncated, infos
         :raises InvalidAction: if there is not one action per race, or one is none
         """
-        if self.closed:
+        if self.closed or self._batch is None:
             raise EnvClosed("step after close; make new environments with gym.make_vec")
         shape = self.action_space.shape or ()
-        rows = listed_actions(actions, shape, ": take them from envs.action_space.sample()")
-        anew = self._begin_anew()
-        going = [index for index in range(self.num_envs) if not anew[index]]
-        # All before any sets out: a wrong one leaves all races where they are.
-        for index in going:
-            try:
-                self.envs[index].read_action(rows[index])
-            except InvalidAction as error:
-                raise InvalidAction(f"environment {index}: {error}") from error
-        parts = {index: self.envs[index].held_parts() for index in going}
-        try:
-            for index, (held, *_) in parts.items():
-                self._fleet.put(index, present_world(self.envs[index].backend))
-                self._fleet.begin(index, *held)
-            for index, (_, *later) in parts.items():
-                for held in later:  # the controls have arrived
-                    self._go_on(index, held)
-            return self._collect(anew)
-        except BaseException:
-            self._fleet.finish()  # so that a reset finds no thread at work
-            raise
+        rows: Any = actions
+        if getattr(actions, "shape", None) != shape:
+            rows = listed_actions(actions, shape, ": take them from envs.action_space.sample()")
+        starting = self._begin_anew()
+        going = np.flatnonzero(~starting)
+        if not self._driving:
+            self._enter()
+        driven = rows[going] if isinstance(rows, np.ndarray) else [rows[index] for index in going]
+        timestep = self._batch.step(driven, going)
+        over = timestep.ended | (timestep.after["timesteps"] >= self._limit)
+        return self._collect(self._batch, timestep, rows, starting, over & ~starting)
 
-    def _go_on(self, race: int, held: Part) -> None:
-        """Drive the next part of a timestep, unless the race has failed in the one before."""
-        with suppress(CarLost):  # told when the car is collected
-            self._fleet.wait(race)
-            self._fleet.begin(race, *held)
+    def _enter(self) -> None:
+        """Let the batch take over all races."""
+        assert self._batch is not None
+        for index, env in enumerate(self._envs):
+            env.check_ready()
+            self._batch.enter(index)
+        self._driving = True
 
-    def _begin_anew(self) -> list[bool]:
-        """Say for each race whether this timestep begins an episode instead."""
-        ended: list[bool] = self._autoreset_envs.tolist()
+    def _begin_anew(self) -> npt.NDArray[np.bool_]:
+        """Find the races in which this timestep begins an episode instead."""
+        ended = self._autoreset_envs
         if self.autoreset_mode == AutoresetMode.NEXT_STEP:
-            return ended
-        if self.autoreset_mode == AutoresetMode.DISABLED and any(ended):
+            return ended.copy()
+        if self.autoreset_mode == AutoresetMode.DISABLED and ended.any():
             raise ResetNeeded(
                 "an episode has ended, and autoreset_mode is DISABLED; call "
                 "reset(options={'reset_mask': terminated | truncated}) first"
             )
-        return [False] * self.num_envs
+        return np.zeros(self.num_envs, np.bool_)
 
-    def _collect(self, anew: list[bool]) -> Answers:
-        """Take the cars in order; what is done here is done while later ones still drive."""
-        number = self.num_envs
-        observations = np.empty((number, self.envs[0].view.size), np.float32)
-        rewards = np.zeros(number)
-        terminated, truncated = np.zeros(number, np.bool_), np.zeros(number, np.bool_)
+    def _collect(
+        self,
+        batch: Batch,
+        timestep: Outcome,
+        rows: Any,
+        starting: npt.NDArray[np.bool_],
+        over: npt.NDArray[np.bool_],
+    ) -> Answers:
+        """Finish episodes that are over, begin others, and gather what all races return."""
+        observations = timestep.observations
+        rewards = np.array(batch.value(timestep, ~(starting | over)))
+        terminated, truncated = np.zeros((2, self.num_envs), np.bool_)
         infos: dict[str, Any] = {}
-        same_step = self.autoreset_mode == AutoresetMode.SAME_STEP
-        for index, env in enumerate(self.envs):
-            if anew[index]:
-                observation, info = env.reset()
-            else:
-                observation, reward, end, cut, info = env.finish_step(
-                    partial(self._fleet.wait, index)
-                )
-                rewards[index] = reward
-                if end or cut:
-                    terminated[index], truncated[index] = end, cut
-                    if same_step:
-                        self._gather(infos, {"final_obs": observation, "final_info": info}, index)
-                        observation, info = env.reset()
-            observations[index] = observation
-            self._env_obs[index] = observation
+        for index, env in enumerate(self._envs):
+            resets = starting[index]
+            if over[index]:
+                act = partial(env.step, rows[index])
+                answer = batch.finish(index, timestep, act)
+                observations[index], rewards[index], ended, cut, info = answer
+                cut = cut or timestep.after["timesteps"][index] >= self._limit
+                terminated[index], truncated[index] = ended, cut
+                resets = self.autoreset_mode == AutoresetMode.SAME_STEP
+                if resets:
+                    self._gather(infos, {"final_obs": answer[0], "final_info": info}, index)
+            elif not resets:
+                info = timestep.info(index)
+                if self.render_mode == "human":
+                    batch.leave(index)
+                    env.render()
+            if resets:
+                observations[index], info = env.reset()
+                batch.enter(index)
+            if starting[index]:
+                rewards[index] = 0.0
+            self._env_obs[index] = observations[index]
             self._gather(infos, info, index)
         self._autoreset_envs = terminated | truncated
         return observations, rewards, terminated, truncated, infos
@@ -211,24 +220,20 @@ class TorcsVectorEnv(SyncVectorEnv):
 
         :param kwargs: as of SyncVectorEnv
         """
-        self.__dict__.pop("_fleet", None)  # not there if a race could not be made
+        batch = self.__dict__.get("_batch")  # none if a race could not be made
+        self._driving, self._batch = False, None
+        if batch is not None:
+            batch.close()
         super().close_extras(**kwargs)
 
 
-class _LimitedRace(TorcsEnv):
-    """One of the races, which counts its timesteps as ``TimeLimit`` would."""
+class TorcsLiteVectorEnv(TorcsVectorEnv):
+    """
+    Several races of the fallback physics, driven at once by threads of this process.
 
-    def __init__(self, timesteps: float, **options: Any) -> None:
-        super().__init__(**options)
-        self._timesteps = timesteps
-        self._elapsed = 0
+    :param num_envs: as of :class:`TorcsVectorEnv`, and so on
+    :param options: of :class:`~sb3_torcs.envs.torcs_lite.TorcsLiteEnv`, the same for all races
+    """
 
-    def reset(self, **kwargs: Any) -> tuple[Observation, dict[str, Any]]:
-        self._elapsed = 0
-        return super().reset(**kwargs)
-
-    def finish_step(self, drive: Callable[[], CarState]) -> Answer:
-        observation, reward, terminated, truncated, info = super().finish_step(drive)
-        self._elapsed += 1
-        truncated = truncated or self._elapsed >= self._timesteps
-        return observation, reward, terminated, truncated, info
+    env_id = "TorcsLite-v0"
+    kind = TorcsLiteEnv

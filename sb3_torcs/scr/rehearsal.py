@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from sb3_torcs import maths
 from sb3_torcs.car import CONTROL_TICK, Start
 from sb3_torcs.scr.protocol import ScrState, format_state
 
@@ -25,7 +24,6 @@ class Rehearsal:
 
     def __init__(self) -> None:
         self._tick = -COUNTDOWN
-        maths.wrong_functions()  # rewards and ends call some of those that it compiles
 
     @property
     def over(self) -> bool:

@@ -19,6 +19,7 @@ from sb3_torcs.backends.seats import Seat, SharedRace
 from sb3_torcs.backends.several import shared_worlds
 from sb3_torcs.car import check_count
 from sb3_torcs.envs.batch import Batch, Outcome
+from sb3_torcs.envs.ends import RACE_OVER
 from sb3_torcs.envs.making import MANY_RACES, EnvMaker, checked_threads, env_makers, refuse_flag
 from sb3_torcs.envs.racing import RacingEnv
 from sb3_torcs.errors import EnvClosed, InvalidOption
@@ -163,18 +164,19 @@ class TorcsVecEnv(DummyVecEnv):
         batch = self._open_batch
         if not self._driving:
             self._enter()
-        timestep = self._drive(batch)
-        rewards = np.array(timestep.rewards, np.float32)
+        timestep = batch.step(self.actions)
         dones = np.zeros(self.num_envs, np.bool_)
         infos: list[Any] = [LazyInfo(timestep, i) for i in range(self.num_envs)]
         over = timestep.ended | (self._elapsed + 1 >= self._limits)
         failures: list[Exception] = []
         # Ctrl-C waits meanwhile: a race between two episodes could not be driven on.
         with held_back() if over.any() else contextlib.nullcontext():
-            self._end_races(over)
+            self._end_races(over, timestep)
+            values = batch.value(timestep, ~over)
+            rewards = np.array(values, np.float32)
             self._elapsed += ~over
             for i in np.flatnonzero(~over).tolist():
-                self._wrappers[i].append(timestep.rewards[i])
+                self._wrappers[i].append(values[i])
             last: dict[int, Any] = {}
             for i in np.flatnonzero(over).tolist():
                 with self._kept(failures, i):
@@ -193,17 +195,7 @@ class TorcsVecEnv(DummyVecEnv):
             raise failures[0]
         return timestep.observations, rewards, dones, infos
 
-    def _drive(self, batch: Batch) -> Outcome:
-        """Take a timestep in all races, in which opponents that are agents drive, too."""
-        for race in self._shared:
-            race.ask()
-        timestep = batch.step(self.actions)
-        for race, members in self._shared.items():
-            first = min(members.values())
-            race.advance(self._wrappers[first].racing.action_repeat)
-        return timestep
-
-    def _end_races(self, over: npt.NDArray[np.bool_]) -> None:
+    def _end_races(self, over: npt.NDArray[np.bool_], timestep: Outcome) -> None:
         """End the races all of whose first episodes are over; with them end all their others."""
         for race, members in self._shared.items():
             ending = {number for number, i in members.items() if over[i]}
@@ -211,7 +203,7 @@ class TorcsVecEnv(DummyVecEnv):
                 race.end()
                 for i in members.values():
                     if not over[i]:
-                        self._wrappers[i].racing.end_race()
+                        timestep.after["race_end"][i] = RACE_OVER
                     over[i] = True
 
     @contextlib.contextmanager
@@ -241,7 +233,6 @@ class TorcsVecEnv(DummyVecEnv):
 
     def _enter(self) -> None:
         """Take the states of all races over from their environments."""
-        self._open_batch.renew()
         for i in range(self.num_envs):
             self._enter_race(i)
         self._driving = True
@@ -292,12 +283,11 @@ class _Wrappers:
             )
         self.racing = env.unwrapped
         kind = type(self.racing)
-        for name in ("step", "begin_step", "read_action", "held_parts", "finish_step"):
-            if getattr(kind, name) is not getattr(RacingEnv, name):
-                raise InvalidOption(
-                    f"{kind.__name__} has a {name} of its own, which TorcsVecEnv would not call in "
-                    "each timestep; use DummyVecEnv"
-                )
+        if kind.step is not RacingEnv.step:
+            raise InvalidOption(
+                f"{kind.__name__} has a step of its own, which TorcsVecEnv would not call in each "
+                "timestep; use DummyVecEnv"
+            )
         while isinstance(env, gym.Wrapper):
             names = {
                 kind.__name__ for kind in type(env).__mro__
