@@ -90,26 +90,15 @@ class Engine:
 class Fleet:
     def __init__(self, engines: Sequence[Engine], threads: int) -> None: ...
     def put(self, race: int, engine: Engine) -> None: ...
-    def begin(
-        self,
-        race: int,
-        steering: float,
-        throttle: float,
-        brake: float,
-        gear: int | None,
-        ticks: int,
-        clutch: float = 0.0,
-    ) -> None: ...
-    def wait(self, race: int) -> CarState: ...
-    def finish(self) -> None: ...
     def step(
         self,
         races: npt.NDArray[np.int64],  # (n,); rows of one follow each other
-        seats: npt.NDArray[np.int64],  # (n,) which car; -1 is the first agent's
+        seats: npt.NDArray[np.int64],  # (n,) which car
         controls: FloatArray,  # (n, 5) as of Controls; a gear of nan is the gearbox's choice
         ticks: npt.NDArray[np.int64],  # (n,)
         cars: FloatArray,  # (n, 111) filled, as of CarState
     ) -> list[int]: ...  # the rows that were not, of races that failed
+    def check(self, race: int) -> None: ...  # raises what stopped it in the latest step
 
 class Rollouts:
     def __init__(self, engines: Sequence[Engine]) -> None: ...

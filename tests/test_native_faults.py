@@ -603,8 +603,8 @@ WRONG = {
     "beside the world": ("engine().start_at(9.0, math.inf, 0, 0)", "InvalidOption"),
     "without a speed": ("engine().start_at(9.0, 0, 0, math.nan)", "InvalidOption"),
     "too far": ("engine().start_at(1e30, 0, 0, 0)", "InvalidOption"),
-    "a fleet of nothing": ("_engine.Fleet([None], 1).begin(0, 0, 0, 0, None, 1)", "TypeError"),
-    "a place of no fleet": ("_engine.Fleet([engine()], 1).wait(5)", "IndexError"),
+    "a fleet of nothing": ("_engine.Fleet([None], 1)", "TypeError"),
+    "a place of no fleet": ("_engine.Fleet([engine()], 1).check(5)", "IndexError"),
     "to put nothing": ("_engine.Fleet([engine()], 1).put(0, None)", "TypeError"),
     "to put it nowhere": ("_engine.Fleet([engine()], 1).put(5, engine())", "IndexError"),
 }  # fmt: skip

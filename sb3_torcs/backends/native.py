@@ -341,7 +341,6 @@ class NativeFleet:
 
     def __init__(self, worlds: Sequence[NativeBackend | SeatWorld], threads: int) -> None:
         self._worlds = list(worlds)
-        self._begun: dict[int, tuple[Controls, int]] = {}  # the latest step of each
         engines = list(dict.fromkeys(world.engine for world in worlds))
         self._engines = np.array([engines.index(world.engine) for world in worlds])
         self._seats = np.array([world.seat for world in worlds])
@@ -353,29 +352,6 @@ class NativeFleet:
             return
         self._worlds[index], self._seats[index] = world, world.seat
         self._fleet.put(int(self._engines[index]), world.engine)
-
-    def begin(self, index: int, controls: Controls, ticks: int) -> None:
-        """
-        Begin a step of one world and return at once. Call :meth:`wait` before using that world.
-
-        :param index: which
-        :param controls: as of ``step``
-        :param ticks: as of ``step``
-        """
-        self._begun[index] = controls, ticks
-        steering, throttle, brake, gear, clutch = controls
-        self._fleet.begin(int(self._engines[index]), steering, throttle, brake, gear, ticks, clutch)
-
-    def wait(self, index: int) -> CarState:
-        """
-        Drive until the step of one world is done.
-
-        :param index: which
-        :return: as of ``step``
-        """
-        state: CarState = self._fleet.wait(int(self._engines[index]))
-        self._worlds[index].arrive(*self._begun[index], state)
-        return state
 
     def step(
         self,
@@ -392,7 +368,7 @@ class NativeFleet:
     def failure(self, index: int) -> Exception:
         """Return what stopped a world; see :class:`~sb3_torcs.backends.base.Fleet`."""
         try:
-            self._fleet.wait(int(self._engines[index]))
+            self._fleet.check(int(self._engines[index]))
         except Exception as error:
             return error
         raise AssertionError("the world has not failed")
@@ -401,10 +377,6 @@ class NativeFleet:
         """Tell a world what it has been driven; see :class:`~sb3_torcs.backends.base.Fleet`."""
         for controls, ticks in steps:
             self._worlds[index].arrive(controls, ticks, car)
-
-    def finish(self) -> None:
-        """Drive until all steps are done."""
-        self._fleet.finish()
 
     def close(self) -> None:
         """End the threads; see :class:`~sb3_torcs.backends.base.Fleet`."""

@@ -455,27 +455,6 @@ PYBIND11_MODULE(_engine, module) {
             },
             "race"_a, "engine"_a, "Let a race go on with another engine.")
         .def(
-            "begin",
-            [](Fleet& fleet, std::size_t race, double steering, double throttle, double brake,
-               std::optional<int> gear, int ticks, double clutch) {
-                const Controls controls = controls_of(steering, throttle, brake, gear, clutch);
-                const WithoutPython released;
-                fleet.begin(race, controls, ticks);
-            },
-            "race"_a, "steering"_a, "throttle"_a, "brake"_a, "gear"_a, "ticks"_a, "clutch"_a = 0.0,
-            "Let a race's first agent hold controls for some ticks, on a thread.")
-        .def(
-            "wait",
-            [](Fleet& fleet, std::size_t race) {
-                const Reading* reading;
-                {
-                    const WithoutPython released;
-                    reading = &fleet.wait(race);
-                }
-                return as_state(*reading);
-            },
-            "race"_a, "Wait for a race that has begun to move; returns its first agent's car.")
-        .def(
             "step",
             [](Fleet& fleet, const py::array_t<std::int64_t, py::array::c_style>& races,
                const py::array_t<std::int64_t, py::array::c_style>& seats,
@@ -489,8 +468,8 @@ PYBIND11_MODULE(_engine, module) {
             },
             "races"_a, "seats"_a, "controls"_a, "ticks"_a, py::arg("cars").noconvert(),
             "Drive several at once; writes their cars, and returns the rows of those that failed.")
-        .def("finish", &Fleet::finish, py::call_guard<WithoutPython>(),
-             "Wait for all races that have begun to move.");
+        .def("check", &Fleet::check, "race"_a,
+             "Raise what stopped a race in the latest step, if something did.");
 
     py::class_<Rollouts>(module, "Rollouts", "Short drives from one moment, at once.")
         .def(py::init([](const Engines& engines) {

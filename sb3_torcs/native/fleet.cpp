@@ -16,23 +16,14 @@ void Fleet::put(std::size_t race, std::shared_ptr<Engine> engine) {
     task.engine = std::move(engine);
 }
 
-void Fleet::begin(std::size_t race, const Controls& controls, int ticks) {
-    begin({{race, FIRST_AGENT, controls, ticks, &tasks_.at(race).reading}});
-}
-
-void Fleet::begin(std::vector<Order> orders) {
-    const std::size_t race = orders.front().race;
-    pool_.wait(race);
-    tasks_[race].orders = std::move(orders);
-    pool_.begin(race);
-}
-
 std::vector<std::size_t> Fleet::step(const std::vector<Order>& orders) {
     for (const Order& order : orders) (void)tasks_.at(order.race);  // before any of them drives
     for (auto first = orders.begin(); first != orders.end();) {
         const auto last = std::find_if(
             first, orders.end(), [&](const Order& order) { return order.race != first->race; });
-        begin({first, last});
+        pool_.wait(first->race);
+        tasks_[first->race].orders = {first, last};
+        pool_.begin(first->race);
         first = last;
     }
     std::vector<std::size_t> failed;
@@ -43,11 +34,9 @@ std::vector<std::size_t> Fleet::step(const std::vector<Order>& orders) {
     return failed;
 }
 
-const Reading& Fleet::wait(std::size_t race) {
+void Fleet::check(std::size_t race) const {
     const Task& task = tasks_.at(race);
-    pool_.wait(race);
     if (task.failure) std::rethrow_exception(task.failure);
-    return task.reading;
 }
 
 void Fleet::work(std::size_t index) {
@@ -56,12 +45,11 @@ void Fleet::work(std::size_t index) {
     try {
         Engine::Access race(*task.engine);
         const int ticks = task.orders.front().ticks;
-        for (Order& order : task.orders) {
+        for (const Order& order : task.orders) {
             if (order.ticks != ticks)
                 throw Error("InvalidOption",
                             "the cars of one race are driven for equally many ticks, not for " +
                                 std::to_string(ticks) + " and " + std::to_string(order.ticks));
-            if (order.car == FIRST_AGENT) order.car = Engine::first_agent(*race);
             Engine::check_agent(*race, order.car);
             race->hold(order.car, order.controls);
         }
