@@ -57,7 +57,7 @@ def rival(rivals: FloatArray, number: int) -> tuple[float, float, float, float, 
 @njit(cache=True)
 def clarity(along: float) -> float:
     """
-    Tell how much a car nearby counts: 1 beside, falling to 0 at 80 m.
+    Return how much a car nearby counts: 1 beside, falling to 0 at 80 m.
 
     :param along: how far it is ahead along the road, or behind [m]
     """

@@ -107,7 +107,7 @@ PREVIEW = (
 
 Of a bend with the radius R it shows 50 m / (50 m + R), positive to the left. So the whole range
 from a straight to a hairpin lies in (-1, 1), changes smoothly while the car moves on, and goes
-nearly with 1 / speed at which the bend can be driven. Widths are told as their difference from the
+nearly with 1 / speed at which the bend can be driven. Widths are shown as their difference from the
 first interval's: most roads are equally wide everywhere, and many inputs that stay the same disturb
 learning.
 """
@@ -157,7 +157,7 @@ RACE = (
 """How the race stands. Gaps are those to the car a place before and after."""
 
 NEEDS_RACE = frozenset({"rivals", "race"})
-"""Groups that only a world with a race can tell."""
+"""Groups that need a world with a race."""
 
 CAR = (
     Sensor("car_grip", "", 1, "-", 0.0, 3.0, 1.0 / 1.5),
@@ -175,15 +175,15 @@ MOTION = (
     Sensor("yaw_rate", "", 1, "rad/s", -5.0, 5.0, 1.0, "opposite"),
     Sensor("lift", "", 1, "m", -0.5, 1.0, 10.0),
 )
-"""What else the car does: how fast it turns, which tells a spin as it begins, and how much higher
-it is than at rest, which tells that it is light over a crest, or flies."""
+"""What else the car does: how fast it turns, which shows a spin as it begins, and how much higher
+it is than at rest, which shows that it is light over a crest, or flies."""
 
 NEEDS_CAR = frozenset({"car"})
-"""Groups that only a world that knows its car's file can tell."""
+"""Groups that need a world that knows its car's file."""
 
 NEEDS_ROAD = frozenset({"preview", "limits", "line", "motion"})
-"""Groups that only a world that knows its track can tell: the yaw rate of ``"motion"`` is the turn
-of the road and of the car on it, where the SCR protocol tells the latter alone."""
+"""Groups that need a world that knows its track: the yaw rate of ``"motion"`` is the turn
+of the road and of the car on it, where the SCR protocol sends the latter alone."""
 
 GROUPS: Mapping[SensorsName, tuple[Sensor, ...]] = {
     "base": SENSORS,

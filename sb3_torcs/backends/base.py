@@ -28,7 +28,7 @@ OPTIONAL: dict[str, Any] = {
     "conditions": (),  # of ``grip``, ``mass`` and ``sensor_noise`` those that it can have
     "draw_track": None,  # a method, of a world that has several; see :class:`Backend`
 }
-"""What a world may have besides, and what holds for one that does not have it."""
+"""What a world may have in addition, and what holds for one that does not have it."""
 
 
 def optional(world: Any, name: str) -> Any:
@@ -126,10 +126,10 @@ class Fleet(Protocol):
 
     def arrive(self, index: int, steps: Iterable[tuple[Controls, int]], car: CarState) -> None:
         """
-        Tell a world which steps it has been driven, before it is used without the fleet.
+        Report to a world which steps it has been driven, before it is used without the fleet.
 
         :param index: which
-        :param steps: controls and ticks since it was told
+        :param steps: controls and ticks since the latest call
         :param car: at their end
         """
 

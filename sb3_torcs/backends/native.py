@@ -160,7 +160,7 @@ def load_race(
 
 def make_rollouts(engines: Sequence[Engine]) -> Rollouts:
     """
-    Drive copies of one race at once, one thread each, to see what candidates come to.
+    Drive copies of one race at once, one thread each, to compare candidates.
 
     :param engines: of the same race, at the same moment
     :return: the rollouts, which begin where the engines stand; see ``native/rollouts.h``
@@ -374,7 +374,7 @@ class NativeFleet:
         raise AssertionError("the world has not failed")
 
     def arrive(self, index: int, steps: Iterable[tuple[Controls, int]], car: CarState) -> None:
-        """Tell a world what it has been driven; see :class:`~sb3_torcs.backends.base.Fleet`."""
+        """Report what a world has been driven; see :class:`~sb3_torcs.backends.base.Fleet`."""
         for controls, ticks in steps:
             self._worlds[index].arrive(controls, ticks, car)
 

@@ -186,7 +186,7 @@ class SharedRace:
         """Ask the opponents that are agents what they do next, once before each timestep."""
         if self.loaded.crew is not None and self._asked != self._tick:
             engine = self.world(0).engine
-            muted = engine.mute_noise(False)  # opponents see with noise, whoever looks on
+            muted = engine.mute_noise(False)  # opponents see with noise, whatever looks on
             try:
                 self.loaded.crew.act(self._tick)
             finally:

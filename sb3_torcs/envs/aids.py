@@ -30,7 +30,7 @@ BACK = 0.35  # [rad] at which a car comes back from beside the road
 BACK_STEERING = 2.0  # [-] per radian
 
 SIDESLIP = 0.3  # [rad] from which on a car slides; on asphalt it corners with about 0.1
-LEAST_SPEED = 8.0  # [m/s] below which a car that slides comes to a stand soon enough
+LEAST_SPEED = 8.0  # [m/s] below which a car that slides stands soon enough
 
 
 @dataclass

@@ -70,7 +70,7 @@ class Conditions:
         self._delays = checked_delay(self.choice["delay"])
         self._factors = {name: checked_factor(name, self.choice[name]) for name in FACTORS}
         self._changed = [name for name, bounds in self._factors.items() if bounds != (1.0, 1.0)]
-        self._tells = bool(self._changed)
+        self._sets = bool(self._changed)
         self.grip = self.mass = 1.0
 
     def instead(self, choice: Mapping[str, Any]) -> Conditions:
@@ -87,7 +87,7 @@ class Conditions:
                 f"sensor_noise was {noise} when the environment was made, and stays so; make "
                 "another one"
             )
-        changed._tells |= self._tells  # a world keeps what it was told last
+        changed._sets |= self._sets  # a world keeps what it was given last
         changed.grip, changed.mass = self.grip, self.mass  # of the present episode
         return changed
 
@@ -121,7 +121,7 @@ class Conditions:
         """
         low, high = map(int, self._delays)
         ticks = low if low == high else int(rng.integers(low, high + 1))
-        if self._tells:
+        if self._sets:
             self.grip, self.mass = (
                 float(low if low == high else rng.uniform(low, high))
                 for low, high in self._factors.values()

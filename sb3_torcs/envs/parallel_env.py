@@ -37,7 +37,7 @@ class TorcsParallelEnv(ParallelEnv[str, Observation, Action]):
     Observations, actions, rewards and ends are those of ``Torcs-v0``, for each agent. With
     ``laps`` the race is flagged: who crosses the line after the winner has finished, too, and ends
     with ``"laps"``. An agent whose episode ends leaves ``agents``, its car is taken off the road,
-    and the others race on. ``info`` holds besides what ``Torcs-v0`` tells the ``place``,
+    and the others race on. ``info`` holds that of ``Torcs-v0``, and the ``place``,
     ``gap_ahead`` and ``gap_behind`` [m], ``contacts`` with other cars, and those by own ``faults``.
 
     :param agents: their number

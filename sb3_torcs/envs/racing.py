@@ -294,7 +294,7 @@ class RacingEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         Check the options of a reset, which are for the track of now.
 
         :param options: as of ``reset``
-        :return: whether they say where to start
+        :return: whether they name a place
         :raises InvalidOption: if a name or a value is wrong
         """
         if options is None or (isinstance(options, Mapping) and not options):

@@ -113,7 +113,7 @@ class TorcsVectorEnv(SyncVectorEnv):
         rows: Any = actions
         if getattr(actions, "shape", None) != shape:
             rows = listed_actions(actions, shape, ": take them from envs.action_space.sample()")
-        starting = self._begin_anew()
+        starting = self._starting()
         going = np.flatnonzero(~starting)
         if not self._driving:
             self._enter()
@@ -130,7 +130,7 @@ class TorcsVectorEnv(SyncVectorEnv):
             self._batch.enter(index)
         self._driving = True
 
-    def _begin_anew(self) -> npt.NDArray[np.bool_]:
+    def _starting(self) -> npt.NDArray[np.bool_]:
         """Find the races in which this timestep begins an episode instead."""
         ended = self._autoreset_envs
         if self.autoreset_mode == AutoresetMode.NEXT_STEP:
@@ -201,7 +201,7 @@ class TorcsVectorEnv(SyncVectorEnv):
             infos[mask_name][index] = True
 
     def _room(self, value: Any) -> Any:
-        """Make room for what all races say, by what the first of them does."""
+        """Allocate an array of one value per race, typed by the first value."""
         if isinstance(value, dict):
             return {}
         if type(value) in (int, float, bool):

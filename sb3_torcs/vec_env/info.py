@@ -1,4 +1,4 @@
-"""What each timestep of a ``TorcsVecEnv`` tells, computed when it is read."""
+"""The ``info`` of each timestep of a ``TorcsVecEnv``, computed when it is read."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ class LazyInfo(MutableMapping[str, Any]):
 
 def glance(info: MutableMapping[str, Any]) -> tuple[float, float, dict[str, float]]:
     """
-    Look up what a timestep came to, at the least cost.
+    Look up a few values of a timestep, at the least cost.
 
     :param info: of the timestep
     :return: speed [m/s], time of the lap that it completed, or 0 [s], and terms of the reward

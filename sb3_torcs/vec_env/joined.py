@@ -97,7 +97,9 @@ class JoinedVecEnv(VecEnv):
         for part in self.parts:
             try:
                 answers.append(part.step_wait())
-            except Exception as error:  # the others have set out, too, and answer before it is told
+            except (
+                Exception
+            ) as error:  # the others have set out, too, and answer before it is raised
                 errors.append(error)
         if errors:
             raise errors[0]
