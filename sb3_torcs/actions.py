@@ -303,7 +303,7 @@ def listed_actions(actions: Any, shape: tuple[int, ...], advice: str) -> list[An
     :raises InvalidAction: if there are more or fewer, or numbers instead of actions
     """
     rows = list(actions) if isinstance(actions, Iterable) else [actions]
-    bare = all(isinstance(row, Real) for row in rows)
+    bare = bool(rows) and all(isinstance(row, Real) for row in rows)
     if bare or len(rows) != shape[0]:
         raise InvalidAction(
             f"{len(rows)} {'numbers' if bare else 'actions'} for {shape[0]} environments; expected "

@@ -157,6 +157,16 @@ def test_the_limit_is_that_of_gym_make(make, limit, cut_at):
     assert cuts == [step == cut_at for step in range(1, 6)]
 
 
+def test_all_races_may_begin_an_episode_at_once(make):
+    envs = make(num_envs=2, max_episode_steps=1)
+    first = envs.reset(seed=0)[0]
+    assert envs.step([GAS, GAS])[3].all()
+    seen, rewards, _, truncated, _ = envs.step([GAS, GAS])
+    np.testing.assert_array_equal(seen, first)
+    assert not rewards.any()
+    assert not truncated.any()
+
+
 def test_what_was_returned_stays_as_it_was(make):
     envs = make(num_envs=2, threads=2)
     kept = [envs.reset(seed=0)[0]] + [envs.step(np.stack([GAS, GAS]))[0] for _ in range(3)]

@@ -176,7 +176,7 @@ class TorcsVectorEnv(SyncVectorEnv):
                 batch.enter(index)
             if starting[index]:
                 rewards[index] = 0.0
-            self._env_obs[index] = observations[index]
+            self._env_obs[index] = observations[index].copy()
             self._gather(infos, info, index)
         self._autoreset_envs = terminated | truncated
         return observations, rewards, terminated, truncated, infos
