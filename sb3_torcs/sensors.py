@@ -282,7 +282,9 @@ register_jitable(track_position)
 
 Rows = npt.NDArray[np.int64]
 Constants = tuple[Any, ...]
-"""What a group needs of a world, the same all through an episode: arrays and numbers."""
+"""What a group needs of a world, the same all through an episode: an array first, if anything."""
+Job = tuple[Callable[..., None], Rows, int, Constants]
+"""Fills the numbers of a group, of which cars, from where in an observation, with what."""
 
 
 @register_jitable
@@ -367,7 +369,12 @@ def _line(world: Any) -> Constants:
 
 
 def _facts(world: Any) -> Constants:
-    return (np.array(world.facts),)
+    return (_numbers(world.facts),)
+
+
+@lru_cache
+def _numbers(facts: tuple[float, ...]) -> FloatArray:
+    return np.array(facts)
 
 
 _FILLERS: Mapping[SensorsName, tuple[Callable[..., None], Callable[[Any], Constants]]] = {
@@ -464,7 +471,7 @@ class Eyes:
     def __init__(self, view: View, number: int) -> None:
         self._view = view
         self._constants: list[list[Constants]] = [[()] * number for _ in view.sensors]
-        self._jobs: list[tuple[Callable[..., None], Rows, int, Constants]] = []
+        self._jobs: list[list[Job]] = [[] for _ in view.sensors]
 
     def open(self, index: int, world: Any) -> None:
         """
@@ -473,9 +480,11 @@ class Eyes:
         :param index: of the car
         :param world: in which it drives until the next call
         """
-        for name, constants in zip(self._view.sensors, self._constants, strict=True):
-            constants[index] = _FILLERS[name][1](world)
-        self._jobs = []
+        for place, name in enumerate(self._view.sensors):
+            before, constants = self._constants[place][index], _FILLERS[name][1](world)
+            if _key(before) != _key(constants):
+                self._jobs[place] = []
+            self._constants[place][index] = constants
 
     def see(self, cars: Any) -> npt.NDArray[np.float32]:
         """
@@ -485,22 +494,26 @@ class Eyes:
         :return: (number, size) numbers within ``low`` and ``high`` of the view
         """
         observations = np.empty((len(cars), self._view.size), np.float32)
-        for fill, rows, at, constants in self._jobs or self._plan():
-            fill(cars, rows, at, observations, *constants)
+        for place, jobs in enumerate(self._jobs):
+            for fill, rows, at, constants in jobs or self._plan(place):
+                fill(cars, rows, at, observations, *constants)
         return observations
 
-    def _plan(self) -> list[tuple[Callable[..., None], Rows, int, Constants]]:
+    def _plan(self, place: int) -> list[Job]:
         """Find which cars share what a group needs of a world: one call fills it for them all."""
-        at = 0
-        for name, each in zip(self._view.sensors, self._constants, strict=True):
-            shared: dict[tuple[int, ...], list[int]] = {}
-            for index, constants in enumerate(each):
-                shared.setdefault(tuple(map(id, constants[:1])), []).append(index)
-            self._jobs += [
-                (_compiled(name), np.array(rows), at, each[rows[0]]) for rows in shared.values()
-            ]
-            at += _PARTS[name].stop - _PARTS[name].start
-        return self._jobs
+        each, sensors = self._constants[place], self._view.sensors
+        shared: dict[int, list[int]] = {}
+        for index, constants in enumerate(each):
+            shared.setdefault(_key(constants), []).append(index)
+        fill = _compiled(sensors[place])
+        at = sum(_PARTS[name].stop - _PARTS[name].start for name in sensors[:place])
+        self._jobs[place] = [(fill, np.array(rows), at, each[rows[0]]) for rows in shared.values()]
+        return self._jobs[place]
+
+
+def _key(constants: Constants) -> int:
+    """Distinguish constants of one world from those of another: by the array that comes first."""
+    return id(constants[0]) if constants else 0
 
 
 def encode(car: CarState) -> npt.NDArray[np.float32]:

@@ -58,6 +58,8 @@ class Outcome:
     failures: dict[int, Exception]  # what stopped cars, by index
     valued: Rewards  # of the environments
     terms: list[list[float]] = field(default_factory=list)  # of the rewards, once they are valued
+    speeds: list[float] = field(default_factory=list)  # [m/s] then
+    lap_times: list[float] = field(default_factory=list)  # [s] of laps just completed, or 0, then
 
     @property
     def ended(self) -> npt.NDArray[np.bool_]:
@@ -82,8 +84,7 @@ class Outcome:
             the reward
         """
         terms = self.valued.rewards[index].explain(self.terms[index], None)
-        number = numbers_of(self.after).item
-        return number(index, SPEED_X), number(index, LAP_TIME), terms
+        return self.speeds[index], self.lap_times[index], terms
 
 
 class Replay:
@@ -243,6 +244,9 @@ class Batch:
         :param going: (n,) which they are
         :return: rewards
         """
+        numbers = numbers_of(timestep.after)
+        timestep.speeds = numbers[:, SPEED_X].tolist()
+        timestep.lap_times = numbers[:, LAP_TIME].tolist()
         timestep.terms = self._rewards.value(timestep.before, timestep.after, going)
         return [sum(terms) for terms in timestep.terms]
 
