@@ -835,6 +835,7 @@ def test_a_training_goes_on_in_the_environment_of_its_model(monkeypatch):
 def test_a_folder_that_cannot_be_written_is_told_before_the_training(capsys, tmp_path, option):
     (tmp_path / "file").write_text("")
     words = ["--conf-file", write_config(tmp_path), "--folder", str(tmp_path / "logs")]
+    words += ["--env", "TorcsLite-v0"]
     status, _, err = run(capsys, "train", *words, option, str(tmp_path / "file" / "logs"))
     assert status == 2
     assert err.startswith("sb3-torcs: cannot write to the folder")

@@ -242,6 +242,7 @@ class DrivingMetricsCallback(BaseCallback):
         if self.model.num_timesteps == 0:  # not one that goes on
             self.best_lap_time = self.best_evaluation_lap_time = None
         others = list(callbacks_in(self.locals.get("callback")))
+        # Others get the lines from this one.
         same = (callback for callback in others if isinstance(callback, DrivingMetricsCallback))
         first = next(same, self)
         listening: list[LineListener] = [

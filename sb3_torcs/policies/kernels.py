@@ -3,10 +3,9 @@
 They compute what the plain networks compute, but for rounding. They cost little more than the
 matrix products, because numba compiles the loops between these.
 
-Each network's parameters are one vector. Its matrices are (inputs, outputs), each followed by its
-bias and, with a layer norm, by the norm's weight and bias. The weights of the last layer are
-(outputs, inputs). A backward pass reads what the forward pass wrote to ``work``, a vector per
-network.
+Each network's parameters are one vector, in PyTorch's order: each matrix is (outputs, inputs),
+followed by its bias and, with a layer norm, by the norm's weight and bias. A backward pass reads
+what the forward pass wrote to ``work``, a vector per network.
 """
 
 from __future__ import annotations
@@ -76,9 +75,9 @@ def stack_forward(
     start, at, x = 0, 0, features
     for number in range(1, len(sizes) - 1):
         units = sizes[number]
-        weight, bias = matrix(weights, start, sizes[number - 1], units)
+        weight, bias = matrix(weights, start, units, sizes[number - 1])
         products, y, _, deviation, at = layer(work, at, len(features), units)
-        product(x, False, weight, False, products)
+        product(x, False, weight, True, products)
         hidden(weights[bias:], norm, products, y, deviation)
         start, x = bias + units * (3 if norm else 1), y
     outputs(weights[start:], x, results)
@@ -86,9 +85,8 @@ def stack_forward(
 
 @compiled
 def stack_backward(
-    weights: Any, sizes: Any, norm: bool, features: Any, work: Any, slope: Any, gradient: Any,
-    d_features: Any,
-) -> None:  # fmt: skip
+    weights: Any, sizes: Any, norm: bool, features: Any, work: Any, slope: Any, gradient: Any
+) -> None:
     """
     Find the gradient of the weights.
 
@@ -99,7 +97,6 @@ def stack_backward(
     :param work: from ``stack_forward``
     :param slope: gradient of the results
     :param gradient: of the weights, written
-    :param d_features: gradient of the features, written; or of size 0
     """
     batch, last = len(features), len(sizes) - 2
     start = weights.size - sizes[-1] * (sizes[last] + 1)
@@ -109,19 +106,25 @@ def stack_backward(
     for number in range(last, 0, -1):
         inputs, units = sizes[number - 1], sizes[number]
         start -= units * (inputs + (3 if norm else 1))
-        weight, bias = matrix(weights, start, inputs, units)
+        weight, bias = matrix(weights, start, units, inputs)
         hidden_backward(weights[bias:], norm, d, products, y, deviation, gradient[bias:])
-        d_weight, _ = matrix(gradient, start, inputs, units)
+        d_weight, _ = matrix(gradient, start, units, inputs)
         if number > 1:
             at -= batch * (3 * inputs + 1)
             products, y, below, deviation, _ = layer(work, at, batch, inputs)
-            product(y, True, d, False, d_weight)
-            product(d, False, weight, True, below)
+            product(d, True, y, False, d_weight)
+            product(d, False, weight, False, below)
             d = below
         else:
-            product(features, True, d, False, d_weight)
-            if d_features.size:
-                product(d, False, weight, True, d_features)
+            _gradient_of_first(features, d, d_weight)
+
+
+@compiled
+def _gradient_of_first(features: Any, slope: Any, gradient: Any) -> None:
+    """Find the gradient of a first layer: with few inputs the turned product is faster."""
+    turned = np.empty((features.shape[1], slope.shape[1]), features.dtype)
+    product(features, True, slope, False, turned)
+    gradient[:] = turned.T
 
 
 @compiled
@@ -148,7 +151,7 @@ def actor_forward(
 @compiled
 def actor_backward(
     weights: Any, sizes: Any, norm: bool, features: Any, gain: Any, work: Any, actions: Any,
-    slope: Any, gradient: Any, d_features: Any,
+    slope: Any, gradient: Any,
 ) -> None:  # fmt: skip
     """
     Find the gradient of the weights.
@@ -162,13 +165,12 @@ def actor_backward(
     :param actions: from ``actor_forward``
     :param slope: gradient of the actions; overwritten
     :param gradient: of the weights, written
-    :param d_features: gradient of the features, written; or of size 0
     """
     one = weights.dtype.type(1)
     for j in range(len(features)):
         for o in range(len(gain)):
             slope[j, o] *= (one - actions[j, o] * actions[j, o]) * gain[o]
-    stack_backward(weights, sizes, norm, features, work, slope, gradient, d_features)
+    stack_backward(weights, sizes, norm, features, work, slope, gradient)
 
 
 # ----------------------------------------------------------------------------- critics
@@ -229,14 +231,14 @@ def values_forward(
         (x1, y1, _, deviation1), (x3, y3, _, deviation3), x2, _ = _rooms(
             work[k], sizes, len(features)
         )
-        weight, bias = matrix(own, state1, n_features, first)
-        product(features, False, weight, False, x1)
+        weight, bias = matrix(own, state1, first, n_features)
+        product(features, False, weight, True, x1)
         hidden(own[bias:], norm, x1, y1, deviation1)
-        weight, bias = matrix(own, state2, first, second)
-        product(y1, False, weight, False, x2)
+        weight, bias = matrix(own, state2, second, first)
+        product(y1, False, weight, True, x2)
         join(own[bias:], actions, x2)
         weight, bias = matrix(own, joint3, second, second)
-        product(x2, False, weight, False, x3)
+        product(x2, False, weight, True, x3)
         hidden(own[bias:], norm, x3, y3, deviation3)
         outputs(own[value:], y3, values[k])
 
@@ -244,7 +246,7 @@ def values_forward(
 @compiled
 def values_backward(
     weights: Any, sizes: Any, norm: bool, features: Any, actions: Any, work: Any, slope: Any,
-    gradient: Any, d_features: Any, d_actions: Any,
+    gradient: Any,
 ) -> None:  # fmt: skip
     """
     Find the gradient of the weights.
@@ -257,10 +259,8 @@ def values_backward(
     :param work: from ``values_forward``
     :param slope: gradient of the values, (networks, batch, 1)
     :param gradient: of the weights, written
-    :param d_features: gradient of the features by each network, written; or of size 0
-    :param d_actions: gradient of the actions by each network, written; or of size 0
     """
-    n_features, n_actions, first, second = sizes
+    n_features, _, first, second = sizes
     state1, state2, joint3, value = _places(sizes, norm)
     for k in range(len(weights)):
         own, d_own = weights[k], gradient[k]
@@ -270,20 +270,15 @@ def values_backward(
         outputs_backward(own[value:], slope[k], y3, d3, d_own[value:])
         weight, bias = matrix(own, joint3, second, second)
         hidden_backward(own[bias:], norm, d3, x3, y3, deviation3, d_own[bias:])
-        product(d3, False, weight, True, d2)
-        product(x2, True, d3, False, matrix(d_own, joint3, second, second)[0])
-        weight, bias = matrix(own, state2, first, second)
+        product(d3, False, weight, False, d2)
+        product(d3, True, x2, False, matrix(d_own, joint3, second, second)[0])
+        weight, bias = matrix(own, state2, second, first)
         join_backward(d2, actions, d_own[bias:])
-        product(d2, False, weight, True, d1)
-        product(y1, True, d2, False, matrix(d_own, state2, first, second)[0])
-        if d_actions.size:
-            action2, _ = matrix(own, bias + second, n_actions, second)
-            product(d2, False, action2, True, d_actions[k])
-        weight, bias = matrix(own, state1, n_features, first)
+        product(d2, False, weight, False, d1)
+        product(d2, True, y1, False, matrix(d_own, state2, second, first)[0])
+        weight, bias = matrix(own, state1, first, n_features)
         hidden_backward(own[bias:], norm, d1, x1, y1, deviation1, d_own[bias:])
-        product(features, True, d1, False, matrix(d_own, state1, n_features, first)[0])
-        if d_features.size:
-            product(d1, False, weight, True, d_features[k])
+        _gradient_of_first(features, d1, matrix(d_own, state1, first, n_features)[0])
 
 
 @compiled
@@ -309,9 +304,9 @@ def values_backward_to_actions(
     weight, bias = matrix(own, joint3, second, second)
     hidden_backward(own[bias:], norm, d3, x3, y3, deviation3, unused)
     # Two matrices follow the actions: multiply them first, since their product is small.
-    action2, _ = matrix(own, state2 + (first + 1) * second, n_actions, second)
+    action2, _ = matrix(own, state2 + (first + 1) * second, second, n_actions)
     both = np.empty((n_actions, second), own.dtype)
-    product(action2, False, weight, False, both)
+    product(action2, True, weight, True, both)
     product(d3, False, both, True, d_actions)
 
 

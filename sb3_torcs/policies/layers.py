@@ -177,19 +177,20 @@ def join(own: Any, actions: Any, x: Any) -> None:
     """
     Add the layer of the actions to a product.
 
-    :param own: the product's bias, the actions' matrix, and their bias
+    :param own: the product's bias, the actions' matrix, (units, actuators), and their bias
     :param actions: (batch, actuators)
     :param x: product, (batch, units); overwritten with the sum
     """
     batch, units = x.shape
     n = actions.shape[1]
     bias, other = own[:units], own[(1 + n) * units : (2 + n) * units]
+    weights = own[units : (1 + n) * units].reshape(units, n).T.copy()
     for j in range(batch):
         row = x[j]
         for i in range(units):
             row[i] += bias[i] + other[i]
         for a in range(n):
-            weight, action = own[(1 + a) * units : (2 + a) * units], actions[j, a]
+            weight, action = weights[a], actions[j, a]
             for i in range(units):
                 row[i] += action * weight[i]
 
@@ -207,14 +208,16 @@ def join_backward(slope: Any, actions: Any, gradient: Any) -> None:
     n = actions.shape[1]
     gradient[: (2 + n) * units] = 0
     d_bias, other = gradient[:units], gradient[(1 + n) * units : (2 + n) * units]
+    d_weights = np.zeros((n, units), slope.dtype)
     for j in range(batch):
         d = slope[j]
         for i in range(units):
             d_bias[i] += d[i]
         for a in range(n):
-            d_weight, action = gradient[(1 + a) * units : (2 + a) * units], actions[j, a]
+            d_weight, action = d_weights[a], actions[j, a]
             for i in range(units):
                 d_weight[i] += action * d[i]
+    gradient[units : (1 + n) * units].reshape(units, n)[:] = d_weights.T
     other[:] = d_bias
 
 

@@ -6,7 +6,7 @@ The policy and the value function share no layer, so two threads find their grad
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from types import MethodType
 from typing import Any, NamedTuple
 
@@ -29,7 +29,7 @@ from sb3_torcs.policies.optimizers import adam_factors, adam_state, is_usual
 from sb3_torcs.policies.ppo_passes import decide, find_policy_gradient, find_value_gradient
 from sb3_torcs.policies.stock import has_hooks, has_module_hooks, has_own_methods
 from sb3_torcs.policies.threads import Helper, two_threads
-from sb3_torcs.policies.vectors import Slot, array
+from sb3_torcs.policies.vectors import array
 
 __all__ = ["LeanForward", "LeanPPO", "is_for"]
 
@@ -61,10 +61,6 @@ class _Stack:
         layers = [each for each in hidden.children() if isinstance(each, nn.Linear)] + [last]
         self.sizes = (layers[0].in_features, *(each.out_features for each in layers))
         self.parameters = [own for each in layers for own in (each.weight, each.bias)]
-        self.slots = [
-            Slot(tuple(own.shape), own.dim() == 2 and own is not last.weight)
-            for own in self.parameters
-        ]
         self.part = slice(start, start + sum(map(th.numel, self.parameters)))
         self._rooms: dict[int, np.ndarray] = {}
 
@@ -99,7 +95,6 @@ class LeanPPO:
         self.actor = _Stack(hidden.policy_net, last, first)
         self.critic = _Stack(hidden.value_net, policy.value_net, self.actor.part.stop)
         self.parameters = [policy.log_std, *self.actor.parameters, *self.critic.parameters]
-        self.slots = [Slot((first,), False), *self.actor.slots, *self.critic.slots]
         self.weights, self.gradient, self.mean, self.square = np.zeros(
             (4, self.critic.part.stop), np.float32
         )
@@ -117,7 +112,7 @@ class LeanPPO:
         self._pointers = self._find_pointers()
         self._views = [array(own) for own in self.parameters]
         self._taken = [view.copy() for view in self._views]
-        _read(self.weights, self.slots, [own.detach() for own in self.parameters])
+        _read(self.weights, self.parameters)
 
     def _find_pointers(self) -> list[int]:
         return [own.data_ptr() for own in self.policy.parameters()]
@@ -257,11 +252,9 @@ class LeanPPO:
 
     # --------------------------------------------------------------------------- state
 
-    def _averages(self) -> tuple[list[Slot], list[th.Tensor]]:
-        """Look at the average of each parameter of the actor; there may be none."""
-        if self.average is None:
-            return [], []
-        return self.actor.slots, list(self.average.module.parameters())
+    def _averages(self) -> list[th.Tensor]:
+        """Return the average of each parameter of the actor; there may be none."""
+        return [] if self.average is None else list(self.average.module.parameters())
 
     def _states(self) -> list[dict[str, Any]]:
         """Look at what Adam keeps of each parameter; begin it if needed."""
@@ -271,24 +264,21 @@ class LeanPPO:
         """Take over the parameters and what Adam keeps of them."""
         states = self._states()
         self.read_parameters()
-        _read(self.mean, self.slots, [state["exp_avg"] for state in states])
-        _read(self.square, self.slots, [state["exp_avg_sq"] for state in states])
-        _read(self.averaged, *self._averages())
+        _read(self.mean, [state["exp_avg"] for state in states])
+        _read(self.square, [state["exp_avg_sq"] for state in states])
+        _read(self.averaged, self._averages())
         self.count = int(states[0]["step"].item())
 
     @th.no_grad()
     def _write_state(self) -> None:
         """Give them back to the model."""
-        views = (_views(each, self.slots) for each in (self.weights, self.mean, self.square))
-        for own, state, *found in zip(self.parameters, self._states(), *views, strict=True):
-            for tensor, view in zip(
-                (own, state["exp_avg"], state["exp_avg_sq"]), found, strict=True
-            ):
-                tensor.copy_(view)
+        states = self._states()
+        _write(self.weights, self.parameters)
+        _write(self.mean, [state["exp_avg"] for state in states])
+        _write(self.square, [state["exp_avg_sq"] for state in states])
+        _write(self.averaged, self._averages())
+        for state in states:
             state["step"].fill_(self.count)
-        slots, tensors = self._averages()
-        for own, view in zip(tensors, _views(self.averaged, slots), strict=True):
-            own.copy_(view)
 
 
 class LeanForward:
@@ -320,16 +310,17 @@ class LeanForward:
         return MethodType, (type(policy).forward, policy)
 
 
-def _views(vector: np.ndarray, slots: Sequence[Slot]) -> list[th.Tensor]:
-    """Look at the part of each parameter, in the form that the model gives it."""
-    parts = th.from_numpy(vector).split([math.prod(slot.shape) for slot in slots])
-    return [slot.of(part) for slot, part in zip(slots, parts, strict=True)]
+def _read(vector: np.ndarray, tensors: Sequence[th.Tensor]) -> None:
+    """Copy the numbers of tensors into a vector."""
+    if tensors:
+        th.cat([own.detach().reshape(-1) for own in tensors], out=th.from_numpy(vector))
 
 
-def _read(vector: np.ndarray, slots: Sequence[Slot], tensors: Iterable[th.Tensor]) -> None:
-    """Take over parameters from the model."""
-    for view, own in zip(_views(vector, slots), tensors, strict=True):
-        view.copy_(own)
+def _write(vector: np.ndarray, tensors: Sequence[th.Tensor]) -> None:
+    """Copy the parts of a vector back into tensors."""
+    parts = th.from_numpy(vector).split([own.numel() for own in tensors])
+    for own, part in zip(tensors, parts, strict=True):
+        own.copy_(part.view(own.shape))
 
 
 def is_for(model: PPO) -> bool:

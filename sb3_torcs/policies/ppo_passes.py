@@ -15,7 +15,6 @@ from sb3_torcs.policies.layers import compiled
 
 __all__ = ["decide", "find_policy_gradient", "find_value_gradient"]
 
-NO_FEATURES = np.empty((0, 0), np.float32)
 """In place of their gradient, which nobody needs."""
 
 LOG_ROOT_TAU = np.float32(math.log(math.sqrt(math.tau)))
@@ -177,7 +176,7 @@ def find_policy_gradient(
             slope[j, o] = share * z * inverse[o]
             d_log_std[o] += share * (z * z - one)
     share_slopes(slope, bounds, each)
-    kernels.stack_backward(weights, sizes, False, observations, work, each, gradient, NO_FEATURES)
+    kernels.stack_backward(weights, sizes, False, observations, work, each, gradient)
     return loss / batch, clipped / batch, divergence / batch
 
 
@@ -228,5 +227,5 @@ def find_value_gradient(
         loss += values[j] * values[j]
     for row in range(rows):
         slope[row, 0] = coefficient * real(2) / real(rows) * values[row // ways]
-    kernels.stack_backward(weights, sizes, False, observations, work, slope, gradient, NO_FEATURES)
+    kernels.stack_backward(weights, sizes, False, observations, work, slope, gradient)
     return loss / batch

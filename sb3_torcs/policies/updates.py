@@ -25,7 +25,7 @@ from sb3_torcs.policies.optimizers import adam_factors, adam_state, is_usual
 from sb3_torcs.policies.split_head import SplitHeadPolicy
 from sb3_torcs.policies.stock import has_hooks, has_own_methods
 from sb3_torcs.policies.threads import Helper, two_threads
-from sb3_torcs.policies.vectors import Vector, array, slots_of
+from sb3_torcs.policies.vectors import Vector, array
 
 __all__ = ["LeanUpdates", "is_for"]
 
@@ -44,13 +44,13 @@ class _Learner:
     def __init__(
         self, network: nn.Module, target: nn.Module, optimizer: th.optim.Optimizer
     ) -> None:
-        slots, self.own = slots_of(network), list(network.parameters())
+        self.own = list(network.parameters())
         self.optimizer = optimizer
         states = self._states()
-        self.weights = Vector(self.own, slots)
-        self.target = Vector(target.parameters(), slots)
-        self.mean = Vector([state["exp_avg"] for state in states], slots)
-        self.square = Vector([state["exp_avg_sq"] for state in states], slots)
+        self.weights = Vector(self.own)
+        self.target = Vector(target.parameters())
+        self.mean = Vector(state["exp_avg"] for state in states)
+        self.square = Vector(state["exp_avg_sq"] for state in states)
         self.gradient = np.empty_like(self.weights.numbers)
         self.count = int(states[0]["step"].item())  # steps of Adam
 
@@ -165,8 +165,7 @@ class LeanUpdates:
         self.averages: tuple[np.ndarray, np.ndarray] = np.empty(0, np.float32), np.zeros((), int)
         self._averaged: Vector | None = None
         if self.average is not None:
-            heads = self.average.module.mu
-            self._averaged = Vector(heads.parameters(), slots_of(heads))
+            self._averaged = Vector(self.average.module.mu.parameters())
             self.averages = self._averaged.numbers, self.average.n_averaged.numpy()
         self._rooms: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         actor.lean = _LeanActor(actor, self.actor.weights)
@@ -355,10 +354,7 @@ def _learn_values(
     """
     sizes, norm = shape
     weights, target, gradient = networks
-    unused = np.empty((0, 0, 0), weights.dtype)
-    kernels.values_backward(
-        weights, sizes, norm, batch[0], batch[1], room, slope, gradient, unused, unused
-    )
+    kernels.values_backward(weights, sizes, norm, batch[0], batch[1], room, slope, gradient)
     kernels.adam(weights.reshape(-1), gradient.reshape(-1), *adam)
     if tau:
         kernels.follow(target.reshape(-1), weights.reshape(-1), weights.dtype.type(tau))
@@ -398,9 +394,8 @@ def _update_actor(
     share = np.full((batch, 1), real(-1) / real(batch))
     kernels.values_backward_to_actions(first, critic_sizes, critic_norm, rooms[1], share, slope)
     kernels.actor_backward(
-        weights, sizes, norm, observations, gain, rooms[0], actions, slope, gradient,
-        np.empty((0, 0), weights.dtype),
-    )  # fmt: skip
+        weights, sizes, norm, observations, gain, rooms[0], actions, slope, gradient
+    )
     kernels.adam(weights, gradient, *adam)
     kernels.follow(target, weights, real(tau))
     average, count = averages
