@@ -107,10 +107,7 @@ def test_the_facts_of_a_known_car(tmp_path):
     assert facts == pytest.approx(expected, rel=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("mass", "taken"),
-    [("1400", 1400.0), ("1600", 1500.0), ("400", 400.0)],
-)
+@pytest.mark.parametrize(("mass", "taken"), [("1400", 1400.0), ("1600", 1500.0), ("400", 400.0)])
 def test_the_category_s_upper_limit_counts_as_in_the_game(tmp_path, mass, taken):
     """The game's own merging of files cuts what is above it, and leaves what is below the lower."""
     own = OWN.replace("</section>", f'<attnum name="mass" unit="kg" val="{mass}"/></section>', 1)

@@ -299,10 +299,7 @@ def test_a_file_that_cannot_be_written_is_named_and_the_training_goes_on_from_wh
     ("error", "said"),
     [
         ("OSError(28, 'No space left on device')", "cannot write '{folder}': No space left"),
-        (
-            "TrainingDiverged('no numbers')",
-            "(add: --hyperparams learning_rate=NUMBER), and go on",
-        ),
+        ("TrainingDiverged('no numbers')", "(add: --hyperparams learning_rate=NUMBER), and go on"),
     ],
 )
 def test_what_was_learned_until_an_error_is_kept(capsys, tmp_path, error, said):

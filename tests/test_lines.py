@@ -13,12 +13,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_torcs.callbacks.display import bars
 from sb3_torcs.callbacks.driven_line import DrivenLine
-from sb3_torcs.callbacks.lines import (
-    DrivenLap,
-    LinePicturesCallback,
-    draw_learning,
-    driven_laps,
-)
+from sb3_torcs.callbacks.lines import DrivenLap, LinePicturesCallback, draw_learning, driven_laps
 from sb3_torcs.callbacks.metrics import DrivingMetricsCallback
 from sb3_torcs.callbacks.progress import RacingProgressCallback, spoken_moment
 from sb3_torcs.envs.racing import RacingEnv

@@ -20,12 +20,7 @@ from toy import ToyRace
 
 from sb3_torcs.callbacks.replay import MirrorCallback
 from sb3_torcs.errors import InvalidAction, InvalidOption
-from sb3_torcs.policies.mirror import (
-    mirror_actions,
-    mirror_half,
-    mirror_image,
-    mirror_observations,
-)
+from sb3_torcs.policies.mirror import mirror_actions, mirror_half, mirror_image, mirror_observations
 from sb3_torcs.policies.mirrored_replay import sample_mirrored
 from sb3_torcs.sensors import View, encode, feature_slices
 from sb3_torcs.vec_env import MirrorVecEnv, TorcsVecEnv

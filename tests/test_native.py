@@ -308,14 +308,7 @@ class TestStarts:
             assert car.gear >= 1
             assert 50.0 < car.engine_speed < 1000.0
 
-    @pytest.mark.parametrize(
-        "track",
-        [
-            "michigan",
-            "dirt-1",
-            "b-speedway",
-        ],
-    )
+    @pytest.mark.parametrize("track", ["michigan", "dirt-1", "b-speedway"])
     def test_nobody_is_damaged_by_a_start(self, rng, track):
         """Also where the road is banked."""
         backend = NativeBackend(track)

@@ -205,12 +205,7 @@ def test_a_state_comes_back_with_six_digits(state):
     for value, expected in zip(once, state, strict=True):
         if expected is not None:
             np.testing.assert_allclose(value, expected, rtol=1e-5)
-    assert parse_motor(text) == (
-        once.lap_time,
-        once.gear,
-        once.engine_speed,
-        once.speed_x,
-    )
+    assert parse_motor(text) == (once.lap_time, once.gear, once.engine_speed, once.speed_x)
 
 
 @given(actions)

@@ -208,10 +208,7 @@ from sb3_torcs.cli import main
 main()
 """
 
-ONLY_OF_AN_EXTRA = [
-    "sb3_torcs.envs.parallel_env",
-    "sb3_torcs.rendering.encoder",
-]
+ONLY_OF_AN_EXTRA = ["sb3_torcs.envs.parallel_env", "sb3_torcs.rendering.encoder"]
 
 
 def extras():
