@@ -199,21 +199,6 @@ def modules_that(path: Path, modules: set[str]) -> set[str]:
         item.rpartition(".")[0] == name for item in found)}  # fmt: skip
 
 
-def test_the_walk_sees_lazy_imports_and_skips_those_for_types():
-    code = (
-        "import a.b\nif TYPE_CHECKING:\n    import c\n"
-        "def f():\n    from d import e\nclass G:\n    import h\n"
-    )
-    found = list(_walk(ast.parse(code), lazy=False))
-    assert found == [Import("a.b", False, 1), Import("d.e", True, 5), Import("h", False, 7)]
-    assert found[0].within("a")
-    assert not Import("ab", False, 1).within("a")
-
-
-def test_a_circle_is_found():
-    assert in_circle({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}) == ["a", "b", "c"]
-
-
 def floor_plan() -> dict[str, str]:
     """What docs/architecture.md says of each room."""
     block = (PACKAGE.parent / "docs/architecture.md").read_text("utf-8").split("```")[1]
@@ -322,11 +307,6 @@ def faults_of_a_test(text: str) -> list[str]:
     return sorted((called & {"importorskip", "exec"}) | imported)
 
 
-def test_the_faults_of_a_test_are_found():
-    bad = "from test_a import b\nrun('import test_c')\npytest.importorskip('d')\nexec('e')\n"
-    assert faults_of_a_test(bad) == ["exec", "importorskip", "test_a", "test_c"]
-
-
 def test_tests_skip_nothing_and_share_helpers():
     """What several tests need stands in a module of its own."""
     found = {path.name: faults_of_a_test(source(path)) for path in TESTS if path != Path(__file__)}
@@ -341,25 +321,51 @@ def test_the_top_of_the_package_is_short():
     assert len(folders) <= MAX_FOLDERS
 
 
-def test_the_vocabulary_is_pure():
-    """It has to work where there is no environment, no network and no simulator."""
-    packages = {"gymnasium", "socket", "torch", "stable_baselines3", "sb3_torcs.backends"}
-    assert_none(forbidden(pure_files(), packages | {"sb3_torcs.envs"}))
+def robots() -> list[Path]:
+    return [PACKAGE / name for name in ("agents/robots.py", "torcs/race_results.py")]
 
 
-def test_one_file_knows_the_cluster():
-    """And imports it only when a study is run: nothing else needs Ray."""
-    assert_none(forbidden(all_but({"studies/runner.py"}), {"ray"}))
-    assert_none(forbidden(FILES, {"ray"}, lazy_too=False))
+def others_than_commands() -> list[Path]:
+    return [path for path in all_but(HAS_THE_GAME_RUN) if room(path) != "cli"]
 
 
-def test_no_file_needs_the_zoo():
-    assert_none(forbidden(FILES, {"rl_zoo3"}))
+AGENTS = {"gymnasium", "torch", "stable_baselines3", "rl_zoo3"}
+LEARNING_LIBRARIES = AGENTS - {"gymnasium"}
+WORLDS = {"sb3_torcs.backends", "sb3_torcs.envs"}
+SIMULATOR = {"gymnasium", "socket", "torch", "stable_baselines3", *WORLDS}
+GRAPHICS = modules(DRAWS) | {"highway_env", "pygame", "matplotlib"}
+ENGINE = {"sb3_torcs._engine"}
+NEVER = {  # files that import none of the packages, inside functions either
+    "the vocabulary is pure": (pure_files, SIMULATOR),
+    "one file knows the cluster": (lambda: all_but({"studies/runner.py"}), {"ray"}),
+    "no file needs the zoo": (lambda: FILES, {"rl_zoo3"}),
+    "worlds know nothing of agents": (lambda: files_of({"backends"}), AGENTS),
+    "environments know nothing of learning": (lambda: files_of({"envs"}), LEARNING_LIBRARIES),
+    "what learns works with the next world, too": (lambda: files_of(LEARNING), WORLDS),
+    "a busy machine changes no step": (on_the_way_of_a_step, {"time", "datetime", "timeit"}),
+    "few have programs run": (others_than_commands, modules(STARTS_PROGRAMS)),
+    "few speak over a network": (lambda: all_but(USES_A_NETWORK), {"socket"}),
+    "one file says how to build the engine": (lambda: all_but(LOADS_THE_ENGINE), ENGINE),
+    "two files know XML": (lambda: all_but({"torcs/params.py", "torcs/nodes.py"}), {"xml"}),
+    "robots need no agent": (robots, AGENTS | {"sb3_torcs.envs"}),
+}
+ONLY_IN_FUNCTIONS = {  # packages that files load when somebody needs them
+    "Ray, for a study": (lambda: FILES, {"ray"}),
+    "graphics, for who looks": (lambda: all_but(DRAWS), GRAPHICS),
+    "the engine, for who drives": (lambda: [PACKAGE / "backends" / "native.py"], ENGINE),
+}
 
 
-def test_worlds_know_nothing_of_agents():
-    learning = {"gymnasium", "torch", "stable_baselines3", "rl_zoo3"}
-    assert_none(forbidden(files_of({"backends"}), learning))
+@pytest.mark.parametrize("rule", NEVER)
+def test_files_do_not_import(rule):
+    files, packages = NEVER[rule]
+    assert_none(forbidden(files(), packages))
+
+
+@pytest.mark.parametrize("rule", ONLY_IN_FUNCTIONS)
+def test_files_import_only_in_functions(rule):
+    files, packages = ONLY_IN_FUNCTIONS[rule]
+    assert_none(forbidden(files(), packages, lazy_too=False))
 
 
 @pytest.mark.parametrize("world", ["lite", "native", "scr"])
@@ -373,28 +379,9 @@ def test_a_world_knows_no_other_world(world):
     assert_none(forbidden(others, {f"sb3_torcs.backends.{world}"}))
 
 
-def test_environments_know_nothing_of_learning():
-    assert_none(forbidden(files_of({"envs"}), {"torch", "stable_baselines3", "rl_zoo3"}))
-
-
 def test_the_loop_names_no_world():
     found = forbidden([PACKAGE / "envs" / "racing.py"], {"sb3_torcs.backends"})
     assert {fault.rpartition(".")[2] for fault in found} == {"Backend", "optional"}
-
-
-def test_what_learns_never_imports_a_world():
-    """So that it works with the next one, too."""
-    assert_none(forbidden(files_of(LEARNING), {"sb3_torcs.backends", "sb3_torcs.envs"}))
-
-
-def test_graphics_load_only_when_somebody_looks():
-    graphics = modules(DRAWS) | {"highway_env", "pygame", "matplotlib"}
-    assert_none(forbidden(all_but(DRAWS), graphics, lazy_too=False))
-
-
-def test_no_clock_stands_in_the_way_of_a_step():
-    """Time is counted in physics steps: a busy machine must not change what happens."""
-    assert_none(forbidden(on_the_way_of_a_step(), {"time", "datetime", "timeit"}))
 
 
 def test_no_shell_and_no_other_process():
@@ -402,33 +389,6 @@ def test_no_shell_and_no_other_process():
     assert_none(forbidden(FILES, {"pty", "pexpect", "os.system", "os.popen"}))
     words = r"os\.(system|popen|exec|spawn)|pkill|killall|shell=True"
     assert [named(path) for path in FILES if re.search(words, source(path))] == []
-
-
-def test_few_have_programs_run():
-    others = [path for path in all_but(HAS_THE_GAME_RUN) if room(path) != "cli"]
-    assert_none(forbidden(others, modules(STARTS_PROGRAMS)))
-
-
-def test_few_speak_over_a_network():
-    assert_none(forbidden(all_but(USES_A_NETWORK), {"socket"}))
-
-
-def test_one_file_knows_the_engine():
-    """
-    All others go through it, so that there is one place that says how to build it; but for the
-    process that tries a track, which starts faster so.
-    """
-    assert_none(forbidden(all_but(LOADS_THE_ENGINE), {"sb3_torcs._engine"}))
-
-
-def test_the_engine_loads_only_when_somebody_drives():
-    path = PACKAGE / "backends" / "native.py"
-    assert_none(forbidden([path], {"sb3_torcs._engine"}, lazy_too=False))
-
-
-def test_two_files_know_xml():
-    """What of TORCS is read and written, is so in one way."""
-    assert_none(forbidden(all_but({"torcs/params.py", "torcs/nodes.py"}), {"xml"}))
 
 
 def test_the_car_and_its_gearbox_are_said_once():
@@ -452,12 +412,6 @@ def test_few_files_let_drivers_drive():
     """So that a lap is the same lap, whoever asks for it."""
     asking = {named(path) for path in FILES if any(map(asks_a_driver, nodes(path)))}
     assert asking == ASKS_DRIVERS
-
-
-def test_robots_need_no_agent():
-    packages = {"gymnasium", "torch", "stable_baselines3", "rl_zoo3", "sb3_torcs.envs"}
-    paths = [PACKAGE / name for name in ("agents/robots.py", "torcs/race_results.py")]
-    assert_none(forbidden(paths, packages))
 
 
 def test_one_file_knows_python():
@@ -500,10 +454,6 @@ def code_lines(text: str) -> int:
         if is_text and isinstance(node.value.value, str):
             lines -= set(range(node.lineno, node.end_lineno + 1))
     return len(lines)
-
-
-def test_code_lines_are_those_that_do_something():
-    assert code_lines('"""Doc."""\n\n# comment\nx = (\n    1  # one\n)\n') == 3
 
 
 def test_no_file_is_longer_than_one_can_read():

@@ -78,17 +78,16 @@ def test_noise_callback_installs_one_noise_per_environment(kind, cls, n_envs):
     assert [noise.timesteps for noise in noises_of(model)] == [12] * n_envs
 
 
-@pytest.mark.parametrize("n_envs", [1, 3])
-def test_full_set_point_noise_drives_the_car_by_the_table(n_envs):
-    """At scale 1, theta 1 and no chance the executed action is mu, clipped, in every world."""
-    spy = learn(make_model(n_envs), 30, NoiseCallback(**SET_POINT))
+@pytest.mark.parametrize(("n_envs", "algorithm"), [(1, DDPG), (3, DDPG), (1, SAC)])
+def test_full_set_point_noise_drives_the_car_by_the_table(n_envs, algorithm):
+    """
+    At scale 1, theta 1 and no chance the executed action is mu, clipped, in every world.
+
+    The buffer holds it as SB3 scales it: 0.5 on the throttle is 0 there, no brake is -1.
+    """
+    model = make_model(n_envs, algorithm=algorithm)
+    spy = learn(model, 30, NoiseCallback(**SET_POINT))
     np.testing.assert_allclose(spy.actions, [[0.0, 0.5, 0.0]] * len(spy.actions), atol=1e-6)
-
-
-def test_the_buffer_holds_the_action_that_was_executed():
-    """SB3's scaled action: 0.5 on the throttle is 0 there, no brake is -1."""
-    model = make_model()
-    learn(model, 10, NoiseCallback(**SET_POINT))
     np.testing.assert_allclose(model.replay_buffer.actions[:10, 0], [[0, 0, -1]] * 10, atol=1e-6)
 
 
@@ -109,26 +108,8 @@ def test_same_seed_same_training(kind):
 
 
 def test_the_seed_of_the_callback_comes_first():
-    """Another seed, another noise."""
-    one = learn(make_model(), 5, NoiseCallback(kind="ou", seed=1))
-    two = learn(make_model(), 5, NoiseCallback(kind="ou", seed=2))
+    one, two = (learn(make_model(), 5, NoiseCallback(kind="ou", seed=seed)) for seed in (1, 2))
     assert not np.array_equal(one.actions, two.actions)
-
-
-@pytest.mark.parametrize(("kwargs", "message"), [
-    ({"seed": "abc"}, "seed is 'abc'; expected a whole number >= 0"),
-    ({"seed": -1}, "seed is -1; expected a whole number >= 0"),
-    ({"throttle": 5}, r"throttle is 5; expected \[mu, theta, sigma\]"),
-])  # fmt: skip
-def test_a_wrong_argument_of_the_noise_is_told(kwargs, message):
-    with pytest.raises(InvalidOption, match=message):
-        NoiseCallback(**kwargs)
-
-
-@pytest.mark.parametrize("mu", [-0.1, 5, "x"])
-def test_a_brake_that_cannot_be_is_refused(mu):
-    with pytest.raises(InvalidOption, match="expected how far to brake, from 0 to 1"):
-        StochasticBrakeCallback(mu=mu)
 
 
 def test_nothing_is_added_during_the_warm_up():
@@ -184,12 +165,6 @@ def test_a_foreign_noise_is_replaced():
     assert isinstance(model.action_noise, OUNoise)
 
 
-def test_noise_works_with_sac_too():
-    """Its actor is stochastic; the set point takes what it has drawn."""
-    spy = learn(make_model(algorithm=SAC), 10, NoiseCallback(**SET_POINT))
-    np.testing.assert_allclose(spy.actions, [[0.0, 0.5, 0.0]] * 10, atol=1e-6)
-
-
 def test_an_algorithm_without_action_noise_is_refused():
     """PPO explores by its own distribution."""
     model = PPO("MlpPolicy", DummyVecEnv([ToyRace]), n_steps=8, batch_size=8, device="cpu")
@@ -197,12 +172,6 @@ def test_an_algorithm_without_action_noise_is_refused():
         told = f"PPO takes no action noise; use {callback.__name__} with DDPG, TD3 or SAC"
         with pytest.raises(InvalidOption, match=told):
             model.learn(8, callback=callback())
-
-
-def test_an_unknown_kind_shows_the_near_one():
-    """With what is allowed."""
-    with pytest.raises(InvalidOption, match="did you mean 'set_point'"):
-        NoiseCallback(kind="setpoint")
 
 
 def test_set_point_noise_without_the_callback_says_so():
@@ -239,16 +208,6 @@ def test_steering_a_noise_that_is_not_there_is_an_error(callback):
     """It names the callback that is missing."""
     with pytest.raises(InvalidOption, match="add NoiseCallback"):
         learn(make_model(), 2, callback())
-
-
-@pytest.mark.parametrize(
-    "bad",
-    [{"timesteps": 0}, {"floor": -0.1}, {"floor": 1.1}, {"timesteps": "1e5"}, {"floor": None}],
-)
-def test_a_decay_that_is_none_is_refused(bad):
-    """Values that would divide by zero or grow."""
-    with pytest.raises(InvalidOption, match=f"{next(iter(bad))} is .*; expected a"):
-        NoiseDecayCallback(**bad)
 
 
 @pytest.mark.parametrize("kind", ["set_point", "ou"])
@@ -293,12 +252,6 @@ def test_the_brake_of_the_post_brakes_in_every_tenth_timestep():
     assert share == pytest.approx(0.0945, abs=4 * np.sqrt(0.0945 * 0.9055 / 1500))
 
 
-def test_a_share_that_is_none_is_refused():
-    """Ten per cent is 0.1, not 10."""
-    with pytest.raises(InvalidOption, match=r"share of the timesteps in \[0, 1\]"):
-        StochasticBrakeCallback(probability=10)
-
-
 # ----------------------------------------------------------------------- reward and start
 
 
@@ -323,16 +276,11 @@ def test_reward_and_start_are_switched_and_given_back(n_envs, vec_env_cls):
 
 def test_what_an_interrupted_training_left_is_not_taken_for_the_environments_own():
     """SB3 tells no callback that an exception has ended a training."""
-
-    class Stop(BaseCallback):
-        def _on_step(self):
-            raise KeyboardInterrupt
-
     model = make_model()
     before = model.get_env().env_method("settings")
     callbacks = [RewardCallback(reward="blog"), RandomStartCallback()]
     with pytest.raises(KeyboardInterrupt):
-        learn(model, 4, *callbacks, Stop())
+        learn(model, 4, *callbacks, Raising())
     learn(model, 4, *callbacks)
     assert model.get_env().env_method("settings") == before
 
@@ -402,6 +350,20 @@ def test_evaluation_keeps_its_reward_unless_asked(also_eval, expected):
 @pytest.mark.parametrize(
     ("callback", "options", "message"),
     [
+        (NoiseCallback, {"seed": "abc"}, "seed is 'abc'; expected a whole number >= 0"),
+        (NoiseCallback, {"seed": -1}, "seed is -1; expected a whole number >= 0"),
+        (NoiseCallback, {"throttle": 5}, r"throttle is 5; expected \[mu, theta, sigma\]"),
+        (NoiseCallback, {"kind": "setpoint"}, "did you mean 'set_point'"),
+        (NoiseDecayCallback, {"timesteps": 0}, "timesteps is .*; expected a"),
+        (NoiseDecayCallback, {"timesteps": "1e5"}, "timesteps is .*; expected a"),
+        *[(NoiseDecayCallback, {"floor": floor}, "floor is .*; expected a")
+          for floor in (-0.1, 1.1, None)],
+        *[(StochasticBrakeCallback, {"mu": mu}, "how far to brake, from 0 to 1")
+          for mu in (-0.1, 5, "x")],
+        (StochasticBrakeCallback, {"probability": 10}, r"share of the timesteps in \[0, 1\]"),
+        *[(GradientStepsCallback, {"timesteps": 10, "gradient_steps": 2, **wrong}, "number >= 1")
+          for wrong in ({"gradient_steps": 0}, {"timesteps": 0}, {"gradient_steps": 2.5},
+                        {"timesteps": "1e5"})],
         (RewardCallback, {"reward": "progres"}, "did you mean 'progress'"),
         (RewardCallback, {"reward": "blog", "timesteps": -1}, "a whole number >= 0"),
         (RewardCallback, {"reward": "blog", "timesteps": False}, "a whole number >= 0"),
@@ -412,7 +374,7 @@ def test_evaluation_keeps_its_reward_unless_asked(also_eval, expected):
         (NoiseCallback, {"dt": "1e-1"}, "pass a duration above 0"),
         (StochasticBrakeCallback, {"probability": "10 %"}, "a share of the timesteps"),
     ],
-)
+)  # fmt: skip
 def test_a_wrong_value_is_told_when_the_callback_is_made(callback, options, message):
     """A worker process would die of it."""
     with pytest.raises(Sb3TorcsError, match=message):
@@ -456,10 +418,8 @@ def test_a_young_training_learns_more_from_each_timestep():
 
 
 def test_a_young_training_that_an_error_ended_leaves_the_steps_of_the_model():
-    model, young = (
-        make_model(gradient_steps=1),
-        GradientStepsCallback(gradient_steps=3, timesteps=8),
-    )
+    model = make_model(gradient_steps=1)
+    young = GradientStepsCallback(gradient_steps=3, timesteps=8)
     with pytest.raises(KeyboardInterrupt):
         learn(model, 4, young, Raising())
     assert model.gradient_steps == 3
@@ -482,16 +442,6 @@ def test_gradient_steps_need_an_algorithm_with_a_replay():
     model = PPO("MlpPolicy", make_vec_env(ToyRace), n_steps=8, batch_size=8, device="cpu")
     with pytest.raises(InvalidOption, match="off-policy algorithms, but the model learns by PPO"):
         model.learn(8, callback=GradientStepsCallback(gradient_steps=2, timesteps=10))
-
-
-@pytest.mark.parametrize(
-    "options",
-    [{"gradient_steps": 0}, {"timesteps": 0}, {"gradient_steps": 2.5}, {"timesteps": "1e5"}],
-)
-def test_gradient_steps_are_at_least_one(options):
-    """None at all is what `learning_starts` is for."""
-    with pytest.raises(InvalidOption, match="expected a whole number >= 1"):
-        GradientStepsCallback(**{"gradient_steps": 2, "timesteps": 10, **options})
 
 
 @pytest.mark.parametrize(

@@ -120,15 +120,9 @@ def tracks_table():
     for path in sorted(BUNDLED_FOLDER.glob("*/*.csv")):
         s = load_track(path.stem).summary()
         origin = path.read_text(encoding="utf-8").splitlines()[:2]
-        rows.append(
-            [
-                f"`{s.category}/{s.name}`",
-                f"{s.length_m:.1f}",
-                f"{s.width_m:.1f}",
-                f"{s.tightest_radius_m:.1f}",
-                " ".join(line.lstrip("# ") for line in origin),
-            ]
-        )
+        sizes = [f"{size:.1f}" for size in (s.length_m, s.width_m, s.tightest_radius_m)]
+        source = " ".join(line.lstrip("# ") for line in origin)
+        rows.append([f"`{s.category}/{s.name}`", *sizes, source])
     return markdown(["track", "length m", "width m", "tightest radius m", "source"], rows)
 
 
@@ -155,19 +149,12 @@ def tags_table():
 def verbs_table():
     """What ``sb3-torcs --help`` says of its verbs."""
 
-    class Collector:
-        def __init__(self):
-            self.rows = []
-
-        def add_parser(self, name, *, help, **kwargs):
-
-            self.rows.append([f"`sb3-torcs {name}`", help])
-            return argparse.ArgumentParser(add_help=False)
-
-    collector = Collector()
+    parser = argparse.ArgumentParser()
+    verbs = parser.add_subparsers()
     for verb in cli.VERBS:
-        verb.add_parser(collector)
-    return markdown(["verb", "does"], collector.rows)
+        verb.add_parser(verbs)
+    rows = [[f"`sb3-torcs {choice.dest}`", choice.help] for choice in verbs._choices_actions]
+    return markdown(["verb", "does"], rows)
 
 
 def sensor_table():
@@ -403,9 +390,8 @@ def check_shown(parsed, monkeypatch, line):
         case ["python", "-m", "sb3_torcs.rl_zoo", script, *words]:
             call = [sys.executable, "-m", "sb3_torcs.rl_zoo", script, *words, "--help"]
             told = subprocess.run(call, capture_output=True, check=True, text=True).stdout
-            assert {word for word in words if word.startswith("-")} <= set(
-                re.split(r"[\s,]+", told)
-            )
+            flags = {word for word in words if word.startswith("-")}
+            assert flags <= set(re.split(r"[\s,]+", told))
         case ["make", target, *_]:
             assert target in TARGETS
         case ["python" | "sh", script, *_]:
@@ -454,9 +440,8 @@ def check(args):
     if args.verb == "study" and not args.report:
         assert read_study(args.file).trials
     if args.verb == "evaluate":
-        run = re.fullmatch(
-            r"logs/(?:\w+/)?(\w+)/Torcs(?:Lite)?-v0_1(?:/best_model\.zip)?", args.model
-        )
+        saved = r"logs/(?:\w+/)?(\w+)/Torcs(?:Lite)?-v0_1(?:/best_model\.zip)?"
+        run = re.fullmatch(saved, args.model)
         named = ("scripted", *shipped_agents(), *ROBOTS)
         assert args.model.partition(":")[0] in named or zoo.config_file(run[1])
 
@@ -571,18 +556,6 @@ def test_what_the_docs_name_is_there():
         for flag in re.findall(r"(?<!\S)--[a-z][\w-]*", text)
         if flag not in flags
     )
-
-
-def test_names_that_are_not_there_would_be_found(tmp_path, monkeypatch):
-    """A page of mistakes: nothing of it is known."""
-    page = tmp_path / "page.md"
-    page.write_text("`sb3_torcs.nothing`, `NoSuchClass`, `no_such()`, `--no-flag`, `no/file.py`")
-    monkeypatch.setattr(sys.modules[__name__], "PAGES", [page])
-    monkeypatch.setattr(sys.modules[__name__], "ROOT", tmp_path)
-    assert unknown(FILE, is_there) == ["page.md:1: no/file.py"]
-    assert unknown(DOTTED, imports) == ["page.md:1: sb3_torcs.nothing"]
-    missing = unknown(NAME, defined().__contains__)
-    assert missing == ["page.md:1: NoSuchClass", "page.md:1: no_such"]
 
 
 # ------------------------------------------------------------------------------ links, docstrings
