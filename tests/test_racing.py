@@ -20,14 +20,17 @@ from sb3_torcs.rewards import TERMS, safe_speed
 GAS = np.array([0.0, 1.0, 0.0], np.float32)
 
 
-def run(track, *states, **options):
-    """Reset, then one step per given state; return the last step's answer."""
+def begun(track, *states, **options):
+    """An environment whose first episode has begun."""
     env = RacingEnv(ScriptedBackend(track, *states), **options)
     env.reset(seed=0)
-    answer = None
-    for _ in states:
-        answer = env.step(GAS)
-    return answer
+    return env
+
+
+def run(track, *states, **options):
+    """Reset, then one step per given state; return the last step's answer."""
+    env = begun(track, *states, **options)
+    return [env.step(GAS) for _ in states][-1]
 
 
 @pytest.mark.parametrize(
@@ -65,46 +68,30 @@ def test_a_car_may_be_beside_the_road_where_there_is_runoff(oval, axis, end):
     assert info["off_track"]
 
 
-ENDS = {"recovery": 4.0}
+RECOVERY = {"ends": {"recovery": 4.0}}
+BACK = {"heading_error": math.pi, "speed_x": -10.0}  # the right way along the road, backwards
 
 
-@pytest.mark.parametrize("state", [{"heading_error": 3.0}, {"speed_x": 1.0}])
-def test_a_car_has_time_to_recover_where_it_is_given(oval, state):
-    """Of 4 s, to turn round or to set off, from the last timestep with headway on."""
-    env = RacingEnv(ScriptedBackend(oval, {"speed_x": 20.0}, *[state] * 50), ends=ENDS)
-    env.reset(seed=0)
-    steps = [env.step(GAS) for _ in range(42)]
-    assert [step[2] for step in steps] == [False] * 41 + [True]
-    assert steps[-1][4]["end"] == "stuck"
-
-
-def test_who_backs_out_of_a_spin_makes_no_headway(oval):
-    """A car that reverses the right way along the road may not do so for ever."""
-    back = {"heading_error": math.pi, "speed_x": -10.0}
-    env = RacingEnv(ScriptedBackend(oval, *[back] * 50), ends=ENDS)
-    env.reset(seed=0)
-    assert [env.step(GAS)[2] for _ in range(41)] == [False] * 40 + [True]
-
-
-def test_a_standing_car_is_stuck_after_the_grace_of_the_start(oval):
-    env = RacingEnv(ScriptedBackend(oval, *[{"speed_x": 0.0}] * 40))
-    env.reset(seed=0)
-    ended = [env.step(GAS)[2] for _ in range(31)]
-    assert ended == [False] * 30 + [True]  # 3.0 s of 0.1 s timesteps may pass
-
-
-def test_a_car_that_stops_on_the_way_is_stuck_sooner(oval):
-    states = [{"speed_x": 20.0}] + [{"speed_x": 1.0}] * 20
-    env = RacingEnv(ScriptedBackend(oval, *states))
-    env.reset(seed=0)
-    ended = [env.step(GAS)[2] for _ in range(17)]
-    assert ended == [False] * 16 + [True]  # 1.5 s after the one fast timestep
+@pytest.mark.parametrize(
+    ("first", "then", "options", "steps"),
+    [
+        ([{"speed_x": 20.0}], {"heading_error": 3.0}, RECOVERY, 42),
+        ([{"speed_x": 20.0}], {"speed_x": 1.0}, RECOVERY, 42),
+        ([], BACK, RECOVERY, 41),
+        ([], {"speed_x": 0.0}, {}, 31),  # 3.0 s of 0.1 s timesteps may pass
+        ([{"speed_x": 20.0}], {"speed_x": 1.0}, {}, 17),  # 1.5 s after the one fast timestep
+    ],
+)
+def test_who_makes_no_headway_is_stuck_after_a_time(oval, first, then, options, steps):
+    env = begun(oval, *first, *[then] * 50, **options)
+    answers = [env.step(GAS) for _ in range(steps)]
+    assert [answer[2] for answer in answers] == [False] * (steps - 1) + [True]
+    assert answers[-1][4]["end"] == "stuck"
 
 
 def test_lap_time_is_0_unless_a_lap_was_just_completed(oval):
     first = {"laps": 1, "last_lap_time": 70.5, "best_lap_time": 70.5}
-    env = RacingEnv(ScriptedBackend(oval, first, first))
-    env.reset(seed=0)
+    env = begun(oval, first, first)
     assert env.step(GAS)[4]["lap_time"] == 70.5
     info = env.step(GAS)[4]
     assert info["lap_time"] == 0.0
@@ -129,29 +116,16 @@ def test_a_car_that_is_lost_ends_the_episode_only(oval, reward):
 
 
 def test_controls_are_held_for_the_action_repeat(oval):
-    env = RacingEnv(ScriptedBackend(oval), action_repeat=7)
-    env.reset(seed=0)
+    env = begun(oval, action_repeat=7)
     env.step(np.array([0.5, 2.0, -1.0], np.float32))
     assert env.backend.calls[-1] == ("step", Controls(0.5, 1.0, 0.0), 7)
 
 
-def test_reset_options_place_the_car(oval):
-    env = RacingEnv(ScriptedBackend(oval))
-    env.reset(seed=0, options={"distance": 100.0, "speed": 20.0, "track_position": 0.5})
-    assert env.backend.calls[-1] == ("reset", Start(100.0, 0.5, 0.0, 20.0))
-
-
 def test_numbers_of_numpy_are_numbers(oval):
     env = RacingEnv(ScriptedBackend(oval), action_repeat=np.int64(3), laps=np.int32(2))
-    env.reset(options={"distance": np.int64(100), "speed": np.float32(20.0)})
-    assert env.backend.calls[-1] == ("reset", Start(100.0, 0.0, 0.0, 20.0))
-
-
-def test_what_is_no_number_at_all_is_no_action(oval):
-    env = RacingEnv(ScriptedBackend(oval))
-    env.reset(seed=0)
-    with pytest.raises(InvalidAction, match="expected three numbers"):
-        env.step(np.array(["a", "b", "c"]))
+    place = {"distance": np.int64(100), "speed": np.float32(20.0), "track_position": 0.5}
+    env.reset(options=place)
+    assert env.backend.calls[-1] == ("reset", Start(100.0, 0.5, 0.0, 20.0))
 
 
 def test_random_starts_are_on_the_road_and_follow_the_seed(oval):
@@ -301,26 +275,24 @@ def test_a_place_just_before_the_line_is_on_the_lap():
     assert cars[0].distance_from_start == cars[1].distance_from_start
 
 
-@pytest.mark.parametrize("actuator", ["steering", "throttle", "brake"])
-def test_nan_names_the_actuator(oval, actuator):
-    env = RacingEnv(ScriptedBackend(oval))
-    env.reset(seed=0)
-    action = np.zeros(3, np.float32)
-    action[["steering", "throttle", "brake"].index(actuator)] = np.nan
-    with pytest.raises(InvalidAction, match=f"{actuator} is nan"):
-        env.step(action)
-
-
-def test_a_wrong_shape_says_the_right_one(oval):
-    env = RacingEnv(ScriptedBackend(oval))
-    env.reset(seed=0)
-    with pytest.raises(InvalidAction, match=r"shape \(2,\), expected \(3,\)"):
-        env.step(np.zeros(2, np.float32))
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        ([np.nan, 0.0, 0.0], "steering is nan"),
+        ([0.0, np.nan, 0.0], "throttle is nan"),
+        ([0.0, 0.0, np.nan], "brake is nan"),
+        ([0.0, 0.0], r"shape \(2,\), expected \(3,\)"),
+        (["a", "b", "c"], "expected three numbers"),
+    ],
+)
+def test_what_is_no_action_is_told(oval, action, message):
+    env = begun(oval)
+    with pytest.raises(InvalidAction, match=message):
+        env.step(np.array(action))
 
 
 def test_after_a_reset_that_failed_there_is_no_step(oval, monkeypatch):
-    env = RacingEnv(ScriptedBackend(oval))
-    env.reset(seed=0)
+    env = begun(oval)
 
     def reset(rng, start):
         raise InvalidOption("start elsewhere")
@@ -333,8 +305,7 @@ def test_after_a_reset_that_failed_there_is_no_step(oval, monkeypatch):
 
 
 def test_a_wrong_option_of_a_reset_leaves_the_episode_as_it_is(oval):
-    env = RacingEnv(ScriptedBackend(oval))
-    env.reset(seed=0)
+    env = begun(oval)
     before = env.np_random.bit_generator.state
     with pytest.raises(InvalidOption, match="unknown reset option 'speeed'"):
         env.reset(seed=1, options={"speeed": 1.0})
@@ -353,8 +324,7 @@ def test_a_window_that_fails_to_close_does_not_keep_the_world_open(oval):
 def test_a_timestep_after_the_end_warns_once(oval):
     """But not one from a moment before it, to which somebody has gone back."""
     lost, fine = {"distance_from_axis": 20.0}, {}
-    env = RacingEnv(ScriptedBackend(oval, lost, fine, lost, lost, lost))
-    env.reset(seed=0)
+    env = begun(oval, lost, fine, lost, lost, lost)
     assert [env.step(GAS)[2] for _ in range(3)] == [True, False, True]
     with pytest.warns(UserWarning, match="step after the end of an episode"):
         assert env.step(GAS)[2]

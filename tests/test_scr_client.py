@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 import time
 from array import array
+from contextlib import closing, contextmanager
 
 import numpy as np
 import pytest
@@ -19,8 +20,12 @@ from sb3_torcs.scr.protocol import ScrAction, format_action, parse_state
 ANGLES = np.radians(np.arange(-90.0, 91.0, 10.0))
 
 
+@contextmanager
 def client_of(server, **options):
-    return ScrClient(server.host, server.port, ANGLES, **options)
+    """A client whose server has identified it."""
+    with closing(ScrClient(server.host, server.port, ANGLES, **options)) as client:
+        client.identify()
+        yield client
 
 
 def answer(client, message, steering=0.0):
@@ -44,57 +49,43 @@ def free_port():
 
 
 def test_one_state_follows_each_action():
-    with Loopback() as server:
-        client = client_of(server)
-        client.identify()
+    with Loopback() as server, client_of(server) as client:
         assert drive(client, COUNTDOWN + 4) == [0.0] * COUNTDOWN + [0.0, 1.0, 2.0, 3.0]
-        client.close()
     assert server.inits[0].angles == pytest.approx(ANGLES)
     assert [action.steering for action in server.actions] == [0.001 * n for n in range(7)]
 
 
 def test_the_end_of_the_race_is_told_once_its_last_state_was():
-    with Loopback(ticks=2) as server:
-        client = client_of(server)
-        client.identify()
+    with Loopback(ticks=2) as server, client_of(server) as client:
         drive(client, COUNTDOWN + 2)
         assert client.receive() is None
         assert client.over
         assert client.receive() is None
         client.identify()  # the next race
         assert drive(client, COUNTDOWN + 1)[-1] == 0.0
-        client.close()
 
 
 def test_a_restart_begins_anew_where_it_was_asked_for():
-    with Loopback() as server:
-        client = client_of(server)
-        client.identify()
+    with Loopback() as server, client_of(server) as client:
         drive(client, 20)
         client.restart(Start(100.0, 0.5))
         assert drive(client, COUNTDOWN + 2)[-2:] == [0.0, 1.0]
-        client.close()
     assert server.inits[-1].start == Start(100.0, 0.5)
 
 
 def test_of_several_states_the_newest_is_taken():
-    with Loopback() as server:
-        client = client_of(server)
-        client.identify()
+    with Loopback() as server, client_of(server) as client:
         first = client.receive()
         for tick in (5, 6, 7):
             server.tick = tick
             server.send_state()
         assert parse_state(client.receive()).distance_from_start == 7.0
         assert first != client._taken
-        client.close()
 
 
 def test_ticks_that_were_lost_are_counted():
     """A state that another one followed, before it was answered or without ever being."""
-    with Loopback() as server:
-        client = client_of(server, latencies=array("d"))
-        client.identify()
+    with Loopback() as server, client_of(server, latencies=array("d")) as client:
         message = client.receive()
         answer(client, message)  # in time
         message = client.receive()
@@ -104,34 +95,27 @@ def test_ticks_that_were_lost_are_counted():
             server.send_state()  # doubled
         answer(client, message)  # late, and 5 and 6 are passed over
         assert parse_state(client.receive()).distance_from_start == 7.0
-        client.close()
     assert client.lost == 3
 
 
 def test_a_state_that_comes_twice_is_taken_once():
-    with Loopback() as server:
-        client = client_of(server)
-        client.identify()
+    with Loopback() as server, client_of(server) as client:
         message = client.receive()
         server.say(message)
         answer(client, message)
         assert client.receive() != message
-        client.close()
 
 
 def test_an_action_is_said_again_when_no_state_follows():
-    with Loopback(mute={0, 2, 3}) as server:
-        client = client_of(server, pause=0.02)
-        client.identify()
+    with Loopback(mute={0, 2, 3}) as server, client_of(server, pause=0.02) as client:
         assert drive(client, COUNTDOWN + 6)[COUNTDOWN:] == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
-        client.close()
     assert server.late == 3
     assert len(server.actions) == COUNTDOWN + 6
 
 
 def test_one_in_twenty_datagrams_lost_and_as_many_doubled_changes_nothing():
     with Loopback() as server, Errant((server.host, server.port)) as network:
-        client = client_of(network, pause=0.02)
+        client = ScrClient(network.host, network.port, ANGLES, pause=0.02)
         for _ in range(3):
             client.identify()
             driven = drive(client, 300)
@@ -180,40 +164,32 @@ def test_a_server_may_come_later():
 
 
 def test_a_server_that_ends_is_noticed_at_once():
-    server = Loopback()
-    with server:
-        client = client_of(server, patience=60.0, pause=30.0)
-        client.identify()
+    server = Loopback().__enter__()
+    with client_of(server, patience=60.0, pause=30.0) as client:
         message = client.receive()
-    with pytest.raises(ServerLost, match="its port is closed"):  # noqa: PT012
-        answer(client, message)
-        client.receive()
-    client.close()
+        server.stop()
+        with pytest.raises(ServerLost, match="its port is closed"):  # noqa: PT012
+            answer(client, message)
+            client.receive()
 
 
 def test_a_server_that_falls_silent_is_given_up_in_time():
-    with Loopback() as server:
-        client = client_of(server, patience=2.0, pause=0.05)
-        client.identify()
+    with Loopback() as server, client_of(server, patience=2.0, pause=0.05) as client:
         message = client.receive()
         server.say = lambda message: None
         answer(client, message)
         with pytest.raises(ServerLost, match="nothing came for"):
             client.receive()
-        client.close()
 
 
 def test_a_race_that_somebody_pauses_is_waited_for():
-    with Loopback() as server:
-        client = client_of(server, patience=1.0, silence=60.0, pause=0.02)
-        client.identify()
+    with Loopback() as server, client_of(server, patience=1.0, silence=60.0, pause=0.02) as client:
         message = client.receive()
         say, until = server.say, time.monotonic() + 2.0
         server.say = lambda message: say(message) if time.monotonic() > until else None
         answer(client, message)
         assert client.receive() != message
         assert time.monotonic() > until
-        client.close()
 
 
 def test_what_watches_the_server_has_the_last_word():
@@ -246,12 +222,12 @@ NAN = b"(angle 0)(curLapTime 0.02)(gear 1)(rpm 10)(speedX nan)(trackPos 0)\0"
 
 @pytest.mark.parametrize("words", [NAN, b"(angle", b"\xff\x00\x01", b""])
 def test_a_broken_state_is_left_out_with_one_warning(words):
-    with Garbling(words, {4, 7, *range(10, 19)}) as server:
-        client = client_of(server, skips_broken=True, pause=0.01)
-        client.identify()
+    with (
+        Garbling(words, {4, 7, *range(10, 19)}) as server,
+        client_of(server, skips_broken=True, pause=0.01) as client,
+    ):
         with pytest.warns(UserWarning, match="is left out") as warned:
             distances = drive(client, 20)
-        client.close()
     assert distances[-1] == 20 - COUNTDOWN - 1
     assert len(warned) == 1
 

@@ -33,10 +33,6 @@ def accepted(entry, algo="ddpg"):
     zoo.check_entry({**MINIMAL, **entry}, algo, "TorcsLite-v0", zoo.Place(zoo.Path("x"), "here"))
 
 
-def test_a_file_is_shipped_for_ddpg():
-    assert "ddpg" in [path.stem for path in SHIPPED]
-
-
 @pytest.mark.parametrize(("path", "name"), ENTRIES, ids=lambda part: getattr(part, "stem", part))
 def test_everything_in_the_shipped_files_is_read_by_something(path, name):
     """A key that nothing reads, a class that does not import, an argument that is not there."""
@@ -107,6 +103,9 @@ def test_a_missing_file_is_named(tmp_path):
         ("- 1\n", r"x\.yml: expected entries"),
         ("", r"x\.yml: expected entries"),
         ("a: 1\n", r"x\.yml, entry 'a': expected a mapping, got 1"),
+        ("null: {a: 1}", "an entry is called None; expected a word"),
+        ("1.5: {a: 1}", "an entry is called 1.5; expected a word"),
+        ("[" * 20_000, "not YAML"),
     ],
 )
 def test_a_broken_file_is_named_with_its_line(tmp_path, text, message):
@@ -124,20 +123,6 @@ def test_an_entry_that_is_not_there_is_told_the_near_miss():
         zoo.read_entry(zoo.config_file("ddpg"), "TorcsLight-v0")
 
 
-def test_an_unknown_key_is_told_the_near_miss(tmp_path):
-    said = complaint(tmp_path, {"learning_rat": 0.1})
-    assert said == "unknown key 'learning_rat'; did you mean 'learning_rate'?"
-
-
-def test_a_key_of_another_algorithm_is_unknown(tmp_path):
-    assert complaint(tmp_path, {"clip_range": 0.1}).startswith("unknown key 'clip_range'")
-    accepted({"clip_range": 0.1}, algo="ppo")
-
-
-def test_what_the_zoo_passes_itself_may_not_stand_in_an_entry(tmp_path):
-    assert complaint(tmp_path, {"seed": 1}).startswith("unknown key 'seed'")
-
-
 @pytest.mark.parametrize("key", ["n_timesteps", "policy"])
 def test_a_missing_key_is_named(key):
     entry = {name: value for name, value in MINIMAL.items() if name != key}
@@ -145,140 +130,73 @@ def test_a_missing_key_is_named(key):
         zoo.check_entry(entry, "ddpg", "TorcsLite-v0", zoo.Place(zoo.Path("x"), "here"))
 
 
+SPLIT_HEAD = {"policy": "sb3_torcs.policies.SplitHeadPolicy"}
+CHECKPOINTS = f"{MODULE}.CheckpointCallback"
+NOISE = {"noise_type": "normal", "noise_std": 0.1}
+STACKS = {"normalize": True, "frame_stack": 2}
+
+
+@pytest.mark.parametrize(("entry", "told"), [
+    ({"learning_rat": 0.1}, "unknown key 'learning_rat'; did you mean 'learning_rate'?"),
+    ({"clip_range": 0.1}, "unknown key 'clip_range'"),  # of PPO
+    ({"seed": 1}, "unknown key 'seed'"),  # which the zoo passes itself
+    ({"policy": "MlpPolice"}, "unknown policy 'MlpPolice'; did you mean 'MlpPolicy'?"),
+    ({"policy": ["MlpPolicy"]}, "unknown policy ['MlpPolicy']"),
+    ({"policy": "sb3_torcs.policies.BoundedPolicy"}, "is a policy for PPO and A2C; allowed: "),
+    ({"policy_kwargs": {"net_arc": [1]}}, "argument 'net_arc'; did you mean 'net_arch'?"),
+    ({**SPLIT_HEAD, "policy_kwargs": {"head_bia": [0.0]}}, "did you mean 'head_bias'?"),
+    ({"callback": "nowhere.Callback"}, "does not import (No module named 'nowhere'); install the"),
+    ({"callback": [f"{MODULE}.CheckpointCallbak"]}, "did you mean 'CheckpointCallback'? "),
+    ({"callback": {CHECKPOINTS: {"save_frequ": 1}}}, "did you mean 'save_freq'?"),
+    ({"callback": [{CHECKPOINTS: None, "a": 1}]}, "check the indentation"),
+    ({"env_kwargs": {"trak": "aalborg"}}, "argument 'trak'; did you mean 'track'?"),
+    ({"env_kwargs": {"max_episode_steps": 0.5}}, "expected a whole number of timesteps >= 1"),
+    ({"env_kwargs": "dict(track='aalborg')"}, "expected '{key: value}'"),
+    ({"monitor_kwargs": {"info_keywords": ["laps"]}}, "add the other one as []"),
+    ({"monitor_kwargs": {"info_keyword": []}}, "did you mean 'info_keywords'?"),
+    ({"normalize": {"norm_ob": True}}, "argument 'norm_ob'; did you mean 'norm_obs'?"),
+    *[({"n_timesteps": steps}, f"n_timesteps is {steps!r}; expected a number >= 1")
+      for steps in ("abc", 0, -5, True, None, float("inf"))],
+    *[({"learning_rate": rate}, f"learning_rate is {rate!r}; expected {RATE}")
+      for rate in ("abc", "1e-3", float("nan"))],
+    *[({key: value}, f"{key} is {value!r}; expected a whole number >= 1, e.g. 64")
+      for key, value in (("batch_size", 1.5), ("n_envs", 0), ("buffer_size", "1e5"))],
+    *[({key: value}, f"{key} is {value!r}; expected a number from 0 to 1, e.g. 0.005")
+      for key, value in (("gamma", "x"), ("gamma", float("nan")), ("tau", "1e-3"))],
+    *[({"learning_starts": value}, f"is {value!r}; expected a whole number >= 0")
+      for value in ("1e3", -1, False)],
+    *[({"gradient_steps": value}, f"is {value!r}; expected a whole number >= 1, or -1")
+      for value in (-1.0, 0)],
+])  # fmt: skip
+def test_a_wrong_entry_is_told(tmp_path, entry, told):
+    assert told in complaint(tmp_path, entry)
+
+
+@pytest.mark.parametrize(("entry", "algo"), [
+    ({"clip_range": 0.1}, "ppo"), (STACKS, "ppo"), (NOISE, "ddpg"),
+    ({**SPLIT_HEAD, "policy_kwargs": {"head_bias": [0, 0, -1], "net_arch": [3, 6]}}, "ddpg"),
+    ({"callback": [{CHECKPOINTS: {"save_freq": 1, "save_path": "x"}}]}, "ddpg"),
+    ({"env_kwargs": {"track": "aalborg", "max_episode_steps": 200}}, "ddpg"),
+    ({"monitor_kwargs": {"info_keywords": ["laps"], "reset_keywords": []}}, "ddpg"),
+    ({"normalize": {"norm_obs": True, "norm_reward": False}}, "ddpg"),
+    ({"normalize": True}, "ddpg"), ({"learning_rate": "lin_1e-3"}, "ddpg"),
+    ({"learning_rate": 0.001}, "ddpg"),
+    *[({"n_timesteps": steps}, "ddpg") for steps in (100, 1e5, "1e5", "100000.0")],
+])  # fmt: skip
+def test_what_the_zoo_reads_is_accepted(entry, algo):
+    accepted(entry, algo)
+
+
+@pytest.mark.parametrize(("entry", "algo", "told"), [
+    (STACKS, "sac", "cannot learn with both"), (NOISE, "ppo", "ppo takes no action noise; remove"),
+])  # fmt: skip
+def test_what_an_algorithm_cannot_do_is_told(tmp_path, entry, algo, told):
+    assert told in complaint(tmp_path, entry, algo)
+
+
 def test_an_unknown_algorithm_is_told_the_near_miss():
     with pytest.raises(ZooConfigError, match=r"no algorithm 'td33'; did you mean 'td3'\?"):
         accepted({}, algo="td33")
-
-
-def test_an_unknown_policy_is_told_the_near_miss(tmp_path):
-    said = complaint(tmp_path, {"policy": "MlpPolice"})
-    assert said.startswith("unknown policy 'MlpPolice'; did you mean 'MlpPolicy'?")
-    said = complaint(tmp_path, {"policy": ["MlpPolicy"]})
-    assert said.startswith("unknown policy ['MlpPolicy']")
-
-
-def test_a_policy_of_ppo_is_none_for_an_algorithm_with_critics(tmp_path):
-    said = complaint(tmp_path, {"policy": "sb3_torcs.policies.BoundedPolicy"})
-    assert said.startswith(
-        "sb3_torcs.policies.BoundedPolicy is a policy for PPO and A2C; allowed: "
-    )
-
-
-def test_an_argument_of_the_policy_that_it_does_not_have_is_unknown(tmp_path):
-    """Also where the policy hands what it does not know to its base class."""
-    said = complaint(tmp_path, {"policy_kwargs": {"net_arc": [1]}})
-    assert said == "unknown policy_kwargs: argument 'net_arc'; did you mean 'net_arch'?"
-    ours = {"policy": "sb3_torcs.policies.SplitHeadPolicy"}
-    said = complaint(tmp_path, {**ours, "policy_kwargs": {"head_bia": [0.0]}})
-    assert said == "unknown policy_kwargs: argument 'head_bia'; did you mean 'head_bias'?"
-    accepted({**ours, "policy_kwargs": {"head_bias": [0, 0, -1], "net_arch": [3, 6]}})
-
-
-def test_a_callback_that_does_not_import_is_told_why(tmp_path):
-    said = complaint(tmp_path, {"callback": "nowhere.Callback"})
-    assert said == (
-        "callback 'nowhere.Callback' does not import (No module named 'nowhere'); install the "
-        "package that it is in"
-    )
-
-
-def test_a_callback_that_is_not_in_its_module_is_told_the_near_miss(tmp_path):
-    said = complaint(tmp_path, {"callback": [f"{MODULE}.CheckpointCallbak"]})
-    assert "has no 'CheckpointCallbak'; did you mean 'CheckpointCallback'? " in said
-
-
-def test_an_argument_of_a_callback_that_it_does_not_have_is_unknown(tmp_path):
-    path = f"{MODULE}.CheckpointCallback"
-    said = complaint(tmp_path, {"callback": {path: {"save_frequ": 1}}})
-    assert said == f"unknown callback {path}: argument 'save_frequ'; did you mean 'save_freq'?"
-    accepted({"callback": [{path: {"save_freq": 1, "save_path": "x"}}]})
-
-
-def test_a_callback_with_a_slip_of_indentation_is_told_so(tmp_path):
-    said = complaint(tmp_path, {"callback": [{f"{MODULE}.CheckpointCallback": None, "a": 1}]})
-    assert "check the indentation" in said
-
-
-def test_an_argument_of_the_environment_that_it_does_not_have_is_unknown(tmp_path):
-    said = complaint(tmp_path, {"env_kwargs": {"trak": "aalborg"}})
-    assert said == "unknown env_kwargs: argument 'trak'; did you mean 'track'?"
-    accepted({"env_kwargs": {"track": "aalborg"}})
-
-
-def test_a_time_limit_is_among_the_arguments_of_the_environment(tmp_path):
-    """``gym.make`` itself takes it."""
-    accepted({"env_kwargs": {"track": "aalborg", "max_episode_steps": 200}})
-    said = complaint(tmp_path, {"env_kwargs": {"max_episode_steps": 0.5}})
-    assert said == "max_episode_steps is 0.5; expected a whole number of timesteps >= 1"
-
-
-def test_monitor_gets_both_of_its_lists_or_none(tmp_path):
-    """Monitor adds the two together, and a tuple is its default: it would fail later."""
-    said = complaint(tmp_path, {"monitor_kwargs": {"info_keywords": ["laps"]}})
-    assert said.endswith("add the other one as []")
-    accepted({"monitor_kwargs": {"info_keywords": ["laps"], "reset_keywords": []}})
-    said = complaint(tmp_path, {"monitor_kwargs": {"info_keyword": []}})
-    assert said == "unknown monitor_kwargs: argument 'info_keyword'; did you mean 'info_keywords'?"
-
-
-def test_an_argument_of_the_normalization_that_it_does_not_have_is_unknown(tmp_path):
-    said = complaint(tmp_path, {"normalize": {"norm_ob": True}})
-    assert said == "unknown normalize: argument 'norm_ob'; did you mean 'norm_obs'?"
-    accepted({"normalize": {"norm_obs": True, "norm_reward": False}})
-    accepted({"normalize": True})
-
-
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("null: {a: 1}", "an entry is called None; expected a word"),
-        ("1.5: {a: 1}", "an entry is called 1.5; expected a word"),
-        ("[" * 20_000, "not YAML"),
-    ],
-)
-def test_a_damaged_file_is_told(tmp_path, text, said):
-    file = tmp_path / "x.yml"
-    file.write_text(text)
-    with pytest.raises(ZooConfigError, match=said):
-        zoo.read_entry(file, "Torcs-v0")
-
-
-@pytest.mark.parametrize("steps", ["abc", 0, -5, True, None, float("inf")])
-def test_the_budget_must_be_a_number(tmp_path, steps):
-    said = complaint(tmp_path, {"n_timesteps": steps})
-    assert said == f"n_timesteps is {steps!r}; expected a number >= 1"
-
-
-@pytest.mark.parametrize("steps", [100, 1e5, "1e5", "100000.0"])
-def test_the_budget_may_be_written_as_people_do(steps):
-    accepted({"n_timesteps": steps})
-
-
-def test_a_schedule_must_be_one_that_the_zoo_reads(tmp_path):
-    said = complaint(tmp_path, {"learning_rate": "abc"})
-    assert said == f"learning_rate is 'abc'; expected {RATE}"
-    assert complaint(tmp_path, {"learning_rate": "1e-3"}).endswith(RATE)
-    accepted({"learning_rate": "lin_1e-3"})
-    accepted({"learning_rate": 0.001})
-
-
-@pytest.mark.parametrize(("key", "value", "expected"), [
-    ("learning_rate", float("nan"), RATE),
-    ("batch_size", 1.5, "a whole number >= 1, e.g. 64"),
-    ("n_envs", 0, "a whole number >= 1, e.g. 64"),
-    ("buffer_size", "1e5", "a whole number >= 1, e.g. 64"),
-    ("gamma", "x", "a number from 0 to 1, e.g. 0.005"),
-    ("gamma", float("nan"), "a number from 0 to 1, e.g. 0.005"),
-    ("tau", "1e-3", "a number from 0 to 1, e.g. 0.005"),
-    ("learning_starts", "1e3", "a whole number >= 0"),
-    ("learning_starts", -1, "a whole number >= 0"),
-    ("learning_starts", False, "a whole number >= 0"),
-    ("gradient_steps", -1.0, "a whole number >= 1, or -1"),
-    ("gradient_steps", 0, "a whole number >= 1, or -1"),
-    ("env_kwargs", "dict(track='aalborg')", "'{key: value}'"),
-])  # fmt: skip
-def test_a_number_that_none_can_train_with_is_told(tmp_path, key, value, expected):
-    assert complaint(tmp_path, {key: value}) == f"{key} is {value!r}; expected {expected}"
 
 
 def test_a_symmetric_policy_needs_observations_that_have_a_mirror_image(tmp_path):
@@ -358,16 +276,3 @@ def test_what_would_end_a_training_at_its_begin_is_told(change, message):
 
     with pytest.raises(ZooConfigError, match=message):
         begin()
-
-
-def test_normalized_stacks_are_for_algorithms_without_a_replay_buffer(tmp_path):
-    both = {"normalize": True, "frame_stack": 2}
-    assert "cannot learn with both" in complaint(tmp_path, both, algo="sac")
-    accepted(both, algo="ppo")
-
-
-def test_an_algorithm_without_action_noise_is_told(tmp_path):
-    noise = {"noise_type": "normal", "noise_std": 0.1}
-    accepted(noise)
-    said = complaint(tmp_path, noise, algo="ppo")
-    assert said.startswith("noise_type is 'normal', and ppo takes no action noise; remove it")
