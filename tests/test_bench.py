@@ -59,24 +59,23 @@ def short(game, monkeypatch):
     monkeypatch.setattr(bench_scr, "SIZE", (160, 120))
 
 
-@pytest.mark.usefixtures("short")
-def test_the_game_in_a_process_of_its_own_is_measured_by_its_names():
-    figures = {**bench_scr.ticks(0.0001), **bench_scr.resets(), **bench_scr.pictures()}
-    assert list(figures) == ["scr_ticks_per_s", "scr_reset_ms", "game_frames_per_s"]
-    assert min(figures.values()) > 0.0
+GAME = [
+    "torcs_limit_ticks_per_s", "torcs_cpp_ticks_per_s", "torcs_env_ticks_per_s",
+    "torcs_env_repeat5_ticks_per_s", "torcs_reset_ms", "torcs_load_ms",
+]  # fmt: skip
 
 
 @pytest.mark.usefixtures("short")
-def test_the_game_is_measured_by_its_names():
-    figures = {**bench_torcs.ticks(0.0001), **bench_torcs.resets(), **bench_torcs.loads()}
-    assert list(figures) == [
-        "torcs_limit_ticks_per_s",
-        "torcs_cpp_ticks_per_s",
-        "torcs_env_ticks_per_s",
-        "torcs_env_repeat5_ticks_per_s",
-        "torcs_reset_ms",
-        "torcs_load_ms",
-    ]
+@pytest.mark.parametrize(("measure", "names"), [
+    (lambda: {**bench_scr.ticks(0.0001), **bench_scr.resets(), **bench_scr.pictures()},
+     ["scr_ticks_per_s", "scr_reset_ms", "game_frames_per_s"]),
+    (lambda: {**bench_torcs.ticks(0.0001), **bench_torcs.resets(), **bench_torcs.loads()}, GAME),
+    (lambda: vec_env(0.0001), ["vec_env_timesteps_per_s", "vec_env_two_threads_ratio"]),
+], ids=["its own process", "this process", "races at once"])  # fmt: skip
+def test_the_game_is_measured_by_its_names(monkeypatch, measure, names):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0, 1})
+    figures = measure()
+    assert list(figures) == names
     assert min(figures.values()) > 0.0
     assert set(figures) < set(KEYS)
 
@@ -85,15 +84,6 @@ def test_the_game_is_measured_by_its_names():
 def test_the_second_thread_is_measured_against_a_second_process(monkeypatch):
     monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0, 1})
     assert bench_torcs.vector(0.0001)["torcs_vector2_ratio"] > 0.0
-
-
-@pytest.mark.usefixtures("game")
-def test_races_at_once_are_measured_by_their_names(monkeypatch):
-    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0, 1})
-    figures = vec_env(0.0001)
-    assert list(figures) == ["vec_env_timesteps_per_s", "vec_env_two_threads_ratio"]
-    assert min(figures.values()) > 0.0
-    assert set(figures) < set(KEYS)
 
 
 @pytest.mark.usefixtures("game")

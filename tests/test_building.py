@@ -51,15 +51,8 @@ def test_the_remedy_names_a_checkout_where_none_is_known(monkeypatch, record):
 
 def build(folder, **environment):
     """Build the extensions as an installation does, somewhere else."""
-    command = [
-        sys.executable,
-        "setup.py",
-        "build_ext",
-        "--build-lib",
-        folder,
-        "--build-temp",
-        folder,
-    ]
+    folders = ["--build-lib", folder, "--build-temp", folder]
+    command = [sys.executable, "setup.py", "build_ext", *folders]
     settings = {**os.environ, "CC": "/bin/false", "CXX": "/bin/false", **environment}
     return subprocess.run(command, cwd=ROOT, env=settings, capture_output=True, text=True)
 

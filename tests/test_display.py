@@ -31,21 +31,20 @@ class TestTheUsersDisplay:
             monkeypatch.setenv("DISPLAY", f"{display.name}.0")
             assert find_display("do without one") == f"{display.name}.0"
 
-    def test_none_is_an_error_that_says_what_else_to_do(self, monkeypatch):
-        monkeypatch.delenv("DISPLAY", raising=False)
-        with pytest.raises(DisplayUnavailable, match=r"DISPLAY is not set.*do without one"):
-            find_display("do without one")
-
-    @pytest.mark.parametrize("name", [":2999", "unix:2999", "localhost:2999"])
-    def test_one_that_does_not_answer_is_an_error(self, monkeypatch, name):
-        monkeypatch.setenv("DISPLAY", name)
-        told = rf"no X server answers at .*{name}.*do without one"
-        with pytest.raises(DisplayUnavailable, match=told):
-            find_display("do without one")
-
-    def test_what_is_no_name_is_an_error(self, monkeypatch):
-        monkeypatch.setenv("DISPLAY", "the big one")
-        with pytest.raises(DisplayUnavailable, match="expected a name such as :0"):
+    @pytest.mark.parametrize(
+        ("name", "message"),
+        [
+            ("", "DISPLAY is not set.*do without one"),
+            *[(name, rf"no X server answers at .*{name}.*do without one")
+              for name in (":2999", "unix:2999", "localhost:2999")],
+            ("the big one", "expected a name such as :0"),
+        ],
+    )  # fmt: skip
+    def test_none_is_an_error_that_says_what_else_to_do(self, monkeypatch, name, message):
+        monkeypatch.setenv("DISPLAY", name) if name else monkeypatch.delenv(
+            "DISPLAY", raising=False
+        )
+        with pytest.raises(DisplayUnavailable, match=message):
             find_display("do without one")
 
 
@@ -105,12 +104,14 @@ class TestTheVirtualDisplay:
             VirtualDisplay(SIZE)
         assert isinstance(caught.value, BackendUnavailable)
 
-    def test_a_program_that_fails_is_quoted(self, monkeypatch, tmp_path):
-        monkeypatch.setenv("PATH", program(tmp_path, "echo 'no memory' >&2; exit 1"))
-        with pytest.raises(DisplayUnavailable, match="does not start; it said: no memory"):
-            VirtualDisplay(SIZE)
-
-    def test_a_program_that_does_not_answer_is_an_error(self, monkeypatch, tmp_path):
-        monkeypatch.setenv("PATH", program(tmp_path, 'echo 2999 >/dev/fd/"$2"; exec sleep 60'))
-        with pytest.raises(DisplayUnavailable, match="does not answer"):
+    @pytest.mark.parametrize(
+        ("script", "message"),
+        [
+            ("echo 'no memory' >&2; exit 1", "does not start; it said: no memory"),
+            ('echo 2999 >/dev/fd/"$2"; exec sleep 60', "does not answer"),
+        ],
+    )
+    def test_a_program_that_fails_is_an_error(self, monkeypatch, tmp_path, script, message):
+        monkeypatch.setenv("PATH", program(tmp_path, script))
+        with pytest.raises(DisplayUnavailable, match=message):
             VirtualDisplay(SIZE)

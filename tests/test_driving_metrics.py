@@ -94,19 +94,11 @@ def test_an_episode_is_logged_with_distance_laps_and_how_it_ended(oval):
     """Without these nobody sees from TensorBoard why a car does not come round."""
     off = {"distance_from_axis": 6.0, "distance_raced": 70.0, "laps": 1, "best_lap_time": 42.0}
     values = logged(scripted_model(oval, {}, off), [STILL, STILL])
-    assert values["driving/distance"] == 70.0
-    assert values["driving/laps"] == 1.0
+    assert (values["driving/distance"], values["driving/laps"]) == (70.0, 1.0)
+    assert not [key for key in values if "lap_time" in key]
     ends = {key: value for key, value in values.items() if key.startswith("driving/end_")}
-    assert ends == {
-        "driving/end_off_track": 1.0,
-        "driving/end_backwards": 0.0,
-        "driving/end_stuck": 0.0,
-        "driving/end_damage": 0.0,
-        "driving/end_lost": 0.0,
-        "driving/end_laps": 0.0,
-        "driving/end_race": 0.0,
-        "driving/end_time_limit": 0.0,
-    }
+    others = ("backwards", "stuck", "damage", "lost", "laps", "race", "time_limit")
+    assert ends == {"driving/end_off_track": 1.0, **{f"driving/end_{name}": 0.0 for name in others}}
 
 
 def test_shares_of_ends_are_means_over_the_episodes_of_all_environments(oval):
@@ -131,9 +123,7 @@ def test_each_term_of_the_reward_is_summed_over_an_episode(oval):
     values = logged(model, [STILL] * 4, metrics)
     # Episodes of two timesteps and of one, of 0.1 s each; the third one has not ended yet.
     assert values["reward/crash"] == -8.0
-    assert values["reward/speed_along"] == pytest.approx(
-        1.5, rel=1e-12
-    )  # 0.1 s is a rounded number
+    assert values["reward/speed_along"] == pytest.approx(1.5, rel=1e-12)  # 0.1 is rounded
     assert sum(key.startswith("reward/") for key in values) == 2
 
 
@@ -163,20 +153,15 @@ def test_lap_times_are_averaged_and_the_best_is_kept(oval):
     assert metrics.best_lap_time == 40.0
 
 
-def test_no_lap_time_is_logged_before_there_is_a_lap(oval):
-    values = logged(scripted_model(oval, {"distance_from_axis": 6.0}), [STILL])
-    assert not [key for key in values if "lap_time" in key]
-
-
 def test_speed_braking_and_saturation_are_means_over_timesteps(oval):
     states = [{"speed_x": 10.0}, {"speed_x": 20.0}, {"speed_x": 30.0, "distance_from_axis": 6.0}]
     actions = np.array([[1.0, 0.5, 0.06], [-0.985, 0.995, 0.04], [0.9, 0.5, 0.0]], np.float32)
     values = logged(scripted_model(oval, *states), actions)
-    assert values["driving/speed"] == 20.0
-    assert values["driving/brake_share"] == 1 / 3
-    assert values["driving/saturation_steering"] == 2 / 3
-    assert values["driving/saturation_throttle"] == 1 / 3
-    assert values["driving/saturation_brake"] == 1 / 3
+    saturation = [
+        values[f"driving/saturation_{name}"] for name in ("steering", "throttle", "brake")
+    ]
+    assert (values["driving/speed"], values["driving/brake_share"]) == (20.0, 1 / 3)
+    assert saturation == [2 / 3, 1 / 3, 1 / 3]
 
 
 def test_means_over_timesteps_start_anew_with_each_row_of_the_logger(oval):
@@ -370,12 +355,9 @@ def test_monitor_writes_each_episode_into_its_file(tmp_path, oval):
     env.close()
     (row,) = monitor_rows(tmp_path / "0.monitor.csv")
     assert {name: row[name] for name in MONITOR_KWARGS["info_keywords"]} == {
-        "laps": "1",
-        "best_lap_time": "42.0",
-        "distance": "70.0",
-        "damage": "0.0",
+        "laps": "1", "best_lap_time": "42.0", "distance": "70.0", "damage": "0.0",
         "end": "off_track",
-    }
+    }  # fmt: skip
 
 
 def test_monitor_writes_an_episode_that_the_time_limit_cut(tmp_path):
@@ -398,12 +380,9 @@ def monitor_rows(path):
 
 
 def test_an_environment_that_is_no_racing_one_is_refused():
+    for name in ("q_every", "q_size", "line_timesteps"):
+        with pytest.raises(InvalidOption, match=f"{name} is 0"):
+            DrivingMetricsCallback(**{name: 0})
     model = DDPG("MlpPolicy", "Pendulum-v1", **small())
     with pytest.raises(InvalidOption, match=r"shape \(1,\).*TorcsLite-v0"):
         model.learn(10, callback=DrivingMetricsCallback())
-
-
-@pytest.mark.parametrize("name", ["q_every", "q_size", "line_timesteps"])
-def test_an_interval_below_one_is_refused(name):
-    with pytest.raises(InvalidOption, match=f"{name} is 0"):
-        DrivingMetricsCallback(**{name: 0})

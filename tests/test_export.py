@@ -19,7 +19,6 @@ from sb3_torcs.agents.models import ModelDriver
 from sb3_torcs.errors import ModelMismatch, OutputNotWritable, PackageMissing
 from sb3_torcs.noise import SetPointNoise, bind
 from sb3_torcs.policies import export
-from sb3_torcs.policies import split_head as policies
 from sb3_torcs.policies.export import export_actor
 
 OBSERVATIONS = np.random.default_rng(0).uniform(-1, 1, (200, 29)).astype(np.float32)
@@ -53,15 +52,21 @@ def run(file, observations):
     return actions
 
 
+def assert_equal(model, folder, atol=ROUNDING):
+    """An export drives what the model drives, for any number of rows."""
+    file = export_actor(model, folder / "driver.onnx")
+    for seen in (OBSERVATIONS, OBSERVATIONS[:1]):
+        expected, _ = model.predict(seen, deterministic=True)
+        np.testing.assert_allclose(run(file, seen), expected, rtol=0.0, atol=atol)
+    return file
+
+
 @pytest.mark.parametrize("symmetric", [False, True])
 @pytest.mark.parametrize("algorithm", [DDPG, TD3])
 def test_the_export_is_the_driver(tmp_path, algorithm, symmetric):
-    """Averaged and mirrored, in environment units; for any number of rows."""
+    """Averaged and mirrored, in environment units."""
     model = split_heads(algorithm, layer_norm=True, ema_decay=0.9, symmetric=symmetric)
-    file = export_actor(model, tmp_path / "driver.onnx")
-    for observations in (OBSERVATIONS, OBSERVATIONS[:1]):
-        expected, _ = model.predict(observations, deterministic=True)
-        np.testing.assert_allclose(run(file, observations), expected, rtol=0.0, atol=ROUNDING)
+    file = assert_equal(model, tmp_path)
     learner = model.policy.actor(th.as_tensor(OBSERVATIONS)).detach().numpy()
     assert np.abs(learner - run(file, OBSERVATIONS)).max() > 0.01
 
@@ -72,26 +77,15 @@ def test_a_bounded_policy_is_exported(tmp_path, symmetric):
     model = PPO("BoundedPolicy", race(), policy_kwargs=kwargs, device="cpu", seed=0)
     with th.no_grad():
         model.policy.action_net.linear.weight *= 100.0
-    file = export_actor(model, tmp_path / "driver.onnx")
-    for observations in (OBSERVATIONS, OBSERVATIONS[:1]):
-        expected, _ = model.predict(observations, deterministic=True)
-        np.testing.assert_allclose(run(file, observations), expected, rtol=0.0, atol=ROUNDING)
+    assert_equal(model, tmp_path)
 
 
-@pytest.mark.parametrize("algo", ["ars", "crossq", "ppo", "sac", "td3"])
+@pytest.mark.parametrize("algo", ["ars", "crossq", "ppo", "sac", "td3", "sde"])
 def test_stock_policies_are_exported(tmp_path, algo):
-    """One algorithm of each kind of policy."""
-    model = ALGOS[algo]("MlpPolicy", race(), device="cpu", seed=0)
-    file = export_actor(model, tmp_path / "driver.onnx")
-    expected, _ = model.predict(OBSERVATIONS, deterministic=True)
-    np.testing.assert_allclose(run(file, OBSERVATIONS), expected, rtol=0.0, atol=SINGLE)
-
-
-def test_state_dependent_exploration_is_left_out(tmp_path):
-    model = SAC("MlpPolicy", race(), use_sde=True, buffer_size=1, device="cpu", seed=0)
-    file = export_actor(model, tmp_path / "driver.onnx")
-    expected, _ = model.predict(OBSERVATIONS, deterministic=True)
-    np.testing.assert_allclose(run(file, OBSERVATIONS), expected, rtol=0.0, atol=SINGLE)
+    """One algorithm of each kind of policy, and one without its exploration that sees the state."""
+    own = {"use_sde": True, "buffer_size": 1} if algo == "sde" else {}
+    kind = SAC if algo == "sde" else ALGOS[algo]
+    assert_equal(kind("MlpPolicy", race(), device="cpu", seed=0, **own), tmp_path, SINGLE)
 
 
 def test_the_statistics_of_the_observations_are_in_the_graph(tmp_path):
@@ -109,9 +103,7 @@ def test_the_statistics_of_the_observations_are_in_the_graph(tmp_path):
 def test_statistics_that_are_not_used_are_not_in_the_graph(tmp_path):
     """Those of rewards alone."""
     model = split_heads(env=VecNormalize(race(), norm_obs=False))
-    file = export_actor(model, tmp_path / "driver.onnx")
-    expected, _ = model.predict(OBSERVATIONS, deterministic=True)
-    np.testing.assert_allclose(run(file, OBSERVATIONS), expected, rtol=0.0, atol=ROUNDING)
+    assert_equal(model, tmp_path)
 
 
 def test_a_driver_is_exported_beside_a_noise_that_listens(tmp_path):
@@ -119,9 +111,7 @@ def test_a_driver_is_exported_beside_a_noise_that_listens(tmp_path):
     model = DDPG("MlpPolicy", race(), buffer_size=1, device="cpu", seed=0)
     model.action_noise = SetPointNoise()
     bind(model)
-    expected, _ = model.predict(OBSERVATIONS, deterministic=True)
-    file = export_actor(model, tmp_path / "driver.onnx")
-    np.testing.assert_allclose(run(file, OBSERVATIONS), expected, rtol=0.0, atol=SINGLE)
+    assert_equal(model, tmp_path, SINGLE)
 
 
 def test_an_export_changes_nothing_in_the_process(tmp_path):
@@ -146,10 +136,6 @@ def test_an_export_needs_nothing_but_a_runtime(tmp_path):
     call = [sys.executable, "-c", code, str(tmp_path / "driver.onnx")]
     output = subprocess.run(call, check=True, capture_output=True, text=True)
     assert output.stdout == "(1, 3)\n"
-
-
-def test_the_name_of_before_still_exports():
-    assert policies.export_actor is export_actor
 
 
 def test_a_file_that_cannot_be_written_is_told(tmp_path):

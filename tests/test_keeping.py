@@ -100,32 +100,24 @@ def test_what_is_not_whole_never_comes_to_its_place(tmp_path):
 # What a run saves
 
 
-def training_of(tmp_path, algo="ddpg", **changes):
-    """A training that has not begun, and what saves it."""
-    entry = {**ENTRY, "n_timesteps": 12, **changes}
-    recipe = Recipe(algo, "TorcsLite-v0", entry, 0, 5, ())
-    folder = tmp_path / "TorcsLite-v0_1"
-    folder.mkdir()
-    training = Training(recipe, exact=False)
-    return training, Keeper(training, folder)
-
-
-def kept(keeper):
-    return models.saved_timesteps(keeper.files.folder / "TorcsLite-v0.zip")
-
-
 PPO = {
     "n_timesteps": 8, "policy": "MlpPolicy", "n_steps": 4, "batch_size": 4,
     "policy_kwargs": {"net_arch": [4]},
 }  # fmt: skip
 
 
-def ppo(tmp_path, **changes):
-    recipe = Recipe("ppo", "TorcsLite-v0", {**PPO, **changes}, 0, 4, ())
+def training_of(tmp_path, algo="ddpg", **changes):
+    """A training that has not begun, and what saves it."""
+    entry = {**PPO, **changes} if algo == "ppo" else {**ENTRY, "n_timesteps": 12, **changes}
     folder = tmp_path / "TorcsLite-v0_1"
     folder.mkdir()
-    training = Training(recipe, exact=False)
+    interval = 4 if algo == "ppo" else 5
+    training = Training(Recipe(algo, "TorcsLite-v0", entry, 0, interval, ()), exact=False)
     return training, Keeper(training, folder)
+
+
+def kept(keeper):
+    return models.saved_timesteps(keeper.files.folder / "TorcsLite-v0.zip")
 
 
 class EachStep(BaseCallback):
@@ -163,7 +155,7 @@ def test_a_signal_whose_exception_was_lost_ends_the_training_with_the_next_times
 
 
 def test_a_rollout_that_was_not_learned_from_does_not_count(tmp_path):
-    training, keeper = ppo(tmp_path)
+    training, keeper = training_of(tmp_path, "ppo")
     counted = []
     training.callbacks.append(EachStep(lambda: counted.append(keeper.keep() or kept(keeper))))
     keeper.learn([])
@@ -172,7 +164,7 @@ def test_a_rollout_that_was_not_learned_from_does_not_count(tmp_path):
 
 
 def test_statistics_are_kept_where_the_zoo_looks_for_them(tmp_path):
-    _, keeper = ppo(tmp_path, normalize=True)
+    _, keeper = training_of(tmp_path, "ppo", normalize=True)
     keeper.learn([])
     file = keeper.files.folder / "TorcsLite-v0" / STATISTICS
     assert pickle.loads(file.read_bytes()).obs_rms.count == pytest.approx(9.0001)

@@ -76,10 +76,16 @@ def python(code, folder, *words):
     return ended.returncode, ended.stdout, ended.stderr
 
 
+def ended_well(code, folder):
+    """Run code; return what it printed."""
+    status, out, err = python(code, folder)
+    assert status == 0, err
+    return out
+
+
 def loaded(code, folder):
     """The top names of the modules that code loads."""
-    status, out, err = python(f"{code}\nimport sys\nprint(*sys.modules, sep='\\n')", folder)
-    assert status == 0, err
+    out = ended_well(f"{code}\nimport sys\nprint(*sys.modules, sep='\\n')", folder)
     return {name.partition(".")[0] for name in out.splitlines()}
 
 
@@ -138,8 +144,7 @@ def test_the_core_does_without_the_extras(tmp_path, game):
         "              ['evaluate', 'ppo-aalborg', '--laps', '1', '--line', 'line.png']):",
         "    assert main(words) == 0, words",
     ]
-    status, out, err = python("\n".join(lines), tmp_path)
-    assert status == 0, err
+    out = ended_well("\n".join(lines), tmp_path)
     assert list((tmp_path / "board").rglob("events*"))
     assert out.count("TorcsLite-v0, aalborg") == 1
     assert out.count("Torcs-v0, aalborg") == 1
@@ -273,27 +278,13 @@ def test_each_extra_has_somebody_who_needs_it():
 # without POSIX
 
 
-def test_every_module_imports_where_there_is_no_posix(tmp_path):
-    """The compiled ones are not in a wheel without the engine."""
-    code = (
-        AS_ON_WINDOWS
-        + """
+IMPORT_ALL = """
 import importlib, pkgutil, sb3_torcs
 for module in pkgutil.walk_packages(sb3_torcs.__path__, "sb3_torcs."):
     if not module.name.rpartition(".")[2].startswith("_"):
         importlib.import_module(module.name)
 """
-    )
-    status, _, err = python(code, tmp_path)
-    assert status == 0, err
-
-
-@pytest.mark.slow
-def test_torcslite_is_driven_learned_and_reported_where_there_is_no_posix(tmp_path):
-    code = (
-        AS_ON_WINDOWS
-        + TRAINING
-        + """
+VERBS = """
 from sb3_torcs.cli import main
 words = ["evaluate", "model.zip", "--laps", "1", "--telemetry", "a.csv", "--line", "a.png"]
 assert main(words) == 0
@@ -303,9 +294,17 @@ assert main(["tracks"]) == 0
 assert main(["doctor"]) == 1
 assert main(["install-torcs", "--check"]) in (0, 1)
 """
-    )
-    status, out, err = python(code, tmp_path)
-    assert status == 0, err
+MAIN = "from sb3_torcs.cli import main\nsys.exit(main(sys.argv[1:]))\n"
+
+
+def test_every_module_imports_where_there_is_no_posix(tmp_path):
+    """The compiled ones are not in a wheel without the engine."""
+    ended_well(AS_ON_WINDOWS + IMPORT_ALL, tmp_path)
+
+
+@pytest.mark.slow
+def test_torcslite_is_driven_learned_and_reported_where_there_is_no_posix(tmp_path):
+    out = ended_well(AS_ON_WINDOWS + TRAINING + VERBS, tmp_path)
     assert "ok       TorcsLite-v0 " in out
     written = {path.name for path in tmp_path.iterdir()}
     assert {"a.csv", "a.html", "a.png", "board", "model.zip"} <= written
@@ -313,16 +312,9 @@ assert main(["install-torcs", "--check"]) in (0, 1)
 
 @pytest.mark.slow
 def test_a_training_runs_where_there_is_no_posix(tmp_path):
-    words = ["train", "--algo", "ppo", "--env", "TorcsLite-v0", "--timesteps", "256"]
-    words += ["--eval-freq", "0", "--no-progress", "--hyperparams", "n_steps=32"]
-    code = (
-        AS_ON_WINDOWS
-        + f"""
-from sb3_torcs.cli import main
-sys.exit(main({words}))
-"""
-    )
-    status, out, err = python(code, tmp_path)
+    words = "train --algo ppo --env TorcsLite-v0 --timesteps 256 --eval-freq 0 --no-progress"
+    words = [*words.split(), "--hyperparams", "n_steps=32"]
+    status, out, err = python(AS_ON_WINDOWS + MAIN, tmp_path, *words)
     assert status == 0, err
     assert "learned from" in out
 
@@ -330,13 +322,7 @@ sys.exit(main({words}))
 @pytest.mark.rare
 def test_an_agent_competes_over_the_network_where_there_is_no_posix(tmp_path):
     """A server that is not there ends it with a line."""
-    code = (
-        AS_ON_WINDOWS
-        + """
-from sb3_torcs.cli import main
-sys.exit(main(["compete", "ppo-aalborg", "--port", "2", "--json"]))
-"""
-    )
-    status, _, err = python(code, tmp_path)
+    words = ["compete", "ppo-aalborg", "--port", "2", "--json"]
+    status, _, err = python(AS_ON_WINDOWS + MAIN, tmp_path, *words)
     assert status == 2, err
     assert "SCR server" in err.splitlines()[-1]

@@ -267,16 +267,13 @@ def test_parameters_come_as_a_list_or_as_a_mapping():
 
 
 @pytest.mark.parametrize(
-    "bad", [[1, 2], {"mu": 1, "theta": 2, "sgma": 3}, [0, -1, 0], [0, 1, -1], "abc", [0, 1, "x"]]
-)
-def test_parameters_that_are_none_are_refused(bad):
-    """The message shows what was received and an example of what is allowed."""
-    with pytest.raises(InvalidOption, match=r"\[mu, theta, sigma\]"):
-        OUNoise(steering=bad)
-
-
-@pytest.mark.parametrize("dt", [0.0, -1.0, np.inf, np.nan])
-def test_a_time_step_that_is_none_is_refused(dt):
-    """A step of zero would freeze the process."""
-    with pytest.raises(InvalidOption, match="dt="):
-        OUNoise(dt=dt)
+    ("wrong", "message"),
+    [
+        *[({"steering": steering}, r"\[mu, theta, sigma\]") for steering in
+          ([1, 2], {"mu": 1, "theta": 2, "sgma": 3}, [0, -1, 0], [0, 1, -1], "abc", [0, 1, "x"])],
+        *[({"dt": dt}, "dt=") for dt in (0.0, -1.0, np.inf, np.nan)],
+    ],
+)  # fmt: skip
+def test_wrong_parameters_are_refused(wrong, message):
+    with pytest.raises(InvalidOption, match=message):
+        OUNoise(**wrong)

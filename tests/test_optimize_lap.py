@@ -96,13 +96,6 @@ def test_a_ghost_drives_again_to_the_bit(ghost):
     assert cars_of(ghost) == cars_of(ghost)
 
 
-def test_an_evaluation_of_a_ghost_gives_its_lap_times(ghost):
-    env = ghost.make_env()
-    (race,) = evaluate(env, GhostDriver(ghost))
-    env.close()
-    assert (race.end, race.damage, tuple(race.lap_times)) == ("laps", 0.0, ghost.lap_times)
-
-
 def test_a_search_begins_with_the_fastest_driver_or_with_the_agent_alone(starts):
     assert [start.seconds for start in starts] == sorted(start.seconds for start in starts)
     assert "inferno:3" in [start.driver for start in starts]
@@ -246,6 +239,8 @@ def test_what_is_no_ghost_is_refused(tmp_path, kind):
     broken(kind, path)
     with pytest.raises(ModelMismatch, match=r"is not a ghost \(.+\); give one that"):
         read_ghost(path)
+    with pytest.raises(InvalidOption, match="there is no ghost"):
+        driver_record(tmp_path / "none.npz")
 
 
 def test_damaged_ghosts_are_refused(file, tmp_path):
@@ -272,11 +267,6 @@ def test_a_full_disk_is_said_and_leaves_the_previous_ghost(ghost, file, monkeypa
         ghost.write(file)
     assert file.read_bytes() == before
     assert list(file.parent.iterdir()) == [file]
-
-
-def test_a_ghost_that_is_not_there_is_said(tmp_path):
-    with pytest.raises(InvalidOption, match="there is no ghost"):
-        driver_record(tmp_path / "x.npz")
 
 
 def test_a_ghost_is_a_driver_like_others(file):
@@ -371,14 +361,13 @@ def test_the_command_writes_a_ghost_that_evaluate_drives(tiny, ghost, tmp_path, 
     path = tmp_path / "lap.npz"
     assert main(words(path, "--rollouts", str(ONE_RACE), "--json")) == 0
     said = json.loads(capsys.readouterr().out)
-    assert list(said) == [
-        "track", "car", "agent", "standing_lap", "flying_lap", "rollouts", "seconds", "ghost",
-    ]  # fmt: skip
-    assert (said["standing_lap"], said["flying_lap"]) == (
-        ghost.lap_times[0], min(ghost.lap_times[1:]),
-    )  # fmt: skip
+    keys = "track car agent standing_lap flying_lap rollouts seconds ghost"
+    assert list(said) == keys.split()
+    laps = said["standing_lap"], said["flying_lap"]
+    assert laps == (ghost.lap_times[0], min(ghost.lap_times[1:]))
     assert main(["evaluate", str(path), "--json"]) == 0
     (race,) = json.loads(capsys.readouterr().out)["episodes"]
+    assert (race["end"], race["damage"]) == ("laps", 0.0)
     assert race["lap_times"] == list(ghost.lap_times)
 
 

@@ -44,20 +44,19 @@ def study(tmp_path):
     """Two seeds that complete, one of them elsewhere too, and one that never laps."""
     rows = []
     for seed in (0, 1):
-        rows += [
-            row(seed, laps=()),
-            row(seed, timesteps=200, laps=LAPS[:2]),
-            row(seed, timesteps=300),
-        ]
+        rows += [row(seed, laps=()), row(seed, timesteps=200, laps=LAPS[:2])]
+        rows += [row(seed, timesteps=300)]
         rows += [row(seed, "final", 300, ladder=("finishes", "beats bt")[seed])]
         rows += [row(seed, "final", 300, "alpine-1", laps=LAPS if seed else ())]
-    rows += [
-        row(2, laps=(), kept=1),
-        row(2, timesteps=200, laps=()),
-        row(2, timesteps=300, laps=()),
-    ]
+    rows += [row(2, laps=(), kept=1)]
+    rows += [row(2, timesteps=timesteps, laps=()) for timesteps in (200, 300)]
     rows += [row(2, "final", 100, laps=()), row(2, "final", 100, "alpine-1", laps=())]
     return written(tmp_path / "study", rows)
+
+
+def complaint(folder, capsys, *words):
+    assert main(["study", "--report", str(folder), *words]) == 2
+    return capsys.readouterr().err
 
 
 def lines_of(report, start):
@@ -143,14 +142,12 @@ def test_the_track_that_chose_the_models_is_named(tmp_path):
     report = write_report(written(tmp_path / "study", rows[:2]), tmp_path / "out")
     assert lines_of(report, "## ")[:2] == ["## Summary, on aalborg", "## Every seed, on aalborg"]
     report = write_report(written(tmp_path / "study", rows), tmp_path / "out")
-    assert lines_of(report, "## Sum") == [
-        "## Summary, each on the first track that chose its model"
-    ]
+    (said,) = lines_of(report, "## Sum")
+    assert said == "## Summary, each on the first track that chose its model"
     rows = [row(0), row(0, track="forza"), row(0, "final")]
     report = write_report(written(tmp_path / "study", rows), tmp_path / "out")
-    assert lines_of(report, "## Sum") == [
-        "## Summary, on aalborg, the first of those that chose the models"
-    ]
+    (said,) = lines_of(report, "## Sum")
+    assert said == "## Summary, on aalborg, the first of those that chose the models"
 
 
 def test_a_name_is_no_table(tmp_path):
@@ -167,28 +164,23 @@ def test_a_name_is_no_table(tmp_path):
     ],
 )  # fmt: skip
 def test_rows_that_say_nothing_are_told(tmp_path, capsys, change):
-    assert (
-        main(["study", "--report", str(written(tmp_path / "study", [{**row(0), **change}]))]) == 2
-    )
-    assert "results.csv cannot be read as results (ValueError" in capsys.readouterr().err
+    said = complaint(written(tmp_path / "study", [{**row(0), **change}]), capsys)
+    assert "results.csv cannot be read as results (ValueError" in said
 
 
 @pytest.mark.parametrize("text", ["garbage,1\n", "a,b\n1,2\n", "{}\nbase,0\n", "\xff"])
 def test_a_table_that_is_damaged_is_told(tmp_path, capsys, text):
     heading = ",".join(FIELDS)
     (tmp_path / "results.csv").write_bytes(text.format(heading).encode("latin-1"))
-    assert main(["study", "--report", str(tmp_path)]) == 2
-    assert "results.csv cannot be read as results (" in capsys.readouterr().err
+    assert "results.csv cannot be read as results (" in complaint(tmp_path, capsys)
 
 
 def test_what_is_no_study_is_told(tmp_path, capsys):
-    assert main(["study", "--report", str(tmp_path)]) == 2
-    assert "holds no results.csv; give the folder of a study" in capsys.readouterr().err
+    assert "holds no results.csv; give the folder" in complaint(tmp_path, capsys)
     (tmp_path / "folder" / "results.csv").mkdir(parents=True)
-    assert main(["study", "--report", str(tmp_path / "folder")]) == 2
-    assert "cannot be read as results (IsADirectoryError" in capsys.readouterr().err
-    assert main(["study", "--report", str(written(tmp_path / "empty", []))]) == 2
-    assert "no agent was evaluated yet" in capsys.readouterr().err
+    assert "(IsADirectoryError" in complaint(tmp_path / "folder", capsys)
+    said = complaint(written(tmp_path / "empty", []), capsys)
+    assert "no agent was evaluated yet" in said
 
 
 @pytest.mark.parametrize("taken", ["out", "out/report.md"])
@@ -197,8 +189,8 @@ def test_a_report_that_cannot_be_written_is_told(study, tmp_path, capsys, taken)
         (tmp_path / "out").touch()
     else:
         (tmp_path / taken).mkdir(parents=True)
-    assert main(["study", "--report", str(study), "--output", str(tmp_path / "out")]) == 2
-    assert f"cannot write '{tmp_path}/out/" in capsys.readouterr().err
+    said = complaint(study, capsys, "--output", str(tmp_path / "out"))
+    assert f"cannot write '{tmp_path}/out/" in said
 
 
 def test_the_page_shows_every_seed_and_sorts_its_tables(study, tmp_path):

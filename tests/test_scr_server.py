@@ -445,9 +445,8 @@ class TestStarts:
     def test_by_turns(self, serve):
         _, client = serve()
         grid = client.begin()
-        places = []
-        for start in ("(start 700 0 0 20)", "", "(start 700 0 0 20)"):
-            places.append(client.restart(start))
+        starts = ("(start 700 0 0 20)", "", "(start 700 0 0 20)")
+        places = [client.restart(start) for start in starts]
         assert places[0] == places[2]
         assert places[1] == grid
         assert number(places[0], "distFromStart") == pytest.approx(700, abs=0.1)

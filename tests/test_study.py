@@ -138,18 +138,13 @@ def test_an_agent_that_diverges_is_measured_by_its_best_model_of_before(tmp_path
     store, trial = poisoned(tmp_path, at=500)
     assert store.ended(trial)
     rows = results(tmp_path / "out")
-    assert [(row["phase"], row["decisions"]) for row in rows[:2]] == [
-        ("train", "240"),
-        ("train", "480"),
-    ]
-    assert [row["phase"] for row in rows[2:]] == ["final"] * 2
+    assert [row["decisions"] for row in rows[:2]] == ["240", "480"]
+    assert [row["phase"] for row in rows] == ["train"] * 2 + ["final"] * 2
     assert store.diverged(trial).startswith("the training has diverged: after ")
     assert store.checkpoint(trial) is None
     write_report(tmp_path / "out", tmp_path / "report")
-    assert (
-        "poisoned-seed0: the training has diverged: after "
-        in (tmp_path / "report" / "report.md").read_text()
-    )
+    report = (tmp_path / "report" / "report.md").read_text()
+    assert "poisoned-seed0: the training has diverged: after " in report
 
 
 def test_an_agent_that_diverges_before_its_first_evaluation_counts_as_one_without_a_lap(tmp_path):
@@ -226,57 +221,45 @@ def test_a_full_disk_is_told_and_leaves_everything_as_it_was(begun, tmp_path, mo
     assert store.rows(study.trials[0]) == before
     assert (store.checkpoint(study.trials[0]) / "state.json").read_bytes() == b"1"
     assert main(["study", str(study.path), "--folder", str(store.path.parent / "new")]) == 2
-    assert (
-        "make room, or give another folder, and type the command again" in capsys.readouterr().err
-    )
+    assert "make room, or give another folder" in capsys.readouterr().err
     assert not [file for file in tmp_path.rglob(".*") if file.name != ".lock"]
 
 
-@pytest.mark.parametrize(
-    ("name", "content"),
-    [
-        ("rows.json", b"{\xff"),
-        ("rows.json", b'{"a": 1}'),
-        ("rows.json", b"[1]"),
-        ("rows.json", b"[{}]"),
-        ("rows.json", b"[" * 200_000),
-        ("recipe.yml", b"[" * 20_000),
-        ("recipe.yml", b"{\xff"),
-        ("recipe.yml", b""),
-    ],
-)
-def test_a_damaged_folder_is_told(begun, capsys, name, content):
-    study, store = begun
-    (store.of(study.trials[0]) / name).write_bytes(content)
+def complaint(study, store, capsys):
+    """What the command says, in one line."""
     assert main(["study", str(study.path), "--folder", str(store.path)]) == 2
     err = capsys.readouterr().err
-    assert f"small-nets-seed0/{name}' cannot be read (" in err
     assert err.count("\n") == 1
+    return err
 
 
 @pytest.mark.parametrize(
-    ("field", "value"),
+    ("name", "contents"),
     [
-        ("decisions", "240"),
-        ("decisions", None),
-        ("phase", 1),
-        ("completes", "yes"),
-        ("lap_times_s", 90.0),
-        ("distance_m", [1]),
-        ("best_flying_lap_s", "fast"),
+        ("rows.json", [b"{\xff", b'{"a": 1}', b"[1]", b"[{}]", b"[" * 200_000]),
+        ("recipe.yml", [b"[" * 20_000, b"{\xff", b""]),
+    ],
+)
+def test_a_damaged_folder_is_told(begun, capsys, name, contents):
+    study, store = begun
+    for content in contents:
+        (store.of(study.trials[0]) / name).write_bytes(content)
+        said = complaint(study, store, capsys)
+        assert f"small-nets-seed0/{name}' cannot be read (" in said
+
+
+def test_a_row_with_a_wrong_value_is_told(begun, capsys):
+    study, store = begun
+    file = store.of(study.trials[0]) / "rows.json"
+    (row,) = json.loads(file.read_text())
+    for field, value in (
+        ("decisions", "240"), ("decisions", None), ("phase", 1), ("completes", "yes"),
+        ("lap_times_s", 90.0), ("distance_m", [1]), ("best_flying_lap_s", "fast"),
         ("track", {"a": 1}),
-    ],
-)
-def test_a_row_with_a_wrong_value_is_told(begun, capsys, field, value):
-    study, store = begun
-    rows = store.of(study.trials[0]) / "rows.json"
-    damaged = json.loads(rows.read_text())
-    damaged[0][field] = value
-    rows.write_text(json.dumps(damaged))
-    assert main(["study", str(study.path), "--folder", str(store.path)]) == 2
-    err = capsys.readouterr().err
-    assert f"rows.json' cannot be read (row 0: {field} is {value!r}); repair it, or remove" in err
-    assert err.count("\n") == 1
+    ):  # fmt: skip
+        file.write_text(json.dumps([{**row, field: value}]))
+        said = complaint(study, store, capsys)
+        assert f"(row 0: {field} is {value!r}); repair it, or remove" in said
 
 
 @pytest.mark.parametrize("content", [b"\xff", b"a\0b", b"/" + b"x" * 5000, b"", b"/tmp"])
@@ -291,8 +274,7 @@ def test_a_damaged_record_of_temporary_files_removes_nothing(tmp_path, content):
 def test_what_was_lost_of_a_folder_is_told(begun, capsys):
     study, store = begun
     shutil.rmtree(store.checkpoint(study.trials[0]))
-    assert main(["study", str(study.path), "--folder", str(store.path)]) == 2
-    assert "small-nets-seed0' has lost its checkpoint-*; remove" in capsys.readouterr().err
+    assert "small-nets-seed0' has lost its checkpoint-*" in complaint(study, store, capsys)
 
 
 def test_a_damaged_checkpoint_is_reported(begun):
@@ -359,8 +341,7 @@ def test_a_worker_that_is_behind_is_not_needed(begun):
 def test_two_runs_do_not_share_a_folder(begun, capsys):
     study, store = begun
     with store.locked():
-        assert main(["study", str(study.path), "--folder", str(store.path)]) == 2
-    assert "another process runs the study" in capsys.readouterr().err
+        assert "another process runs the study" in complaint(study, store, capsys)
 
 
 def test_where_ray_does_not_start_it_is_said_and_nothing_else_is_removed(

@@ -110,13 +110,6 @@ def wanted():
     }
 
 
-def test_every_folder_with_modules_is_a_package():
-    folders = {path.parent for path in (ROOT / "sb3_torcs").rglob("*.py")}
-    found = {str(folder.relative_to(ROOT)).replace("/", ".") for folder in folders}
-    listed = SETUP["options"]["packages"].split()
-    assert sorted({*found, "sb3_torcs.zoo_configs"}) == listed
-
-
 def test_the_pure_wheel_is_for_every_machine_and_holds_no_library(pure_wheel):
     assert pure_wheel.name == f"sb3_torcs-{sb3_torcs.__version__}-py3-none-any.whl"
     held = {name for name in names(pure_wheel) if ".dist-info/" not in name}
