@@ -50,9 +50,7 @@ def test_it_is_small_and_has_a_card(name):
 @pytest.mark.parametrize("name", AGENTS)
 def test_the_page_of_the_agents_has_it(name):
     """One row each: what it sees, by the record of its training, and how long it learned."""
-    (row,) = re.findall(
-        rf"^\| \[`{name}`\].*$", (ROOT / "docs" / "agents.md").read_text("utf-8"), re.M
-    )
+    (row,) = re.findall(rf"^\| \[`{name}`\].*$", (ROOT / "docs/agents.md").read_text("utf-8"), re.M)
     _, _, _, sees, learned, _ = row.split("|")
     record = models.training_record(models.AGENTS / name / "best_model.zip")
     groups = [group for group in record.env_kwargs.get("sensors", ()) if group != "base"]

@@ -188,14 +188,12 @@ def test_an_actor_may_see_less_than_its_value_function(actor_sensors, names, tmp
 SCALE = {"range_finders": 3.0, "heading_error": 0.2, "bends_ahead": 0.1}
 
 
-@pytest.mark.parametrize(
-    "kwargs", [{}, {"symmetric": True, "ema_decay": 0.9, "input_scale": SCALE}]
-)
+@pytest.mark.parametrize("own", [{}, {"symmetric": True, "ema_decay": 0.9, "input_scale": SCALE}])
 @pytest.mark.parametrize("net_arch", [[8], {"pi": [6, 5], "vf": [8]}, []])
-def test_lean_updates_of_an_asymmetric_policy_learn_as_ppo_does(net_arch, kwargs):
+def test_lean_updates_of_an_asymmetric_policy_learn_as_ppo_does(net_arch, own):
     states = []
     for callback in (None, LeanUpdatesCallback()):
-        model = make_asymmetric(net_arch=net_arch, **kwargs)
+        model = make_asymmetric(net_arch=net_arch, **own)
         assert is_for(model) is (net_arch != [])
         model.learn(80, callback=callback)
         states.append(model.policy.state_dict())

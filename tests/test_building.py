@@ -41,9 +41,10 @@ def test_the_remedy_installs_from_where_the_package_came_from(monkeypatch, tmp_p
     assert build_command() == pip_installs("git+https://x.org/y.git")
 
 
-@pytest.mark.parametrize(
-    "record", [None, "", "{", {"url": "file:///is/gone", "dir_info": {}}, {"url": "file:///x.whl"}]
-)
+GONE = {"url": "file:///is/gone", "dir_info": {}}
+
+
+@pytest.mark.parametrize("record", [None, "", "{", GONE, {"url": "file:///x.whl"}])
 def test_the_remedy_names_a_checkout_where_none_is_known(monkeypatch, record):
     installed_from(monkeypatch, record)
     assert "--no-deps . (in a checkout of sb3-torcs) (it needs" in build_command()

@@ -256,11 +256,11 @@ def test_the_brake_of_the_post_brakes_in_every_tenth_timestep():
 
 
 @pytest.mark.parametrize(
-    ("n_envs", "vec_env_cls"), [(1, DummyVecEnv), (2, DummyVecEnv), (2, SubprocVecEnv)]
+    ("n_envs", "kind"), [(1, DummyVecEnv), (2, DummyVecEnv), (2, SubprocVecEnv)]
 )
-def test_reward_and_start_are_switched_and_given_back(n_envs, vec_env_cls):
+def test_reward_and_start_are_switched_and_given_back(n_envs, kind):
     """Through Monitor, in one process and in several; each environment gets back its own."""
-    model = make_model(n_envs, vec_env_cls)
+    model = make_model(n_envs, kind)
     env = model.get_env()
     env.env_method("set_reward", "ab", indices=[0])
     before = env.env_method("settings")

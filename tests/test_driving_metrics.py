@@ -65,9 +65,7 @@ def lite(n_envs=1, vec_env_cls=DummyVecEnv, **options):
 
 def scripted_model(oval, *states, n_envs=1, **options):
     """A model that trains on a script; it is never asked to learn."""
-    envs = [
-        lambda: Monitor(RacingEnv(ScriptedBackend(oval, *states), **options)) for _ in range(n_envs)
-    ]
+    envs = [lambda: Monitor(RacingEnv(ScriptedBackend(oval, *states), **options))] * n_envs
     return PPO("MlpPolicy", DummyVecEnv(envs), n_steps=8, batch_size=8, **small())
 
 
@@ -83,9 +81,7 @@ def logged(model, actions, metrics=None, **options):
     for action in actions:
         batch = np.stack([action] * env.num_envs)
         _, rewards, dones, infos = env.step(batch)
-        metrics.update_locals(
-            {"actions": batch, "rewards": rewards, "dones": dones, "infos": infos}
-        )
+        metrics.update_locals(dict(actions=batch, rewards=rewards, dones=dones, infos=infos))
         assert metrics.on_step()
     return dict(model.logger.name_to_value)
 
@@ -158,7 +154,7 @@ def test_speed_braking_and_saturation_are_means_over_timesteps(oval):
     actions = np.array([[1.0, 0.5, 0.06], [-0.985, 0.995, 0.04], [0.9, 0.5, 0.0]], np.float32)
     values = logged(scripted_model(oval, *states), actions)
     saturation = [
-        values[f"driving/saturation_{name}"] for name in ("steering", "throttle", "brake")
+        values[f"driving/saturation_{part}"] for part in ("steering", "throttle", "brake")
     ]
     assert (values["driving/speed"], values["driving/brake_share"]) == (20.0, 1 / 3)
     assert saturation == [2 / 3, 1 / 3, 1 / 3]

@@ -110,9 +110,7 @@ def test_a_careful_racer_goes_on_without_the_decay(monkeypatch, tmp_path, game):
     pytest.param("ppo-aalborg", marks=pytest.mark.rare),
     pytest.param("ppo-post", marks=pytest.mark.rare),
 ])  # fmt: skip
-def test_a_racer_goes_on_from_a_driver_that_never_saw_a_car(
-    driver, monkeypatch, capsys, tmp_path, game
-):
+def test_a_racer_goes_on_from_a_lone_driver(driver, monkeypatch, capsys, tmp_path, game):
     """
     Also from a student, whose file has no value function, more units, and a sensor that comes after
     the rivals.
@@ -191,9 +189,7 @@ def test_a_specialist_of_a_student_learns_its_value_function_anew(monkeypatch, t
 
 
 @pytest.mark.rare
-def test_a_student_that_sees_less_goes_on_learning_on_its_tracks_together(
-    monkeypatch, capsys, tmp_path, game
-):
+def test_a_student_that_sees_less_learns_on_together(monkeypatch, capsys, tmp_path, game):
     """Its teachers see the racing line, and so does its value function; it does not."""
     budget = ["--rounds=1", "--lessons=1", "--cars=1", "--folder", str(tmp_path)]
     teaching = ["--teach", "ppo-any-road", "forza", "aalborg", "--actor-sensors", "base"]
@@ -421,9 +417,7 @@ def test_one_failed_part_of_the_show_does_not_lose_the_others(demo, monkeypatch,
     assert out.splitlines() == ["models kept", "curve drawn", failed, "recorded"]
 
 
-def test_ctrl_c_during_the_training_still_shows_and_says_how_to_go_on(
-    demo, monkeypatch, capsys, tmp_path
-):
+def test_ctrl_c_shows_and_says_how_to_go_on(demo, monkeypatch, capsys, tmp_path):
     def stopped(options):
         raise KeyboardInterrupt
 

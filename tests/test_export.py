@@ -93,9 +93,7 @@ def test_the_statistics_of_the_observations_are_in_the_graph(tmp_path):
     env = VecNormalize(race(), clip_obs=0.5)
     model = split_heads(env=env)
     expected, _ = model.predict(env.normalize_obs(OBSERVATIONS), deterministic=True)
-    for number, driver in enumerate(
-        (model, ModelDriver(model, env), ModelDriver(model.policy, env))
-    ):
+    for number, driver in enumerate((model, *(ModelDriver(m, env) for m in (model, model.policy)))):
         found = run(export_actor(driver, tmp_path / f"{number}.onnx"), OBSERVATIONS)
         np.testing.assert_allclose(found, expected, rtol=0.0, atol=ROUNDING)
 

@@ -125,9 +125,7 @@ class TestMissingParts:
     def test_each_missing_file_is_named(self, tmp_path, missing):
         write_game(tmp_path)
         (tmp_path / missing).unlink()
-        with pytest.raises(
-            GameIncomplete, match=rf"incomplete, missing {tmp_path / missing}; type"
-        ):
+        with pytest.raises(GameIncomplete, match=rf"missing {tmp_path / missing}; type"):
             find_game(tmp_path)
 
     def test_all_that_is_missing_is_named_at_once(self, tmp_path):
@@ -155,9 +153,7 @@ class TestMissingParts:
         (tmp_path / "lib").rename(tmp_path / "other")
         monkeypatch.setenv("SB3_TORCS_HOME", str(tmp_path))
         assert torcs_folders() == [tmp_path / "share/games/torcs"]
-        with pytest.raises(
-            GameIncomplete, match=r"let SB3_TORCS_HOME name another folder, or unset"
-        ):
+        with pytest.raises(GameIncomplete, match=r"SB3_TORCS_HOME name another folder, or unset"):
             find_game()
 
 
@@ -180,13 +176,9 @@ class TestContents:
     def test_a_mistyped_name_is_recognised(self, fake):
         with pytest.raises(TrackNotFound, match=r"no track 'lop'; did you mean 'loop'\?"):
             find_track("lop", fake)
-        with pytest.raises(
-            UnknownCar, match=r"no car 'bigg'; did you mean 'big'\? it has big, small"
-        ):
+        with pytest.raises(UnknownCar, match=r"'bigg'; did you mean 'big'\? it has big, small"):
             fake.find_car("bigg")
-        with pytest.raises(
-            UnknownRobot, match=r"no robot 'racr'; did you mean 'racer'\? it has racer"
-        ):
+        with pytest.raises(UnknownRobot, match=r"'racr'; did you mean 'racer'\? it has racer"):
             fake.find_robot("racr", 3)
         with pytest.raises(UnknownRobot, match=r"no robot 'human'"):
             fake.find_robot("human", 3)

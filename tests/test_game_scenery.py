@@ -50,9 +50,7 @@ OTHER_SKY = ('"background.png"', '"aalborg.png"')
 @pytest.mark.parametrize("name", ["aalborg.xml", "my.xml", "MY.XML"])
 @pytest.mark.parametrize("scenery", [True, False])
 @pytest.mark.parametrize("category", ["road", "dirt", "mine", ""])
-def test_a_track_elsewhere_has_its_scenery_or_that_of_the_game(
-    game, aalborg, tmp_path, name, scenery, category
-):
+def test_a_track_elsewhere_has_some_scenery(game, aalborg, tmp_path, name, scenery, category):
     header = ('name="category"    val="road"', f'name="category" val="{category}"')
     track = changed(aalborg, tmp_path / "x" / name, header, scenery=scenery)
     found = find_scenery(game, track)

@@ -203,9 +203,7 @@ def test_a_model_that_has_diverged_does_not_replace_a_good_one(tmp_path):
 
 
 @pytest.mark.parametrize(("times", "saved"), [(1, True), (2, False)])
-def test_only_a_second_interrupt_ends_the_saving_of_what_was_learned(
-    tmp_path, capsys, monkeypatch, times, saved
-):
+def test_only_a_second_interrupt_ends_the_saving(tmp_path, capsys, monkeypatch, times, saved):
     training, keeper = training_of(tmp_path)
     keep = keeper.keep
 
@@ -265,9 +263,7 @@ def test_trainings_that_begin_at_once_get_folders_of_their_own(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_file_that_cannot_be_written_is_named_and_the_training_goes_on_from_what_is_kept(
-    capsys, tmp_path
-):
+def test_a_file_that_cannot_be_written_is_named_and_the_training_goes_on(capsys, tmp_path):
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))  # the buffer has 250 kB

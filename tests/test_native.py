@@ -402,13 +402,11 @@ class TestLaps:
         first, second = ends
         assert (first.laps, second.laps) == (1, 2)
         assert first.last_lap_time == pytest.approx(first.time - first.lap_time, abs=CLOCK)
-        assert second.time == pytest.approx(
-            first.last_lap_time + second.last_lap_time + second.lap_time, abs=CLOCK
-        )
+        both = first.last_lap_time + second.last_lap_time
+        assert second.time == pytest.approx(both + second.lap_time, abs=CLOCK)
         start = backend.reset(rng, None).distance_from_start
-        assert first.distance_raced == pytest.approx(
-            (length - start) + length + first.distance_from_start, abs=0.5
-        )
+        raced = (length - start) + length + first.distance_from_start
+        assert first.distance_raced == pytest.approx(raced, abs=0.5)
 
     @pytest.mark.parametrize("place", [0.25, 0.75])
     def test_on_the_way_the_first_crossing_starts_the_clock(self, rng, place):
@@ -419,9 +417,9 @@ class TestLaps:
         expected = (2.0 - place) * length
         assert first.distance_raced == pytest.approx(expected + first.distance_from_start, abs=0.5)
         assert first.last_lap_time < first.time - first.lap_time - 1.0
-        assert second.last_lap_time == pytest.approx(
-            second.time - second.lap_time - (first.time - first.lap_time), abs=CLOCK
-        )
+        began = first.time - first.lap_time
+        lap_time = second.time - second.lap_time - began
+        assert second.last_lap_time == pytest.approx(lap_time, abs=CLOCK)
 
     @pytest.mark.parametrize("speed", [0.0, 20.0])
     @pytest.mark.parametrize(

@@ -274,9 +274,7 @@ class TestOtherVersions:
         body = TRACK.format(build=TRACKS["zeros"])
         compiled(MODULE.format(body=body, name="track"), libraries / "modules/track/track.so")
         code = "from sb3_torcs.backends.native import check_layout\n"
-        code += (
-            "try: check_layout(find_game())\nexcept errors.LayoutMismatch as error: print(error)"
-        )
+        code += "try: check_layout(find_game())\nexcept errors.LayoutMismatch as told: print(told)"
         assert "1.3.7" in python(BEGIN + code, SB3_TORCS_HOME=str(root))
 
 

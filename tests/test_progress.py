@@ -88,9 +88,8 @@ def test_a_lap_of_an_evaluation_counts(oval):
 
     metrics = Evaluated()
     stream = io.StringIO()
-    _, progress = learned(
-        oval, {"laps": 1, "last_lap_time": 60.0}, stream=stream, callbacks=[metrics]
-    )
+    lap = {"laps": 1, "last_lap_time": 60.0}
+    _, progress = learned(oval, lap, stream=stream, callbacks=[metrics])
     assert progress.best_lap_time == 55.0
     assert "best lap 55.00 s" in stream.getvalue()
 

@@ -99,9 +99,7 @@ def test_the_camera_follows_the_best_agent_or_else_the_first_driver(agents, foll
     assert _followed(entrants, race) == followed
 
 
-def test_the_first_race_is_recorded_and_comes_out_as_if_nobody_looked(
-    monkeypatch, capsys, game, tmp_path
-):
+def test_the_first_race_is_recorded_as_if_nobody_looked(monkeypatch, capsys, game, tmp_path):
     monkeypatch.setattr(video, "FPS", 0.2)
     written = []
     monkeypatch.setattr(
@@ -124,9 +122,7 @@ def test_the_first_race_is_recorded_and_comes_out_as_if_nobody_looked(
     (KeyboardInterrupt(), "drawing the video of the first race; Ctrl-C again leaves it out"),
     (SystemExit(143), "no video, since the command was told to end"),  # by SIGTERM
 ])  # fmt: skip
-def test_ctrl_c_draws_what_is_over_and_sigterm_ends(
-    ends, said, monkeypatch, capsys, game, tmp_path
-):
+def test_ctrl_c_draws_and_sigterm_ends(ends, said, monkeypatch, capsys, game, tmp_path):
     held = protocol.run_race
 
     def run_race(*arguments, **options):
@@ -193,9 +189,7 @@ def test_the_game_draws_the_race_with_the_board(monkeypatch, capsys, game, tmp_p
         (["--view", "tv", "--video", "{}/x.mp4", "--track", "{}/own.xml"], "own.xml"),
     ],
 )
-def test_what_the_game_cannot_draw_is_refused_before_any_race(
-    words, message, monkeypatch, capsys, game, tmp_path
-):
+def test_what_cannot_be_drawn_is_refused(words, message, monkeypatch, capsys, game, tmp_path):
     monkeypatch.setattr("sb3_torcs.races.protocol.run_race", None)
     assert main(["race", "bt", *(word.format(tmp_path) for word in words)]) == 2
     assert message in capsys.readouterr().err

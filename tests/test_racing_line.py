@@ -67,9 +67,8 @@ def test_a_bend_between_straights_is_driven_outside_inside_outside():
     """And so with a larger radius than its axis has."""
     line = racing_line(square())
     bend = 10.0 * np.pi
-    before, apex, after = (
-        seen(line, d)[OFFSETS, 0] for d in (170.0, 200.0 + bend / 2, 230.0 + bend)
-    )
+    places = (170.0, 200.0 + bend / 2, 230.0 + bend)
+    before, apex, after = (seen(line, d)[OFFSETS, 0] for d in places)
     assert before < -2.0
     assert after < -2.0
     assert apex == pytest.approx(5.0 - EDGE, abs=0.1)

@@ -85,9 +85,8 @@ def test_the_command_that_continues_leaves_out_what_is_recorded(run, tmp_path):
 
 
 def test_a_given_entry_is_all_that_counts(run, tmp_path):
-    (tmp_path / "other.yml").write_text(
-        yaml.safe_dump({"TorcsLite-v0": {**ENTRY, "n_envs": 1, "n_timesteps": 30}})
-    )
+    other = {"TorcsLite-v0": {**ENTRY, "n_envs": 1, "n_timesteps": 30}}
+    (tmp_path / "other.yml").write_text(yaml.safe_dump(other))
     entry = gone_on(run, tmp_path, "--conf-file", str(tmp_path / "other.yml"))
     assert (entry["n_envs"], entry["n_timesteps"]) == (1, 30)
 

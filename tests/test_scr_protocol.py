@@ -237,9 +237,8 @@ def test_both_ends_read_the_same_action(action):
 
 
 def server_action(text):
-    throttle, brake, gear, steering, clutch, restart, focus, lap_time = _engine.scr_parse_action(
-        text
-    )
+    throttle, brake, gear, steering, clutch, *rest = _engine.scr_parse_action(text)
+    restart, focus, lap_time = rest
     return ScrAction(steering, throttle, brake, gear, clutch, focus, restart, lap_time)
 
 

@@ -189,9 +189,7 @@ class TestTexts:
         si += [-1.0] * 19
         si += [-0.25, 1.0, 2.0, 3.0, 4e-7, 0.345, *[-1.0] * 5, 0.125]
         opponents = " ".join(["200"] * 35 + ["7.5"])
-        text, exact = (
-            _engine.scr_format_state(si, exact=exact).decode() for exact in (False, True)
-        )
+        text, exact = (_engine.scr_format_state(si, exact=full).decode() for full in (False, True))
         assert exact.startswith("(angle 0.1)(curLapTime 12.345678)(damage 3)")
         assert exact.endswith("(focus -1 -1 -1 -1 -1)(yawRate 0.125)\0")
         assert text == (

@@ -140,9 +140,8 @@ class TestEngine:
             assert found == [seen(one)[car] for car in one.agents]
 
     def test_agents_have_a_car_and_a_gearbox_each(self, race):
-        engine = race(
-            [("", 0), ("", 1)], car=["car1-trb1", "baja-bug"], gearbox=["road_speed", "automatic"]
-        )
+        cars = {"car": ["car1-trb1", "baja-bug"], "gearbox": ["road_speed", "automatic"]}
+        engine = race([("", 0), ("", 1)], **cars)
         assert [engine.car_name(car) for car in engine.agents] == ["car1-trb1", "baja-bug"]
         hold(engine, [(0.0, 1.0, 0.0, None)] * 2)
         engine.drive(10)
@@ -263,9 +262,7 @@ def step_of_script(engine):
 
 
 class TestMistakes:
-    @pytest.mark.parametrize(
-        "entries", [[("", 1)], [("", 0), ("", 2)], [("", -1)], [("", 0), ("", 0)]]
-    )
+    @pytest.mark.parametrize("entries", [[("", 1)], [("", 0), ("", 2)], [("", -1)], [("", 0)] * 2])
     def test_agents_are_numbered_from_zero(self, race, entries):
         with pytest.raises(InvalidOption, match=r"expected one driver or more|named twice|no car"):
             race(entries)
@@ -595,9 +592,8 @@ class TestSensorsOfARace:
             along, across, speed_along, _, long, wide = car.race[5:].reshape(6, RIVALS)
             assert along == pytest.approx(nearest, abs=1e-3)  # the game's floats
             others = [ahead[place] for place in nearest]
-            assert across == pytest.approx(
-                [other.distance_from_axis - car.distance_from_axis for other in others]
-            )
+            beside = [other.distance_from_axis - car.distance_from_axis for other in others]
+            assert across == pytest.approx(beside)
             assert speed_along == pytest.approx(
                 [speed_on(other) - speed_on(car) for other in others],
                 abs=0.01,  # it rolls, too

@@ -124,9 +124,8 @@ class PoisonCallback(BaseCallback):
 def poisoned(tmp_path, at):
     """Run a study of one agent that diverges after so many timesteps."""
     callback = {f"{__name__}.PoisonCallback": {"at": at}}
-    study = read_study(
-        study_file(tmp_path, seeds=1, variants={"poisoned": {**TINY, "callback": callback}})
-    )
+    variants = {"poisoned": {**TINY, "callback": callback}}
+    study = read_study(study_file(tmp_path, seeds=1, variants=variants))
     store = StudyFolder(tmp_path / "out", study)
     store.begin()
     (trial,) = study.trials
@@ -344,9 +343,7 @@ def test_two_runs_do_not_share_a_folder(begun, capsys):
         assert "another process runs the study" in complaint(study, store, capsys)
 
 
-def test_where_ray_does_not_start_it_is_said_and_nothing_else_is_removed(
-    begun, tmp_path, monkeypatch
-):
+def test_where_ray_does_not_start_nothing_else_is_removed(begun, tmp_path, monkeypatch):
     """Its sockets lie in the folder for temporary files, and their paths must not be long."""
     study, store = begun
     far = tmp_path / ("far" * 20)
@@ -395,9 +392,7 @@ def cluster(short_folder):
 
 
 @pytest.mark.slow
-def test_a_killed_study_loses_a_machine_too_and_ends_as_if_undisturbed(
-    undisturbed, tmp_path, short_folder, cluster
-):
+def test_a_killed_study_loses_a_machine_too(undisturbed, tmp_path, short_folder, cluster):
     """
     It goes on from what it has stored: first nothing is left of its processes, then one of two
     machines is lost with a trial on each.
@@ -464,9 +459,7 @@ def test_a_study_that_has_ended_starts_no_ray(undisturbed_folder, tmp_path, monk
         pytest.param(signal.SIGTERM, True, marks=pytest.mark.rare),
     ],
 )
-def test_a_signal_keeps_everything_and_the_study_says_how_to_go_on(
-    tmp_path, short_folder, number, whole_group
-):
+def test_a_signal_keeps_everything(tmp_path, short_folder, number, whole_group):
     """Also while a trial still waits for its turn."""
     words = words_of(tmp_path, "--jobs", "1")
     variables = {**os.environ, "TMPDIR": short_folder}
@@ -492,9 +485,7 @@ def test_the_ray_of_another_study_is_not_joined(begun, cluster):
 
 
 @pytest.mark.rare
-def test_where_a_damaged_folder_is_removed_the_same_command_goes_on(
-    undisturbed, begun, tmp_path, capsys
-):
+def test_without_a_damaged_folder_the_study_goes_on(undisturbed, begun, tmp_path, capsys):
     assert main(words_of(tmp_path, "--jobs", "2")) == 1
     out = capsys.readouterr().out
     assert "small-nets-seed0 failed: its checkpoint cannot be read (" in out

@@ -88,9 +88,7 @@ def crashing(broken):
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("world", [NativeBackend, LiteBackend])
-def test_what_the_game_cannot_lay_is_refused_with_its_line(
-    broken, world, track, pattern, new, message
-):
+def test_what_the_game_cannot_lay_is_refused(broken, world, track, pattern, new, message):
     with pytest.raises(TrackFileError, match=message):
         world(broken(track, (pattern, new)))
 
@@ -140,9 +138,12 @@ def test_known_tracks_need_no_trial(monkeypatch):
 def test_a_content_is_tried_once_for_each_race(broken, monkeypatch):
     tried = []
     load = track_trial.load_road
-    monkeypatch.setattr(
-        track_trial, "load_road", lambda *words: tried.append(words) or load(*words)
-    )
+
+    def noted(*words):
+        tried.append(words)
+        return load(*words)
+
+    monkeypatch.setattr(track_trial, "load_road", noted)
     path = broken("road/g-track-1", (r"\Z", " "))
     for opponents in ((), (), ("bt",)):
         NativeBackend(path, opponents=opponents).close()
@@ -186,9 +187,7 @@ class TestRoad:
         path, road = laid
         other = road.copy()
         other[100, column] += 0.1
-        with pytest.raises(
-            TrackFileError, match=rf"segment 100, .*{track_trial.COLUMNS[column]} is"
-        ):
+        with pytest.raises(TrackFileError, match=f"100, .*{track_trial.COLUMNS[column]} is"):
             check_road(path, other)
 
 

@@ -370,9 +370,7 @@ class TestAsTheGame:
 
     def test_a_radius_that_rounding_swallows_is_refused(self, read):
         text = VERSION_4.replace('"end radius" val="20"', '"end radius" val="1e-30"')
-        with pytest.raises(
-            TrackFileError, match="needs 'end radius' above 0, it is 1e-30; at least 1e-06"
-        ):
+        with pytest.raises(TrackFileError, match=r"needs 'end radius' above 0, .* at least 1e-06"):
             read(text)
 
     def test_steps_are_counted_in_single_precision(self, read):
