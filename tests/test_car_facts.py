@@ -21,58 +21,47 @@ CARS = ["car1-trb1", "car1-ow1", "p406"]
 ROADS = ["aalborg", "corkscrew"]
 FACTS = slice(29, 35)
 
-CATEGORY = """
+
+def point(number, rpm, torque):
+    """A point of a motor's curve."""
+    return f"""<section name="{number}"><attnum name="rpm" unit="rpm" val="{rpm}"/>
+        <attnum name="Tq" unit="N.m" val="{torque}"/></section>"""
+
+
+def wheel(place, mu):
+    return f"""<section name="{place} Wheel"><attnum name="mu" val="{mu}"/>
+        <attnum name="ride height" unit="mm" val="100"/></section>"""
+
+
+CATEGORY = f"""
 <params name="small" type="template">
   <section name="Car"><attnum name="mass" unit="kg" min="500" max="1500" val="900"/></section>
   <section name="Rear Wing"><attnum name="angle" unit="deg" val="30"/></section>
   <section name="Engine"><section name="data points">
-    <section name="4">
-      <attnum name="rpm" unit="rpm" val="5000"/><attnum name="Tq" unit="N.m" val="260"/>
-    </section>
-    <section name="5">
-      <attnum name="rpm" unit="rpm" val="9000"/><attnum name="Tq" unit="N.m" val="700"/>
-    </section>
+    {point(4, 5000, 260)}{point(5, 9000, 700)}
   </section></section>
 </params>
 """
-OWN = """
+OWN = f"""
 <params name="tiny" type="template">
   <section name="Car">
     <attstr name="category" val="small"/>
-    <attnum name="fuel tank" unit="l" val="60"/>
-    <attnum name="initial fuel" unit="l" val="100"/>
+    <attnum name="fuel tank" unit="l" val="60"/><attnum name="initial fuel" unit="l" val="100"/>
   </section>
   <section name="Aerodynamics">
     <attnum name="Cx" val="0.5"/>
-    <attnum name="front Clift" val="0.3"/>
-    <attnum name="rear Clift" val="0.7"/>
+    <attnum name="front Clift" val="0.3"/><attnum name="rear Clift" val="0.7"/>
   </section>
   <section name="Rear Wing"><attnum name="area" unit="m2" val="0.5"/></section>
   <section name="Engine">
     <attnum name="revs limiter" unit="rpm" val="8000"/>
     <attnum name="tickover" unit="rpm" val="1000"/>
     <section name="data points">
-      <section name="1">
-        <attnum name="rpm" unit="rpm" val="0"/><attnum name="Tq" unit="N.m" val="100"/>
-      </section>
-      <section name="2">
-        <attnum name="rpm" unit="rpm" val="2000"/><attnum name="Tq" unit="N.m" val="300"/>
-      </section>
-      <section name="3">
-        <attnum name="rpm" unit="rpm" val="4000"/><attnum name="Tq" unit="N.m" val="280"/>
-      </section>
+      {point(1, 0, 100)}{point(2, 2000, 300)}{point(3, 4000, 280)}
     </section>
   </section>
   <section name="Steer"><attnum name="steer lock" unit="deg" val="20"/></section>
-  <section name="Front Right Wheel">
-    <attnum name="mu" val="1.4"/><attnum name="ride height" unit="mm" val="100"/>
-  </section>
-  <section name="Front Left Wheel">
-    <attnum name="mu" val="1.4"/><attnum name="ride height" unit="mm" val="100"/>
-  </section>
-  <section name="Rear Right Wheel">
-    <attnum name="mu" val="1.3"/><attnum name="ride height" unit="mm" val="100"/>
-  </section>
+  {wheel("Front Right", 1.4)}{wheel("Front Left", 1.4)}{wheel("Rear Right", 1.3)}
   <section name="Rear Left Wheel"><attnum name="mu" val="1.5"/></section>
 </params>
 """

@@ -24,6 +24,8 @@ from sb3_torcs.sensors import encode
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.starting_list import AGENT
 
+pytestmark = pytest.mark.usefixtures("game")
+
 ALONE = [AGENT]
 # The car settles on its springs, and rolls while it does: on a slope by a few centimetres. At the
 # line some tracks have a gap of up to 0.3 m.
@@ -50,11 +52,6 @@ def race_of(track, entries=ALONE, **options):
     engine = make_engine(find_game(), track, entries, session=session, **options)
     engine.start()
     return engine
-
-
-@pytest.fixture(autouse=True)
-def _game(game):
-    """Nothing here works without it."""
 
 
 @pytest.fixture

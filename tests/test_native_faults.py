@@ -41,6 +41,8 @@ from sb3_torcs.errors import (
 from sb3_torcs.torcs.installation import MODULES, SURFACES, find_game
 from sb3_torcs.torcs.starting_list import AGENT
 
+pytestmark = pytest.mark.usefixtures("game")
+
 INSTALL = "sb3-torcs install-torcs"
 SMALL = "g-track-1"  # loads in no time
 INFERNO = [["inferno", 3]]
@@ -63,11 +65,6 @@ def raised(call):
         return type(error).__name__
     return "nothing"
 """
-
-
-@pytest.fixture(autouse=True)
-def _game(game):
-    """Nothing here works without it."""
 
 
 @pytest.fixture

@@ -106,6 +106,15 @@ def serve(game):
 
 
 @pytest.fixture
+def pair(serve):
+    """Two clients in one race, of whom the first has its first state."""
+    process, first, second = serve([DRIVER, ("scr_server", 1)])
+    first.identify()
+    second.identify()
+    return process, first, second, first.receive()
+
+
+@pytest.fixture
 def another():
     """Make other clients of the server that a client talks to."""
     with contextlib.ExitStack() as stack:
@@ -346,15 +355,6 @@ class TestRace:
         assert numbers(state, "track") == [-1] * 19
         assert numbers(state, "focus") == [-1] * 5
 
-    def test_each_client_is_answered_whoever_comes_first(self, serve):
-        _, first, second = serve([DRIVER, ("scr_server", 1)])
-        second.identify()
-        second.nothing_comes()
-        second.identify()
-        assert number(first.begin(), "curLapTime") < 0.0
-        first.send(STAND)
-        assert number(second.receive(), "curLapTime") < 0.0
-
     def test_two_drivers(self, serve):
         _, first, second = serve([("scr_server", 1), DRIVER])
         first.send(INIT)  # driver 0, at the second place: its turn comes last
@@ -484,11 +484,8 @@ class TestRestart:
         client.receive()
         assert drive(client, client.restart(start), 450) == first[:450]
 
-    def test_asked_for_while_another_driver_thinks(self, serve):
-        _, first, second = serve([DRIVER, ("scr_server", 1)])
-        first.identify()
-        second.identify()
-        first.receive()
+    def test_asked_for_while_another_driver_thinks(self, pair):
+        _, first, second, _ = pair
         first.send(STAND)
         second.receive()
         first.send("(meta 1)")  # before the state that it might answer
@@ -497,12 +494,9 @@ class TestRestart:
             second.send(STAND)
         assert first.receive() == b"***restart***\0"
 
-    def test_the_server_names_who_asks_and_who_does_not_come_back(self, serve):
+    def test_the_server_names_who_asks_and_who_does_not_come_back(self, pair):
         """A client that ends at a restart would stop the race without a sign."""
-        process, first, second = serve([DRIVER, ("scr_server", 1)])
-        first.identify()
-        second.identify()
-        first.receive()
+        process, first, second, _ = pair
         first.send("(meta 1)")
         assert first.receive() == second.receive() == b"***restart***\0"
         first.identify()
@@ -523,11 +517,9 @@ class TestRestart:
         assert memory(process.pid) - before < 500
         assert process.poll() is None
 
-    def test_one_asks_and_all_begin_anew(self, serve):
-        _, first, second = serve([DRIVER, ("scr_server", 1)])
-        first.identify()
-        second.identify()
-        began = [first.receive()]
+    def test_one_asks_and_all_begin_anew(self, pair):
+        _, first, second, state = pair
+        began = [state]
         first.send(STAND)
         began.append(second.receive())
         second.send("(meta 1)")
@@ -841,12 +833,9 @@ class TestLostAndDoubled:
         assert client.ask("(meta 1)") == b"***restart***\0"
         other.insist()  # while the first one does not come back
 
-    def test_who_is_not_asked_is_not_silent(self, serve, another):
+    def test_who_is_not_asked_is_not_silent(self, pair, another):
         """The other driver thinks longer than a client may be silent."""
-        _, first, second = serve([DRIVER, ("scr_server", 1)])
-        first.identify()
-        second.identify()
-        first.receive()
+        _, first, second, _ = pair
         first.send(STAND)
         second.receive()
         stranger = another(first)

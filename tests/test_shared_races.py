@@ -30,14 +30,11 @@ from sb3_torcs.sensors import View, encode, feature_slices
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.vec_env import JoinedVecEnv, TorcsVecEnv
 
+pytestmark = pytest.mark.usefixtures("game")
+
 TRACK = "g-track-1"
 TWO = [("bt", 2), ("", 0), ("inferno", 3), ("", 1)]
 GAS, TURN = [0.0, 1.0, 0.0], [1.0, 1.0, 0.0]
-
-
-@pytest.fixture(autouse=True)
-def _game(game):
-    """Nothing here works without it."""
 
 
 @pytest.fixture

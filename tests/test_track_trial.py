@@ -23,13 +23,10 @@ from sb3_torcs.tracks import trial as track_trial
 from sb3_torcs.tracks.catalogue import load_track
 from sb3_torcs.tracks.trial import check_road, check_track, engine_arguments, try_race
 
+pytestmark = pytest.mark.usefixtures("game")
+
 FIRST_SEGMENT = r'(?s)(Track Segments">.*?<section name=")[^"]*'
 ID_OF_NOTHING = r'\g<0><section name="nowhere"><attnum name="id" val="-7"/></section>'
-
-
-@pytest.fixture(autouse=True)
-def _game(game):
-    """Nothing here works without it."""
 
 
 @pytest.fixture
