@@ -14,7 +14,13 @@ from sb3_torcs.tracks.catalogue import available_tracks
 
 STUDIES = sorted((Path(__file__).parent.parent / "examples" / "studies").glob("*.yml"))
 VECTORS = "stable_baselines3.common.vec_env.VecExtractDictObs"
+NOISE = "sb3_torcs.callbacks.NoiseCallback"
 GOOD = {"name": "s", "env": "TorcsLite-v0", "seeds": 2, "eval_interval": 100}
+
+
+def of_one(**changes):
+    """A study of one variant."""
+    return {"variants": {"a": changes}}
 
 
 def written(tmp_path, **changes):
@@ -45,12 +51,9 @@ def test_the_shipped_studies_can_be_run(path):
         ({"final_tracks": ["aalbrg"]}, "s.yml: final_tracks: no track 'aalbrg'; did you mean"),
         (
             {"env": "Torcs-v0", "final_tracks": ["forza", "random"]},
-            "s.yml: final_tracks: track is 'random'; Torcs-v0 takes the name of an installed",
+            "takes the name of an installed",
         ),
-        (
-            {"env": "Torcs-v0", "variants": {"a": {"eval_tracks": ["own.csv"]}}},
-            "variants: a': eval_tracks: 'own.csv' is a file for TorcsLite-v0",
-        ),
+        ({"env": "Torcs-v0", **of_one(eval_tracks=["own.csv"])}, "is a file for TorcsLite-v0"),
         ({"final_tracks": ["aalborg", "road/aalborg"]}, "one is there twice"),
         ({"final_tracks": 3}, "expected a list of tracks, or of 'road', 'oval', 'dirt'"),
         ({"env": "Torc-v0"}, "no environment 'Torc-v0' is registered; did you mean 'Torcs-v0'?"),
@@ -67,22 +70,13 @@ def test_the_shipped_studies_can_be_run(path):
         ({"variants": {"a": 3}}, "variants: a': expected 'NAME: {key: value}'"),
         ({"variants": {"a b": {}, "a-b": {}}}, "names that differ in signs only"),
         ({"variants": {"a": {"gama": 0.9}}}, "unknown key 'gama'; did you mean 'gamma'?"),
-        (
-            {"variants": {"a": {"callback": {"sb3_torcs.callbacks.NoiseCallback": {"knd": 1}}}}},
-            "argument 'knd'; did you mean 'kind'?",
-        ),
-        (
-            {"variants": {"a": {"env_kwargs": {"track": "nowhere"}}}},
-            "variants: a': no track 'nowhere'",
-        ),
+        (of_one(callback={NOISE: {"knd": 1}}), "argument 'knd'; did you mean 'kind'?"),
+        (of_one(env_kwargs={"track": "nowhere"}), "variants: a': no track 'nowhere'"),
         ({"variants": {"a": {"env_kwargs": 3}}}, "env_kwargs is 3; expected '{key: value}'"),
         ({"variants": {"a": {"env_kwargs": {"reward": "blgo"}}}}, "did you mean 'blog'?"),
         ({"variants": {"a": {"n_steps": None}}}, "null takes 'n_steps' away, but it is not there"),
         ({"final_tracks": []}, "final_tracks is []; expected a list of tracks"),
-        (
-            {"variants": {"a": {"vec_env_wrapper": VECTORS}}},
-            f"vec_env_wrapper {VECTORS} changes vectors of environments",
-        ),
+        (of_one(vec_env_wrapper=VECTORS), f"{VECTORS} changes vectors of environments"),
     ],
 )
 def test_a_mistake_is_told_before_anything_starts(tmp_path, capsys, changes, says):

