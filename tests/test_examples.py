@@ -355,46 +355,36 @@ def test_the_soak_of_robots_finds_nothing():
     assert soaked.stdout.startswith("6 starts: 0 crashed")
 
 
-@pytest.mark.parametrize(
-    ("words", "wanted", "done", "plan"),
-    [
-        ("", None, 0, "fresh"),
-        ("--continue", None, 0, "fresh"),
-        ("--fresh", 100, 50, "fresh"),
-        ("--continue", 100, 50, "continue"),
-        ("", 100, 50, "continue"),
-        ("", 100, 100, "show"),
-        ("--timesteps 200", 100, 100, "continue"),
-    ],
-)
-def test_without_a_terminal_the_demo_goes_on_or_shows(demo, words, wanted, done, plan):
-    """pytest's standard input is no terminal, as in CI."""
+@pytest.mark.parametrize(("words", "wanted", "done", "answer", "plan"), [
+    ("", None, 0, None, "fresh"),
+    ("--continue", None, 0, None, "fresh"),
+    ("--fresh", 100, 50, None, "fresh"),
+    ("--continue", 100, 50, None, "continue"),
+    ("", 100, 50, None, "continue"),
+    ("", 100, 100, None, "show"),
+    ("--timesteps 200", 100, 100, None, "continue"),
+    ("", 100, 50, "", "continue"),
+    ("", 100, 50, "f", "fresh"),
+    ("", 100, 100, "", "show"),
+    ("", 100, 100, "fresh", "fresh"),
+])  # fmt: skip
+def test_the_demo_asks_on_a_terminal_and_else_goes_on_or_shows(
+    demo, monkeypatch, words, wanted, done, answer, plan
+):
+    monkeypatch.setattr(sys.stdin, "isatty", lambda: answer is not None, raising=False)
+    monkeypatch.setattr("builtins.input", lambda question: answer)
     assert demo.choose(demo.parse(words.split()), wanted, done) == plan
 
 
-@pytest.mark.parametrize(
-    ("done", "answer", "plan"),
-    [(50, "", "continue"), (50, "f", "fresh"), (100, "", "show"), (100, "fresh", "fresh")],
-)
-def test_on_a_terminal_the_demo_asks(demo, monkeypatch, done, answer, plan):
-    monkeypatch.setattr(sys.stdin, "isatty", lambda: True, raising=False)
-    monkeypatch.setattr("builtins.input", lambda question: answer)
-    assert demo.choose(demo.parse([]), 100, done) == plan
-
-
 def test_a_fresh_start_removes_nothing_that_is_not_the_demos(demo, tmp_path):
-    """Somebody's own model.zip is not ours to throw away."""
-    (tmp_path / "model.zip").write_text("theirs")
+    for name in ("model.zip", "notes.txt"):
+        (tmp_path / name).write_text("theirs")
     with pytest.raises(OutputNotWritable, match="--folder"):
         demo.clear(tmp_path)
-    assert (tmp_path / "model.zip").read_text() == "theirs"
-
-
-def test_a_fresh_start_leaves_other_files_alone(demo, tmp_path):
+    (tmp_path / "model.zip").rename(tmp_path / "other.zip")
     (tmp_path / demo.STATE).write_text("{}")
-    (tmp_path / "notes.txt").write_text("mine")
     demo.clear(tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["notes.txt", "other.zip"]
 
 
 def test_half_a_state_is_no_obstacle(demo, tmp_path):
@@ -433,10 +423,6 @@ def test_the_demo_learns_where_this_machine_can(demo, monkeypatch, tmp_path, env
     assert demo.course_of(tmp_path) == demo.Course("ppo", env, "Torcs-v0")
     first, *_ = demo.first_words(tmp_path, demo.course_of(tmp_path), 1, False)
     assert ("in TORCS itself" in first) == (env == "Torcs-v0")
-
-
-@pytest.mark.parametrize("env", ["Torcs-v0", "TorcsLite-v0"])
-def test_what_the_demo_asks_for_fits_both_worlds(demo, env):
     place = zoo.Place(zoo.config_file(demo.ALGO), demo.ENTRY)
     zoo.check_entry(zoo.read_entry(*place), demo.ALGO, env, place)
 

@@ -494,21 +494,6 @@ def test_a_game_that_is_killed_in_mid_lap_is_told_and_replaced(backend):
     assert backend._process.pid != pid
 
 
-def test_a_game_that_is_killed_between_episodes_is_replaced(backend):
-    os.kill(backend._process.pid, signal.SIGKILL)
-    assert backend.reset(rng(), None).distance_raced == 0.0
-
-
-def test_resets_keep_the_game(backend):
-    pid = backend._process.pid
-    first = backend.step(STRAIGHT_ON, 20)
-    for _ in range(50):
-        backend.reset(rng(), None)
-    again = backend.step(STRAIGHT_ON, 20)
-    np.testing.assert_array_equal(again.range_finders, first.range_finders)
-    assert backend._process.pid == pid
-
-
 def test_a_car_that_stands_too_long_is_taken_out_and_a_reset_begins_anew(backend):
     """By the game's own rule, after the race; the game then ends."""
     car = backend.reset(rng(), None)
@@ -519,19 +504,16 @@ def test_a_car_that_stands_too_long_is_taken_out_and_a_reset_begins_anew(backend
     assert backend.reset(rng(), None).time < 0.1
 
 
-def test_nothing_is_left_of_a_closed_world(backend):
-    pid, folder = backend._process.pid, backend._process.folder
-    backend.close()
-    assert gone(lambda: runs(pid))
-    assert not folder.exists()
-
-
-def test_nothing_is_left_of_a_forgotten_world():
+@pytest.mark.parametrize("closed", [True, False])
+def test_nothing_is_left_of_a_closed_or_forgotten_world(closed):
     world = ScrBackend("g-track-1")
     world.reset(rng(), None)
     pid, folder = world._process.pid, world._process.folder
-    del world
-    gc.collect()
+    if closed:
+        world.close()
+    else:
+        del world
+        gc.collect()
     assert gone(lambda: runs(pid))
     assert not folder.exists()
 
@@ -592,7 +574,7 @@ def test_two_worlds_do_not_hear_each_other():
         world.close()
 
 
-def test_resets_leak_nothing(backend):
+def test_resets_keep_the_game_and_leak_nothing(backend):
     def descriptors():
         return len(os.listdir("/proc/self/fd"))
 
@@ -600,8 +582,12 @@ def test_resets_leak_nothing(backend):
         status = Path(f"/proc/{backend._process.pid}/statm").read_text()
         return int(status.split()[1])  # [pages]
 
+    pid, first = backend._process.pid, backend.step(STRAIGHT_ON, 20)
     for _ in range(50):
         backend.reset(rng(), None)
+    again = backend.step(STRAIGHT_ON, 20)
+    np.testing.assert_array_equal(again.range_finders, first.range_finders)
+    assert backend._process.pid == pid
     descriptors_before, pages_before = descriptors(), game_memory()
     for n in range(200):
         backend.reset(rng(), Start(10.0 * n, 0.0, 0.0, 20.0) if n % 2 else None)
