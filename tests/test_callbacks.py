@@ -20,7 +20,7 @@ from sb3_torcs.callbacks import (
     StochasticBrakeCallback,
 )
 from sb3_torcs.callbacks.replay import GradientStepsCallback, MirrorCallback
-from sb3_torcs.errors import InvalidOption, NoiseNotBound, Sb3TorcsError
+from sb3_torcs.errors import InvalidOption, Sb3TorcsError
 from sb3_torcs.noise import ActuatorNoise, OUNoise, SetPointNoise, noises_of
 
 SET_POINT = {"steering": [0, 1, 0], "throttle": [0.5, 1, 0], "brake": [-0.1, 1, 0]}
@@ -172,12 +172,6 @@ def test_an_algorithm_without_action_noise_is_refused():
         told = f"PPO takes no action noise; use {callback.__name__} with DDPG, TD3 or SAC"
         with pytest.raises(InvalidOption, match=told):
             model.learn(8, callback=callback())
-
-
-def test_set_point_noise_without_the_callback_says_so():
-    """Stock DDPG knows nothing of bindings."""
-    with pytest.raises(NoiseNotBound, match="NoiseCallback"):
-        learn(make_model(action_noise=SetPointNoise()), 2)
 
 
 # ----------------------------------------------------------------------- decay and brake

@@ -161,11 +161,6 @@ def test_ou_begins_each_episode_at_mu():
     np.testing.assert_array_equal(draws(noise, 1), [[0, 0, 0]])
 
 
-def test_ou_works_without_a_policy():
-    """It needs no binding: stock SB3 takes it as it is."""
-    assert OUNoise(seed=0)().shape == (3,)
-
-
 # -------------------------------------------------------------------------- what all share
 
 
