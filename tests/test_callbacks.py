@@ -159,14 +159,12 @@ def test_another_kind_continues_the_count_of_timesteps():
 
 
 def test_a_foreign_noise_is_replaced():
-    """Whoever lists the callback wants its noise."""
     model = make_model(action_noise=NormalActionNoise(np.zeros(3), np.ones(3)))
     learn(model, 3, NoiseCallback(kind="ou"))
     assert isinstance(model.action_noise, OUNoise)
 
 
 def test_an_algorithm_without_action_noise_is_refused():
-    """PPO explores by its own distribution."""
     model = PPO("MlpPolicy", DummyVecEnv([ToyRace]), n_steps=8, batch_size=8, device="cpu")
     for callback in (NoiseCallback, NoiseDecayCallback, StochasticBrakeCallback):
         told = f"PPO takes no action noise; use {callback.__name__} with DDPG, TD3 or SAC"

@@ -171,7 +171,6 @@ def test_each_episode_shows_the_car_that_it_draws(game):
 
 @pytest.mark.usefixtures("game")
 def test_races_driven_at_once_see_what_single_ones_see():
-    """To the bit, across the ends of episodes, each with a car of its own."""
     options = {"car": CARS, "start": "random", "max_episode_steps": 12, "sensors": SENSORS}
     with both_kinds("Torcs-v0", **options) as (ours, theirs):
         assert_they_see_the_same(ours, theirs)

@@ -174,7 +174,6 @@ def test_less_grip_brakes_less(env_id):
 
 @pytest.mark.usefixtures("game")
 def test_a_heavier_car_gathers_speed_more_slowly():
-    """By as much as it is heavier, without its fuel; a lighter one is faster."""
     gained = [speeds("Torcs-v0", [0.0, 1.0, 0.0], mass=mass)[-1] - 40.0 for mass in (0.8, 1.0, 1.2)]
     assert gained[0] > gained[1] > gained[2] > 0.0
 

@@ -544,7 +544,6 @@ def imports(name):
 
 
 def test_what_the_docs_name_is_there():
-    """Files, dotted paths, classes, functions and flags."""
     named, flags = NOT_IN_THE_PACKAGE | defined(), known_flags()
     assert_none(unknown(FILE, is_there))
     assert_none(unknown(DOTTED, imports))

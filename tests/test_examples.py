@@ -75,7 +75,6 @@ def test_broken_tracks_are_refused_or_drive_what_is_written(monkeypatch, capsys,
 @pytest.mark.rare
 @pytest.mark.usefixtures("game")
 def test_foresight_leaves_hits_out(monkeypatch, capsys):
-    """One lap, from the last place."""
     found = []
     for words in (["--blind"], []):
         run(monkeypatch, "foresight.py", "--races", "1", "--laps", "1", *words)
@@ -447,7 +446,6 @@ def test_the_demo_goes_on_with_what_was_begun(demo, tmp_path, algo, entry):
 @pytest.mark.slow
 @pytest.mark.usefixtures("game")
 def test_the_demo_learns_shows_goes_on_and_shows_again(demo, capsys, tmp_path):
-    """What `make demo` promises, in small."""
     folder = tmp_path / "demo"
     words = ["--timesteps", "2048", "--folder", str(folder)]
     assert demo.main(words) == 0

@@ -115,7 +115,6 @@ def test_a_picture_shows_this_moment_and_nothing_before_it(view):
 
 
 def test_each_view_is_another_picture():
-    """Of one moment; the director's is that of the camera beside the track."""
     pictures = {}
     for view in VIEWS:
         env = make(picture={"size": SIZE, "view": view})

@@ -196,7 +196,6 @@ def answers(tmp_path_factory):
 
 @pytest.mark.parametrize("number", range(len(NEEDS)))
 def test_what_needs_an_extra_says_which_to_type(answers, number):
-    """In one line, before anything is driven."""
     words, package = NEEDS[number]
     status, out, err, written = answers[number]
     last = err.splitlines()[-1]

@@ -176,7 +176,6 @@ def test_pictures_come_at_their_interval(oval, clock, tmp_path):
 
 @pytest.mark.parametrize("before", [0, 16])
 def test_a_training_that_goes_on_continues_the_series(oval, clock, tmp_path, before):
-    """Whether its model counts on, or begins to count again."""
     for timesteps in (0, before):
         pictures = [LinePicturesCallback(folder=str(tmp_path))]
         learned(oval, [driven(oval, 900.0, 104.2)], callbacks=pictures, before=timesteps)

@@ -59,7 +59,6 @@ def test_a_car_on_the_right_becomes_one_on_the_left():
 
 
 def test_steering_changes_sides_and_pedals_stay():
-    """Scaled for the networks or not."""
     actions = th.tensor([[0.5, 0.2, 0.1], [-1.0, -1.0, 1.0]])
     assert mirror_actions(actions).tolist() == th.tensor([[-0.5, 0.2, 0.1], [1, -1, 1]]).tolist()
 

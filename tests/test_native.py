@@ -293,7 +293,6 @@ class TestStarts:
 
     @pytest.mark.parametrize("track", ["michigan", "dirt-1", "b-speedway"])
     def test_nobody_is_damaged_by_a_start(self, rng, track):
-        """Also where the road is banked."""
         backend = NativeBackend(track)
         for _ in range(150):
             place, aside = rng.uniform(0.0, backend.track.length), rng.uniform(-0.6, 0.6)
@@ -581,7 +580,6 @@ class TestNoise:
         assert (noisy[:, 19:][near] / clean[:, 19:][near]).std() == pytest.approx(0.02, rel=0.25)
 
     def test_it_does_not_touch_the_drive(self):
-        """Only what is seen errs."""
         digests = []
         for noise in (False, True):
             backend = NativeBackend("michigan", sensor_noise=noise)

@@ -180,7 +180,6 @@ def test_nothing_is_added_while_sb3_acts_by_lot():
 
 
 def test_scale_multiplies_the_noise_exactly():
-    """Half the scale, half of each number."""
     whole, half = OUNoise(seed=5), OUNoise(seed=5)
     half.scale = 0.5
     np.testing.assert_array_equal(draws(half, 20), 0.5 * draws(whole, 20))

@@ -120,7 +120,6 @@ def test_the_action_joins_the_critic_at_the_second_layer():
     (DDPG, {}, 1), (DDPG, {"n_critics": 2}, 2), (TD3, {}, 2),
 ])  # fmt: skip
 def test_the_number_of_critics_is_respected(algorithm, kwargs, n_critics):
-    """DDPG has one, TD3 two, and two on request."""
     model = make_model(algorithm, **kwargs)
     assert len(model.critic(th.rand(4, 29), th.rand(4, 3))) == n_critics
     model.learn(20)
@@ -134,7 +133,6 @@ def test_the_number_of_critics_is_respected(algorithm, kwargs, n_critics):
     {"optimizer_kwargs": {"weight_decay": 1e-4}},
 ])  # fmt: skip
 def test_the_policy_trains_with_other_parts(kwargs):
-    """Each changes the parameters and keeps them finite."""
     model = make_model(**kwargs)
     before = [parameter.clone() for parameter in model.actor.parameters()]
     model.learn(20)
@@ -207,7 +205,6 @@ ALIKE = [
 
 
 def test_adam_is_fused_unless_somebody_chose_its_kernel():
-    """The default can be overridden, and other optimizers stay what they are."""
     assert make_model().actor.optimizer.defaults["fused"] is True
     assert not make_model(optimizer_kwargs={"fused": False}).actor.optimizer.defaults["fused"]
     assert not make_model(optimizer_kwargs={"foreach": True}).actor.optimizer.defaults["fused"]
@@ -615,7 +612,6 @@ def test_a_copy_keeps_and_saves_the_state_of_its_optimizers(tmp_path):
 
 @pytest.mark.parametrize("lean", [False, True])
 def test_the_same_seed_makes_the_same_model(lean):
-    """To the bit, with the same number of threads."""
     callback = LeanUpdatesCallback() if lean else None
     one, two = (make_model(n_critics=2, layer_norm=True, ema_decay=0.9) for _ in range(2))
     for model in (one, two):

@@ -62,7 +62,6 @@ def test_the_edge_of_the_road_is_still_on_it(oval):
 
 @pytest.mark.parametrize(("axis", "end"), [(7.0, ""), (-7.0, ""), (7.01, "off_track")])
 def test_a_car_may_be_beside_the_road_where_there_is_runoff(oval, axis, end):
-    """Of 2 m, on a road of 10 m."""
     _, _, terminated, _, info = run(oval, {"distance_from_axis": axis}, ends={"runoff": 2.0})
     assert (terminated, info["end"]) == (end != "", end)
     assert info["off_track"]

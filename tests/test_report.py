@@ -286,7 +286,6 @@ def test_a_study_in_which_nobody_laps_is_reported_too(tmp_path):
 
 
 def test_one_picture_shows_all_variants(tmp_path):
-    """Where there are several; each has its own beside it."""
     rows = [
         row(seed, variant=variant, timesteps=timesteps)
         for variant in ("base", "wide")
