@@ -208,17 +208,6 @@ class TestTexts:
             "(wheelSpinVel 1 2 3 4e-07)(z 0.345)(focus -1 -1 -1 -1 -1)\0"
         )
 
-    def test_every_number_as_c_prints_it(self):
-        source = random.Random(1)
-        for _ in range(300):
-            values = [source.uniform(-1, 1) * 10 ** source.uniform(-12, 12) for _ in range(80)]
-            scaled = list(values)
-            scaled[45] *= 10.0
-            for i in (46, 47, 48):
-                scaled[i] *= 3.6
-            text = _engine.scr_format_state(values).decode()
-            assert re.findall(r" ([^ ()]+)", text) == [f"{value:g}" for value in scaled[:79]]
-
     def test_it_takes_microseconds(self):
         values = [math.pi * i for i in range(80)]
         began = time.process_time()

@@ -255,11 +255,6 @@ class TestErrors:
         kept = [line for line in VERSION_4.splitlines() if "ENTITY default-objects" not in line]
         assert read("\n".join(kept)).segments == read(VERSION_4).segments
 
-    def test_entities_that_could_explode_are_refused(self, read):
-        text = VERSION_4.replace("]>", '<!ENTITY a "aaaa">\n]>', 1)
-        with pytest.raises(TrackFileError, match="line 5: entity 'a' has a text of its own"):
-            read(text)
-
 
 KNOWN_LENGTHS = {  # [m] as the game prints them
     "aalborg": 2587.54,
