@@ -337,6 +337,11 @@ class TestStarts:
         again = backend.reset(rng, start)
         assert again[:23] == NativeBackend("aalborg").reset(rng, start)[:23]
 
+    @pytest.mark.parametrize("error", [-3.1, -1.5, 1.5, 3.1])
+    def test_facing_any_way(self, rng, error):
+        car = NativeBackend("michigan").reset(rng, Start(500.0, 0.1, error, 10.0))
+        assert car.heading_error == pytest.approx(error, abs=0.02)
+
     @pytest.mark.parametrize("track", ["aalborg", "michigan", "dirt-1"])
     def test_the_grid_is_the_session_s(self, rng, track):
         """A practice begins in the middle, far before the line; a race in rows, near to it."""
@@ -526,8 +531,8 @@ class TestAmongRobots:
         backend = NativeBackend("michigan", opponents=("inferno", "bt"), grid_place=1)
         first = backend.reset(rng, None)
         assert first.race_position == 1
-        last = backend.step(Controls(0.0, 0.0, 1.0), 500)
-        assert (last.race_position, last.fuel < first.fuel) == (3, True)
+        assert backend.step(Controls(0.0, 0.0, 1.0), 500).race_position == 3
+        assert backend.step(Controls(0.0, 1.0, 0.0), 200).fuel < first.fuel
 
     @pytest.mark.parametrize(
         ("options", "message"),
