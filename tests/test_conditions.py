@@ -150,8 +150,6 @@ def test_a_copy_goes_on_with_the_controls_on_their_way(env_id):
     twin.close()
 
 
-
-
 # ---------------------------------------------------------------------------------- grip and mass
 
 
