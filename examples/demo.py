@@ -13,20 +13,23 @@ import os
 import shlex
 import shutil
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from sb3_torcs.agents.models import find_model, load_driver, saved_timesteps, training_record
+from sb3_torcs.backends.native import check_layout
 from sb3_torcs.callbacks.lines import draw_learning, driven_laps
 from sb3_torcs.callbacks.progress import spoken_moment
 from sb3_torcs.cli.common import positive, seed
-from sb3_torcs.errors import OutputNotWritable, ends_in_a_line
-from sb3_torcs.evaluation.protocol import choose_world, evaluate, time_limit
-from sb3_torcs.evaluation.recording import Recorder, best_stretch
+from sb3_torcs.errors import BackendUnavailable, OutputNotWritable, ends_in_a_line
+from sb3_torcs.evaluation.pictures import BestLap, best_lap, draw_line, save_video
+from sb3_torcs.evaluation.protocol import evaluate, race_environment
+from sb3_torcs.evaluation.ticks import log_drives
 from sb3_torcs.files import writable_folder
+from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.training.run import TrainOptions, train_run
 
 TRACK = "aalborg"
@@ -119,7 +122,16 @@ def course_of(folder: Path) -> Course:
     if begun:
         algo, env = begun[0].parent.name, begun[0].name.rpartition("_")[0]
         return Course(algo, env, ENTRY if algo == ALGO else None)
-    return Course(ALGO, choose_world("the demo", None).env_id, ENTRY)
+    return Course(ALGO, choose_world(), ENTRY)
+
+
+def choose_world() -> str:
+    """Return the game's environment if it runs here, and the other one otherwise."""
+    try:
+        check_layout(find_game())
+    except BackendUnavailable:
+        return "TorcsLite-v0"
+    return "Torcs-v0"
 
 
 def runs(folder: Path) -> list[Path]:
@@ -244,35 +256,32 @@ def curve(folder: Path) -> str:
     return f"{folder / CURVE}: how it learned{told}"
 
 
-@contextlib.contextmanager
-def driven(folder: Path) -> Iterator[Recorder]:
-    """Drive some laps from the grid with the best model."""
+def driven(folder: Path) -> BestLap:
+    """Drive some laps from the grid with the best model, and return the best one."""
     model = best_model(folder)
-    env_kwargs = {**training_record(model).env_kwargs, "laps": LAPS}
-    recorder = Recorder(course_of(folder).env, env_kwargs, time_limit(env_kwargs))
-    with contextlib.closing(recorder):
-        evaluate(recorder, load_driver(model, recorder))
-        yield recorder
+    record = training_record(model)
+    with race_environment(course_of(folder).env, record.env_kwargs, laps=LAPS) as env:
+        log = log_drives(env, "demo")
+        evaluate(env, load_driver(model, env))
+    return best_lap(log)
 
 
 def draw(folder: Path) -> str:
-    with driven(folder) as recorder:
-        recorder.draw_line(folder / PICTURE)
-        return f"{folder / PICTURE}: {described(recorder)}"
+    lap = driven(folder)
+    draw_line(lap, folder / PICTURE)
+    return f"{folder / PICTURE}: {described(lap)}"
 
 
 def video(folder: Path) -> str:
-    with driven(folder) as recorder:
-        recorder.save_video(folder / VIDEO)
-        return f"{folder / VIDEO}: {described(recorder)}"
+    lap = driven(folder)
+    save_video(lap, folder / VIDEO, None)
+    return f"{folder / VIDEO}: {described(lap)}"
 
 
-def described(recorder: Recorder) -> str:
-    stretch = best_stretch(recorder.episodes)
-    last = recorder.episodes[stretch.episode][stretch.last - 1]
-    if last.lap_time:
-        return f"its best lap of {LAPS}, {last.lap_time:.2f} s"
-    return f"no whole lap yet: {last.car.distance_raced:.0f} m"
+def described(lap: BestLap) -> str:
+    if lap.time is not None:
+        return f"its best lap of {LAPS}, {lap.time:.2f} s"
+    return f"no whole lap yet: {lap.distance:.0f} m"
 
 
 def last_words(folder: Path) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 
 from gymnasium.envs.registration import register, registry
 
-from sb3_torcs.torcs.drivers import register_crew
+from sb3_torcs.torcs.opponents import register_opponents
 
 __all__ = ["__version__", "compare", "parallel_env", "register_envs"]
 
@@ -38,7 +38,7 @@ def register_envs() -> None:
 
 
 register_envs()
-register_crew("sb3_torcs.agents.pilots:Crew")
+register_opponents("sb3_torcs.agents.pilots:AgentOpponents")
 
 
 def __getattr__(name: str) -> Any:

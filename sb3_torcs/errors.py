@@ -48,6 +48,7 @@ __all__ = [
     "TrackNotFound",
     "TrainingDiverged",
     "UnknownCar",
+    "UnknownDriver",
     "UnknownRewardTerm",
     "UnknownRobot",
     "ZooConfigError",
@@ -88,6 +89,10 @@ class StartBlocked(InvalidOption):
 
 class InvalidAction(Sb3TorcsError, ValueError):
     """An action has the wrong shape or is not a number."""
+
+
+class UnknownDriver(InvalidOption, LookupError):
+    """No driver has this name."""
 
 
 class UnknownRewardTerm(Sb3TorcsError, LookupError):

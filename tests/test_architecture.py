@@ -50,9 +50,8 @@ STEP_AND_RESET = VOCABULARY | {"backends", "envs", "tracks"}
 LEARNING = {"callbacks", "noise", "policies"}
 
 DRAWS = {
-    "evaluation/watching.py", "rendering/board.py", "rendering/game_camera.py",
-    "rendering/game_video.py", "rendering/gap.py", "rendering/highway.py", "rendering/hud.py",
-    "rendering/scenery.py", "rendering/viewer.py",
+    "rendering/board.py", "rendering/game_camera.py", "rendering/gap.py", "rendering/highway.py",
+    "rendering/hud.py", "rendering/scenery.py", "rendering/viewer.py",
 }  # fmt: skip
 STARTS_PROGRAMS = {
     "torcs/display.py",
@@ -65,9 +64,8 @@ STARTS_A_CHILD = {
     "tracks/trial.py",  # to load a track that may crash the game's loader
 }
 HAS_THE_GAME_RUN = {  # and nothing else: no world but one needs another process
-    "races/text_mode.py", "backends/scr.py", "evaluation/watching.py",
-    "rendering/game_camera.py", "rendering/game_video.py", "scr/server.py", "torcs/libraries.py",
-    "torcs/packages.py", "torcs/results.py", "torcs/window.py",
+    "backends/scr.py", "evaluation/watching.py", "rendering/game_camera.py", "scr/server.py",
+    "torcs/libraries.py", "torcs/packages.py", "torcs/results.py", "torcs/window.py",
 }  # fmt: skip
 USES_A_NETWORK = {"rendering/game_camera.py", "scr/client.py", "scr/server.py", "torcs/display.py"}
 LOADS_THE_ENGINE = {"backends/native.py", "torcs/trial_child.py"}

@@ -1,5 +1,4 @@
 import argparse
-import csv
 import dataclasses
 import errno
 import importlib
@@ -14,7 +13,6 @@ import sys
 import types
 
 import gymnasium as gym
-import numpy as np
 import pytest
 import yaml
 from fake_game import write_game
@@ -25,16 +23,15 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_torcs import __version__
 from sb3_torcs.agents import ScriptedDriver, models
+from sb3_torcs.agents.drivers import NamedDriver
 from sb3_torcs.agents.saved import record as model_record
 from sb3_torcs.bench.stages import KEYS
-from sb3_torcs.cli import VERBS, common, doctor, evaluate, main, requirements
+from sb3_torcs.cli import VERBS, _parser, common, doctor, evaluate, main, requirements
 from sb3_torcs.errors import BackendUnavailable, InvalidOption, OutputNotWritable, ZooConfigError
+from sb3_torcs.evaluation import pictures
 from sb3_torcs.evaluation import protocol as evaluation
-from sb3_torcs.evaluation import recording
-from sb3_torcs.telemetry import TELEMETRY_FIELDS
 from sb3_torcs.torcs import building
 from sb3_torcs.torcs import process as game_process
-from sb3_torcs.torcs.track_names import BUNDLED_FOLDER
 from sb3_torcs.training import run as training_run
 from sb3_torcs.training.run import TrainOptions
 
@@ -141,7 +138,7 @@ def test_driving_does_not_load_the_compiler_of_torch():
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["xyz"], "sb3-torcs: error: there is no verb 'xyz'; choose from doctor, install-torcs"),
+        (["xyz"], "sb3-torcs: error: there is no verb 'xyz'; `sb3-torcs --help` lists them"),
         (["trian"], "there is no verb 'trian'; did you mean 'train'?"),
         (["--verison"], "unrecognized arguments: --verison; did you mean '--version'?\n"),
         (["train", "--trak", "x"], "unrecognized arguments: --trak x; did you mean '--track'?\n"),
@@ -196,9 +193,9 @@ def test_any_terminal_takes_any_text(encoding, text, expected):
 
 
 def test_a_help_text_fits_any_terminal():
-    """That of robots names a list with an ellipsis."""
+    """That of watch names a list with an ellipsis."""
     environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
-    call = [sys.executable, "-m", "sb3_torcs.cli", "robots", "--help"]
+    call = [sys.executable, "-m", "sb3_torcs.cli", "watch", "--help"]
     done = subprocess.run(call, capture_output=True, check=True, env=environment)
     assert b"NAME:I,..." in done.stdout
 
@@ -373,17 +370,11 @@ def test_an_evaluation_takes_any_argument_of_the_environment(capsys):
 
 @pytest.mark.parametrize(("setting", "advice"), [
     ("max_episode_steps=10", "the time limit follows from the laps; type --laps L instead"),
-    ("laps=2", "type --laps 2 instead"),
-    ("track=alpine-1", "type --track alpine-1 instead"),
-    ("track=[]", "type --track TRACK instead"),
-    ("car=car1-ow1", "type --car car1-ow1 instead"),
-    ("action_repeat=2", "type --action-repeat 2 instead"),
-    ("range_finders=scr", "type --range-finders scr instead"),
+    ("laps=2", "type --laps L instead"),
     ("render_mode=5", "type --video FILE.mp4 for a video"),
 ])  # fmt: skip
-def test_an_argument_that_has_an_option_is_given_by_it(capsys, setting, advice):
-    """One of the two would be dropped without a word."""
-    words = ["evaluate", "scripted", *LITE, "--laps", "1", "--env-kwargs", "start=grid", setting]
+def test_an_argument_that_is_chosen_in_another_way(capsys, setting, advice):
+    words = ["evaluate", "scripted", *LITE, "--laps", "1", "--env-kwargs", setting]
     status, out, err = run(capsys, *words)
     assert (status, out, err.count("\n")) == (2, "", 1)
     assert f"--env-kwargs has {setting}" in err
@@ -396,7 +387,7 @@ def test_without_a_whole_lap_there_are_figures_and_no_report(capsys, tmp_path, p
     words = ["evaluate", str(plain), *LITE, "--laps", "1", "--report", str(page)]
     status, out, err = run(capsys, *words, "--json")
     assert (status, json.loads(out)["episodes"][0]["laps"]) == (0, 0)
-    assert err.endswith("sb3-torcs: no report: nobody drove a whole lap of aalborg\n")
+    assert err.endswith("sb3-torcs: no report: no whole lap of aalborg was driven\n")
     assert not page.exists()
     assert "report:" not in run(capsys, *words)[1]
 
@@ -405,7 +396,7 @@ def test_a_video_that_fails_takes_nothing_else_with_it(capsys, tmp_path, monkeyp
     def fail(*_):
         raise OutputNotWritable("ffmpeg stopped writing")
 
-    monkeypatch.setattr(recording.Recorder, "save_video", fail)
+    monkeypatch.setattr(pictures, "save_video", fail)
     files = {kind: str(tmp_path / f"one{kind}") for kind in (".mp4", ".png", ".parquet", ".html")}
     options = zip(("--video", "--line", "--telemetry", "--report"), files.values(), strict=True)
     words = ["evaluate", "scripted", *LITE, "--laps", "1", *itertools.chain(*options)]
@@ -419,7 +410,8 @@ def test_a_video_that_fails_takes_nothing_else_with_it(capsys, tmp_path, monkeyp
 def test_no_report_lays_laps_of_several_roads_on_one(capsys, tmp_path, monkeypatch):
     """Whether the random track is typed, or of the model's own training."""
     record = models.TrainingRecord(env_id="TorcsLite-v0", env_kwargs={"track": "random"})
-    monkeypatch.setattr(evaluate, "told_record", lambda driver: record)
+    driver = NamedDriver("scripted", "scripted", "scripted", record=record)
+    monkeypatch.setattr(evaluate, "named_driver", lambda source: driver)
     words = ["evaluate", "scripted", "--report", str(tmp_path / "one.html")]
     for more in ([], ["--track", "random"]):
         status, _, err = run(capsys, *words, *more)
@@ -429,12 +421,12 @@ def test_no_report_lays_laps_of_several_roads_on_one(capsys, tmp_path, monkeypat
 
 @pytest.mark.parametrize("words", ["delay", "=3"])
 def test_an_argument_without_a_value_is_refused(words):
-    with pytest.raises(argparse.ArgumentTypeError, match=r"expected NAME=VALUE, e\.g\. delay=2"):
+    with pytest.raises(argparse.ArgumentTypeError, match=r"expected NAME=VALUE, e\.g\. track"):
         common.setting(words)
 
 
 def test_a_value_that_is_not_yaml_is_refused():
-    said = r"'delay=\[3': '\[3' is no value of YAML; e\.g\. delay=\[0, 5\]"
+    said = r"'delay=\[3': '\[3' is no value of YAML; e\.g\. aids=\[unstick\]"
     with pytest.raises(argparse.ArgumentTypeError, match=said):
         common.setting("delay=[3")
 
@@ -469,54 +461,62 @@ def driven(capsys, *words):
 
 
 @pytest.mark.usefixtures("game")
-def test_a_robot_is_no_model(capsys):
-    status, _, err = run(capsys, "evaluate", "inferno")
-    assert status == 2
-    assert "'inferno' is a robot of the game" in err
-    assert err.endswith("type: sb3-torcs robots inferno\n")
+def test_a_robot_drives_as_any_driver(capsys, tmp_path):
+    line = tmp_path / "line.png"
+    words = ["inferno", "--track", "g-track-1", "--laps", "1", "--line", str(line), "--json"]
+    status, out, _ = run(capsys, "evaluate", *words)
+    value = json.loads(out)
+    (episode,) = value["episodes"]
+    assert (status, value["track"], value["car"]) == (0, "g-track-1", "car1-trb1")
+    assert (episode["laps"], episode["end"], episode["return"]) == (1, "laps", None)
+    assert line.read_bytes()[:4] == PNG
+    for more, message in (
+        (["--car", "p406"], "car is for an agent"),
+        (["--env", "TorcsLite-v0"], "a robot drives in Torcs-v0"),
+    ):
+        status, _, err = run(capsys, "evaluate", "inferno", *more)
+        assert status == 2
+        assert message in err
 
 
 @pytest.mark.usefixtures("game")
-def test_who_does_not_say_where_it_was_trained_drives_in_the_game(capsys, plain):
+def test_a_driver_without_a_record_drives_in_the_game(capsys, plain):
     for name, track in (("scripted", "a-speedway"), (plain, "aalborg")):
         trust = [] if name == "scripted" else ["--trust", "--algo", "ddpg"]
         world, said = driven(capsys, name, "--track", track, *trust)
         assert world == "Torcs-v0"
-        assert said.endswith(
-            f"driving Torcs-v0: '{name}' does not say where it was trained, and the game is "
-            "installed; --env TorcsLite-v0 drives it without the game\n"
-        )
         assert (f"'{name}' has no record of its training; track, car," in said) == (name == plain)
 
 
-@pytest.mark.usefixtures("no_game")
-def test_without_the_game_it_drives_in_the_world_that_needs_none(capsys, plain):
-    world, said = driven(capsys, plain, "--trust", "--algo", "ddpg")
-    assert world == "TorcsLite-v0"
-    assert "Torcs-v0 does not run here, `sb3-torcs doctor` says why" in said
-
-
 def test_an_agent_drives_in_the_world_of_its_training(capsys):
-    said = "driving TorcsLite-v0: 'ddpg-fallback' was trained there\n"
-    assert driven(capsys, "ddpg-fallback", "--track", "g-track-1") == ("TorcsLite-v0", said)
+    assert driven(capsys, "ddpg-fallback", "--track", "g-track-1") == ("TorcsLite-v0", "")
 
 
-def test_a_world_that_is_named_needs_no_reason(capsys):
+def test_a_world_that_is_named_comes_first(capsys):
     words = ["ddpg-fallback", "--track", "g-track-1"]
     assert driven(capsys, *words, "--env", "Torcs-v0") == ("Torcs-v0", "")
 
 
-def test_random_tracks_are_of_the_world_that_has_them(capsys):
-    world, said = driven(capsys, "scripted", "--track", "random")
-    assert world == "TorcsLite-v0"
-    assert "random tracks are there alone" in said
+@pytest.mark.usefixtures("game")
+def test_the_drivers_are_listed(capsys):
+    status, out, _ = run(capsys, "drivers", "--json")
+    rows = {row["name"]: row for row in json.loads(out)}
+    assert status == 0
+    assert {row["kind"] for row in rows.values()} == {"agent", "robot", "ghost", "scripted"}
+    assert rows["inferno"]["does"].startswith("drives car1-trb1; inferno:")
+    assert all(row["does"] for row in rows.values())
 
 
-def test_a_table_of_a_track_is_driven_in_the_world_that_reads_it(capsys):
-    file = BUNDLED_FOLDER / "road" / "aalborg.csv"
-    world, said = driven(capsys, "scripted", "--track", str(file))
-    assert world == "TorcsLite-v0"
-    assert ".csv tracks are there alone" in said
+def test_options_stand_between_names_too(capsys):
+    args = _parser()[0].parse_args(["compare", "bt", "--track", "forza", "inferno"])
+    assert (args.drivers, args.track) == (["bt", "inferno"], "forza")
+
+
+@pytest.mark.parametrize("verb", ["evaluate", "watch", "compare", "race", "compete"])
+def test_two_dashes_are_no_value(capsys, verb):
+    with pytest.raises(SystemExit):
+        main([verb, "scripted", "--track=--"])
+    assert "argument --track: '--' is no value" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("no_game")
@@ -570,27 +570,13 @@ def test_an_output_that_cannot_be_written_is_told_before_the_drive(capsys, tmp_p
     assert "cannot write to the folder" in err
 
 
-def test_the_environment_is_that_of_the_training_unless_the_words_say_otherwise():
-    kept = {"track": "alpine-1", "range_finders": "narrow", "action_repeat": 2}
-    record = models.TrainingRecord(env_kwargs={**kept, "start": "random", "laps": 9})
-    nothing = dict.fromkeys(("track", "car", "action_repeat", "range_finders"))
-    args = types.SimpleNamespace(laps=3, **nothing)
-    assert evaluate.environment_kwargs(args, record) == {**kept, "laps": 3}
-    args.track = "aalborg"
-    assert evaluate.environment_kwargs(args, record) == {**kept, "track": "aalborg", "laps": 3}
-
-
-@pytest.mark.parametrize(
-    ("option", "several"), [("track", ["alpine-1", "forza"]), ("car", ["baja-bug", "p406"])]
-)
-def test_a_model_of_several_tracks_or_cars_has_to_be_told_one(option, several):
-    record = models.TrainingRecord(env_kwargs={option: several})
-    args = types.SimpleNamespace(laps=3)
-    told = rf"2 {option}s, {', '.join(several)}; .* --{option} {several[0]}"
-    with pytest.raises(InvalidOption, match=told):
-        evaluate.environment_kwargs(args, record)
-    setattr(args, option, several[1])
-    assert evaluate.environment_kwargs(args, record)[option] == several[1]
+def test_what_is_typed_comes_before_the_training():
+    words = ["evaluate", "scripted", "--track", "forza", "--env-kwargs", "action_repeat=2"]
+    args = _parser()[0].parse_args(words)
+    assert common.environment_settings(args) == {"track": "forza", "action_repeat": 2}
+    args = _parser()[0].parse_args([*words, "track=aalborg"])
+    with pytest.raises(InvalidOption, match="track is given twice; give it one value"):
+        common.environment_settings(args)
 
 
 @pytest.mark.parametrize("verb", ["evaluate", "optimize-lap"])
@@ -659,114 +645,11 @@ def test_an_evaluation_is_of_one_environment():
         evaluation.evaluate(gym.make_vec("TorcsLite-v0", num_envs=2), ScriptedDriver())
 
 
-def test_an_evaluation_writes_its_drives_as_the_robots_are_written(capsys, tmp_path):
-    file = tmp_path / "drive.csv"
-    words = ["scripted", "--env", "TorcsLite-v0", "--track", "g-track-1", "--laps", "1"]
-    words += ["--episodes", "2", "--telemetry", str(file)]
-    status, out, _ = run(capsys, "evaluate", *words)
-    assert (status, out.splitlines()[-1]) == (0, f"telemetry: {file}")
-    with file.open(newline="") as opened:
-        rows = list(csv.DictReader(opened))
-    assert tuple(rows[0]) == TELEMETRY_FIELDS
-    assert {(row["robot"], row["index"]) for row in rows} == {("scripted", "1"), ("scripted", "2")}
-    first = [row for row in rows if row["index"] == "1"]
-    times = [round(float(row["time"]), 3) for row in first]
-    assert times == [round(0.1 * number, 3) for number in range(1, len(first) + 1)]
-    assert {row["gear_asked"] for row in rows} == {""}
-    assert max(float(row["throttle"]) for row in rows) == 1.0
-    assert [file.name for file in tmp_path.iterdir()] == ["drive.csv"]
-
-
-def timestep(lap_time=None, distance=0.0):
-    return recording.Recorded(None, types.SimpleNamespace(distance_raced=distance), lap_time)
-
-
-def test_the_best_stretch_is_the_fastest_whole_lap():
-    slow_then_fast = [timestep(), timestep(90.0), timestep(), timestep(80.0), timestep()]
-    stretch = recording.best_stretch([[timestep(), timestep(85.0)], slow_then_fast])
-    assert stretch == (1, 2, 4)
-
-
-def test_without_a_whole_lap_the_best_stretch_is_the_longest_drive():
-    episodes = [[timestep(distance=5.0)], [timestep(distance=1.0), timestep(distance=9.0)]]
-    assert recording.best_stretch(episodes) == (1, 0, 2)
-
-
-@pytest.fixture
-def recorded():
-    """A second episode that a driver ended soon, in a recorder."""
-    recorder = recording.Recorder("TorcsLite-v0", {"track": "random"}, 100)
-    for seed in (3, None):
-        recorder.reset(seed=seed)
-        for _ in range(12 if seed is None else 2):
-            recorder.step(np.array([0.0, 1.0, 0.0], np.float32))
-    yield recorder
-    recorder.close()
-
-
-def test_an_episode_is_driven_again_exactly(recorded):
-    """On the track that was drawn for the second episode."""
-    env = recorded._again(1)
-    for step in recorded.episodes[1]:
-        info = env.step(step.action)[4]
-        assert (info["car"].x, info["car"].y) == (step.car.x, step.car.y)
-    env.close()
-
-
-def test_an_episode_is_driven_again_from_its_own_seed_and_start():
-    recorder = recording.Recorder("TorcsLite-v0", {"track": "aalborg", "start": "random"}, 100)
-    begun = [{"seed": 1}, {"seed": 2}, {"options": {"distance": 500.0}}, {}]
-    firsts = [recorder.reset(**each)[1]["car"].x for each in begun]
-    for episode, x in enumerate(firsts):
-        env = recorder._again(episode)
-        assert env.unwrapped.car.x == x
-        env.close()
-    recorder.close()
-
-
-def test_a_video_shows_the_drive_with_its_aids_and_delay(monkeypatch):
-    """An aid steps in at the beginning of a timestep, and not between."""
-    kwargs = {"track": "g-track-1", "aids": ["unstick"], "ends": {"recovery": 20.0, "runoff": 5.0}}
-    kwargs["conditions"] = {"delay": 3}
-    recorder = recording.Recorder("TorcsLite-v0", kwargs, 100)
-    recorder.reset(seed=0)
-    for _ in range(60):
-        recorder.step(np.array([1.0, 0.3, 0.0], np.float32))
-    (timesteps,) = recorder.episodes
-    assert any(step.controls.throttle != pytest.approx(0.3) for step in timesteps), "it was freed"
-    shown, again = [], recorder._again
-
-    def shown_again(episode, **changes):
-        env = again(episode, **changes)
-        monkeypatch.setattr(env.unwrapped, "render", lambda: shown.append(env.unwrapped.car))
-        return env
-
-    monkeypatch.setattr(recorder, "_again", shown_again)
-    list(recorder._frames(recording.Stretch(0, 40, 60), 5))
-    assert len(shown) == 50
-    assert shown[-1][:23] == timesteps[-1].car[:23]
-    recorder.close()
-
-
-def test_a_stretch_is_recorded_in_real_time(recorded, tmp_path):
-    """12 timesteps of 0.1 s at 25 frames per second."""
-    frames = list(recorded._frames(recording.best_stretch(recorded.episodes), 5))
-    assert len(frames) == 30
-    assert {frame.shape for frame in frames} == {frames[0].shape}
-    recorded.save_video(tmp_path / "v.mp4")
-    assert (tmp_path / "v.mp4").stat().st_size > 1000
-
-
-def test_a_stretch_is_drawn(recorded, tmp_path):
-    recorded.draw_line(tmp_path / "line.png")
-    assert (tmp_path / "line.png").read_bytes()[:4] == PNG
-
-
 def test_what_was_driven_is_told_before_a_file_fails(capsys, tmp_path, monkeypatch):
     def full(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(recording.Recorder, "draw_line", full)
+    monkeypatch.setattr(pictures, "draw_line", full)
     line = str(tmp_path / "line.png")
     status, out, err = run(capsys, "evaluate", "scripted", *LITE, "--laps", "1", "--line", line)
     assert status == 2

@@ -49,7 +49,7 @@ def run(capsys, *words):
 def test_an_agent_a_robot_and_a_saved_drive_are_compared(tmp_path, capsys):
     """And the robot as it was saved drives as the robot does."""
     saved = tmp_path / "inferno.parquet"
-    assert main(["robots", "inferno", "--laps", "2", "--telemetry", str(saved)]) == 0
+    assert main(["evaluate", "inferno", "--laps", "2", "--telemetry", str(saved)]) == 0
     capsys.readouterr()
     page = tmp_path / "report.html"
     words = ["scripted", "inferno", saved, "--track", "aalborg", "--laps", "2", "--html", page]
@@ -133,7 +133,7 @@ def test_what_is_wrong_with_a_later_driver_is_told_before_the_first_one_drives(m
             raise ModelMismatch(f"{driver} does not fit")
 
     monkeypatch.setattr(comparing, "load_driver", refuse)
-    for driving in ("drive_log", "drive"):
+    for driving in ("race", "drive"):
         monkeypatch.setattr(comparing, driving, lambda *words, **named: pytest.fail("it drives"))
     with pytest.raises(ModelMismatch, match="ppo-post does not fit"):
         compare("inferno", "ddpg-aalborg", "ppo-post", track="aalborg", laps=1)
@@ -182,7 +182,7 @@ def test_a_drive_on_an_own_track_names_its_file(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.usefixtures("game")
 @pytest.mark.parametrize(
-    "driver", ["evaluate scripted --env Torcs-v0", "robots inferno", "race inferno --races 1"]
+    "driver", ["evaluate scripted --env Torcs-v0", "evaluate inferno", "race inferno --races 1"]
 )
 def test_others_drive_where_a_saved_drive_was(tmp_path, monkeypatch, driver):
     """And not on the track of the game that has the file's name."""
@@ -217,7 +217,7 @@ def test_drives_of_different_tracks_are_refused(saved, oval, tmp_path, capsys):
     [
         (["none.parquet"], "there is no file 'none.parquet'"),
         (["broken.parquet"], "'broken.parquet' cannot be read as a drive"),
-        (["infernal"], "there is no model 'infernal'"),
+        (["infernal"], "there is no driver 'infernal'"),
         (["scripted", "--track", "forzza"], "no track 'forzza'"),
         (["scripted", "--html", "page.txt"], "'page.txt' should end in .html"),
         (
@@ -239,12 +239,12 @@ def test_an_unfinished_lap_alone_is_an_error(oval, tmp_path, capsys):
     drive(DriveLog(), oval, laps=0, end=120.0, track="aalborg").write(path)
     status, _, err = run(capsys, path, "--html", tmp_path / "page.html")
     assert status == 2
-    assert "nobody drove a whole lap of aalborg, 2588 m: ana drove 120 m" in err
+    assert "no driver completed a lap of aalborg (2588 m): ana drove 120 m" in err
     assert not (tmp_path / "page.html").exists()
 
 
 def test_nobody_is_nobody_to_compare():
-    with pytest.raises(ValueError, match="there is nobody to compare; name drivers"):
+    with pytest.raises(ValueError, match="no driver is named; name some"):
         compare()
 
 
@@ -261,11 +261,6 @@ def test_a_report_of_an_own_track_needs_no_name(game, tmp_path):
     words = ["evaluate", "scripted", "--env", "Torcs-v0", "--track", str(tmp_path / "mine.xml")]
     assert main([*words, "--laps", "1", "--report", str(page)]) == 0
     assert page.is_file()
-
-
-def test_a_csv_of_a_drive_is_not_taken_for_a_model(capsys):
-    assert main(["compare", "drive.csv", "bt"]) == 2
-    assert "'drive.csv' is a CSV file" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("driver", [3, None, ["inferno", "bt"]])

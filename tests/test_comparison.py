@@ -11,7 +11,7 @@ from conftest import segment
 from made_drives import drive, log_of
 
 from sb3_torcs.errors import DriveFileError
-from sb3_torcs.evaluation.comparing import _told_apart
+from sb3_torcs.evaluation.comparing import _numbered
 from sb3_torcs.telemetry import DriveLog
 from sb3_torcs.telemetry.comparison import compare_drives
 from sb3_torcs.telemetry.corners import Corner, corners_of, stretches
@@ -145,7 +145,7 @@ def test_a_start_on_the_line_at_speed_is_no_start_from_the_grid(oval):
 def test_drivers_of_one_name_are_numbered(oval):
     (one,) = drives_of(log_of(oval, ("a", 20.0)).frame())
     drives = [dataclasses.replace(one, driver=name) for name in ("a", "a (2)", "a")]
-    assert [each.driver for each in _told_apart(drives)] == ["a", "a (2)", "a (3)"]
+    assert [each.driver for each in _numbered(drives)] == ["a", "a (2)", "a (3)"]
 
 
 def test_a_difference_that_is_none_has_no_sign():
@@ -154,7 +154,7 @@ def test_a_difference_that_is_none_has_no_sign():
 
 def test_nobody_with_a_whole_lap_is_an_error(oval):
     log = drive(DriveLog(), oval, laps=0, end=120.0)
-    with pytest.raises(DriveFileError, match=r"nobody drove a whole lap of oval.*ana drove 120 m"):
+    with pytest.raises(DriveFileError, match=r"no driver completed a lap of oval.*ana drove 120 m"):
         compared(log, oval)
 
 

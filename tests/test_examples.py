@@ -15,13 +15,12 @@ import pytest
 from made_agents import copied_agent
 from stable_baselines3 import PPO
 
+from sb3_torcs.agents.drivers import find_drivers
 from sb3_torcs.agents.models import AGENTS, driver_record, find_model
 from sb3_torcs.agents.saved.file import learned_weights, saved_weights
 from sb3_torcs.agents.saved.writing import RecordCallback, recipe, write_record
 from sb3_torcs.callbacks.lines import DrivenLap, driven_laps
 from sb3_torcs.errors import OutputNotWritable
-from sb3_torcs.evaluation.protocol import ChosenWorld
-from sb3_torcs.races.entrants import find_entrants
 from sb3_torcs.studies.config import read_study
 from sb3_torcs.training import zoo
 
@@ -87,7 +86,7 @@ def test_a_racer_is_trained_alone_and_against_robots(monkeypatch, capsys, tmp_pa
     budget = [f"--{stage}=1" for stage in ("alone", "robots")]
     run(monkeypatch, "train_racer.py", *budget, "--races", "2", "--folder", str(tmp_path))
     assert f"{tmp_path}/model.zip" in capsys.readouterr().out
-    (racer,) = find_entrants([str(tmp_path / "model.zip")], game)
+    (racer,) = find_drivers([str(tmp_path / "model.zip")])
     assert racer.name == "model"
 
 
@@ -418,7 +417,7 @@ def test_ctrl_c_shows_and_says_how_to_go_on(demo, monkeypatch, capsys, tmp_path)
 
 @pytest.mark.parametrize("env", ["Torcs-v0", "TorcsLite-v0"])
 def test_the_demo_learns_where_this_machine_can(demo, monkeypatch, tmp_path, env):
-    monkeypatch.setattr(demo, "choose_world", lambda *asked: ChosenWorld(env, "as the test says"))
+    monkeypatch.setattr(demo, "choose_world", lambda: env)
     assert demo.course_of(tmp_path) == demo.Course("ppo", env, "Torcs-v0")
     first, *_ = demo.first_words(tmp_path, demo.course_of(tmp_path), 1, False)
     assert ("in TORCS itself" in first) == (env == "Torcs-v0")

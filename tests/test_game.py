@@ -176,9 +176,11 @@ class TestContents:
     def test_a_mistyped_name_is_recognised(self, fake):
         with pytest.raises(TrackNotFound, match=r"no track 'lop'; did you mean 'loop'\?"):
             find_track("lop", fake)
-        with pytest.raises(UnknownCar, match=r"'bigg'; did you mean 'big'\? it has big, small"):
+        with pytest.raises(UnknownCar, match=r"no car 'bigg'; did you mean 'big'\?"):
             fake.find_car("bigg")
-        with pytest.raises(UnknownRobot, match=r"'racr'; did you mean 'racer'\? it has racer"):
+        with pytest.raises(
+            UnknownRobot, match=r"no robot 'racr'; did you mean 'racer'\? `sb3-torcs drivers`"
+        ):
             fake.find_robot("racr", 3)
         with pytest.raises(UnknownRobot, match=r"no robot 'human'"):
             fake.find_robot("human", 3)

@@ -15,6 +15,7 @@ import sys
 import warnings
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium as gym
 import imageio_ffmpeg
@@ -28,8 +29,17 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecVide
 
 from sb3_torcs.envs.torcs import TorcsEnv
 from sb3_torcs.envs.torcs_lite import TorcsLiteEnv
-from sb3_torcs.errors import DisplayUnavailable, EnvClosed, GameFailed, InvalidOption
+from sb3_torcs.errors import (
+    DisplayUnavailable,
+    EnvClosed,
+    GameFailed,
+    GameTimeout,
+    InvalidOption,
+)
 from sb3_torcs.evaluation.ticks import log_drives
+from sb3_torcs.rendering import game_camera
+from sb3_torcs.rendering.game_camera import HEADER, read_frame
+from sb3_torcs.rendering.gap import side_by_side
 from sb3_torcs.torcs.window import VIEWS
 
 TORCS = "sb3_torcs:Torcs-v0"
@@ -412,3 +422,41 @@ def test_without_a_virtual_display_it_says_what_to_type(env, monkeypatch, tmp_pa
     env.reset(seed=1)
     with pytest.raises(DisplayUnavailable, match="sudo apt install xvfb"):
         env.render()
+
+
+def test_a_game_that_hangs_is_an_error(monkeypatch):
+    monkeypatch.setattr(game_camera, "PATIENCE", 0.1)
+    game = SimpleNamespace(last_words=lambda: "Ready.")
+    receiver, sender = os.pipe()
+    with pytest.raises(GameTimeout, match=r"no picture for 0\.1 s; it last said: Ready\."):
+        read_frame(receiver, game)
+    os.close(sender)
+    assert read_frame(receiver, game) is None
+    os.close(receiver)
+
+
+@pytest.mark.parametrize(
+    "sent",
+    [
+        HEADER.pack(b"SB3F", 2, 2, 0, 0.0, 0.0) + b"short",
+        HEADER.pack(b"what", 2, 2, 0, 0.0, 0.0) + bytes(12),
+        b"SB3F",
+    ],
+)
+def test_half_a_frame_is_an_error(sent):
+    game = SimpleNamespace(epitaph=lambda: "the game ended")
+    receiver, sender = os.pipe()
+    os.write(sender, sent)
+    os.close(sender)
+    with pytest.raises(GameFailed, match="the game ended"):
+        read_frame(receiver, game)
+    os.close(receiver)
+
+
+def test_videos_go_side_by_side():
+    def plain(level, width, count):
+        return (np.full((4, width, 3), level + n, np.uint8) for n in range(count))
+
+    joint = list(side_by_side(plain(0, 2, 3), plain(100, 6, 2)))
+    assert [picture.shape for picture in joint] == [(4, 8, 3)] * 3
+    assert [(p[0, 0, 0], p[0, 7, 0]) for p in joint] == [(0, 100), (1, 101), (2, 101)]

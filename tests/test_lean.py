@@ -156,7 +156,7 @@ NEEDS = [
     (["evaluate", "scripted", "--telemetry", "a.parquet"], "pyarrow"),
     (["evaluate", "scripted", "--report", "a.html"], "plotly"),
     (["compare", "scripted"], "plotly"),
-    (["robots", "inferno", "--telemetry", "a.parquet"], "pyarrow"),
+    (["evaluate", "inferno", "--telemetry", "a.parquet"], "pyarrow"),
     (["race", "scripted", "inferno"], "openskill"),
     (["watch", "scripted", "--video", "a.mp4"], "imageio_ffmpeg"),
     (["study", "--report", "."], "plotly"),

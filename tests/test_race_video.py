@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from stadium import COASTING, stadium, state
 
+from sb3_torcs.agents.drivers import find_drivers
 from sb3_torcs.cli import main
 from sb3_torcs.cli.race import _followed
 from sb3_torcs.races import protocol, standings, video
-from sb3_torcs.races.entrants import find_entrants
 from sb3_torcs.races.protocol import run_race
 from sb3_torcs.races.video import Footage, Moment, gaps
 from sb3_torcs.rendering.board import Field, Row
@@ -70,7 +70,7 @@ def test_who_is_out_is_told_so():
 
 def test_the_last_gaps_are_those_of_the_standings(game):
     made = Footage()
-    race = run_race(find_entrants(["tita", "bt"], game), "g-track-1", laps=1, watchers=[made])
+    race = run_race(find_drivers(["tita", "bt"]), "g-track-1", laps=1, watchers=[made])
     first, second = race.standings
     assert sorted(gaps(made, 1)[-1]) == ["", f"+{second.time - first.time:.2f}"]
 
@@ -105,9 +105,9 @@ def written(monkeypatch):
 
 @pytest.mark.parametrize(("agents", "followed"), [({"a", "b"}, "b"), ({"a"}, "a"), (set(), "a")])
 def test_the_camera_follows_the_best_agent_or_else_the_first_driver(agents, followed):
-    entrants = [SimpleNamespace(name=n, agent=n if n in agents else None) for n in "abc"]
+    drivers = [SimpleNamespace(name=n, robot=None if n in agents else (n, 0)) for n in "abc"]
     race = SimpleNamespace(standings=[SimpleNamespace(driver=name) for name in "cba"])
-    assert _followed(entrants, race) == followed
+    assert _followed(drivers, race) == followed
 
 
 def test_the_first_race_is_recorded_as_if_nobody_looked(

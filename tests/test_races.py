@@ -16,8 +16,9 @@ import torch as th
 from made_agents import copied_agent
 from stable_baselines3 import PPO
 
+from sb3_torcs.agents.drivers import find_drivers
 from sb3_torcs.agents.models import find_model
-from sb3_torcs.agents.pilots import Crew
+from sb3_torcs.agents.pilots import AgentOpponents
 from sb3_torcs.agents.robots import race as robots_race
 from sb3_torcs.agents.saved.writing import recipe, write_record
 from sb3_torcs.agents.scripted import ScriptedDriver
@@ -26,7 +27,6 @@ from sb3_torcs.envs.options import AIDS
 from sb3_torcs.errors import InvalidOption, OutputNotWritable
 from sb3_torcs.evaluation.comparing import saved_drives
 from sb3_torcs.races import protocol
-from sb3_torcs.races.entrants import find_entrants
 from sb3_torcs.races.picture import draw_race
 from sb3_torcs.races.protocol import Race, Standing, run_race, run_races
 from sb3_torcs.races.ratings import ratings
@@ -104,11 +104,11 @@ class TestGrid:
         """Hold races in which all come in as they start; return who started where."""
 
         def hold(order, seed):
-            (race,) = held([entrant.name for entrant in order])
+            (race,) = held([driver.name for driver in order])
             return race
 
         def grids(drivers, **options):
-            races = run_races(find_entrants(drivers, game), hold, **{"races": 8, **options})
+            races = run_races(find_drivers(drivers), hold, **{"races": 8, **options})
             return [[s.driver for s in race.standings] for race in races]
 
         return grids
@@ -158,17 +158,16 @@ class TestGrid:
     [
         (["bt", "bt:2"], "driver 'bt' is named twice"),
         (["ddpg-aalborg", "ddpg-aalborg"], "driver 'ddpg-aalborg' is named twice"),
-        (["infermo"], "infermo.*and there is no robot 'infermo'; did you mean 'inferno'"),
-        (["lap.npz"], "is a ghost, which looks at nobody"),
+        (["infermo"], "no driver 'infermo'; did you mean 'inferno'"),
     ],
 )
 def test_a_driver_that_cannot_take_part(drivers, message, game):
     with pytest.raises(InvalidOption, match=message):
-        find_entrants(drivers, game)
+        find_drivers(drivers)
 
 
 def test_more_cars_than_a_grid_has_room_for_are_refused(game):
-    (bt,) = find_entrants(["bt"], game)
+    (bt,) = find_drivers(["bt"])
     crowd = [replace(bt, name=str(number)) for number in range(21)]
     with pytest.raises(InvalidOption, match=r"21 drivers in a race; .* room for 20: .*--field 20"):
         run_races(crowd, lambda order, seed: None, races=1)
@@ -183,10 +182,10 @@ def test_more_cars_than_a_grid_has_room_for_are_refused(game):
 
 
 def test_races_that_cannot_be_held_are_refused_at_once(game):
-    entrants = find_entrants(["bt", "inferno"], game)
+    drivers = find_drivers(["bt", "inferno"])
     for wrong in ({"races": 0}, {"races": 1, "grid": "x"}, {"races": 1, "field_size": 3}):
         with pytest.raises(InvalidOption):
-            run_races(entrants, lambda order, seed: None, **wrong)
+            run_races(drivers, lambda order, seed: None, **wrong)
 
 
 def test_models_of_one_file_name_are_told_apart_by_their_folders(game, tmp_path, monkeypatch):
@@ -197,18 +196,18 @@ def test_models_of_one_file_name_are_told_apart_by_their_folders(game, tmp_path,
     for path in paths:
         (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / path).write_bytes(shipped)
-    entrants = find_entrants([*paths, "bt", "ddpg-aalborg"], game)
-    assert [entrant.name for entrant in entrants] == [
+    drivers = find_drivers([*paths, "bt", "ddpg-aalborg"])
+    assert [driver.name for driver in drivers] == [
         "r1/model", "a/r2/model", "b/r2/model", f"{tmp_path.name}/bt", "other",
         "c/run", "d/run", "r1/ddpg-aalborg", "bt", "ddpg-aalborg",
     ]  # fmt: skip
     with pytest.raises(InvalidOption, match=r"driver 'r1/model\.zip' is named twice"):
-        find_entrants(["r1/model.zip", "a/../r1/model", "bt"], game)
+        find_drivers(["r1/model.zip", "a/../r1/model", "bt"])
 
 
 def test_the_error_is_one_wherever_robots_and_agents_can_be_named(capsys, game):
-    message = "and there is no robot 'infermo'; did you mean 'inferno'"
-    for find in (lambda: find_entrants(["infermo"], game), lambda: Crew(["infermo"])):
+    message = "there is no driver 'infermo'; did you mean 'inferno'"
+    for find in (lambda: find_drivers(["infermo"]), lambda: AgentOpponents(["infermo"])):
         with pytest.raises(InvalidOption, match=message):
             find()
     for command in (["compare", "infermo", "bt"], ["watch", "infermo"], ["race", "infermo"]):
@@ -219,7 +218,7 @@ def test_the_error_is_one_wherever_robots_and_agents_can_be_named(capsys, game):
 def test_robots_race_as_by_the_game_s_rules(game):
     """The same order, times and damage as ``sb3-torcs robots``, which equals the game."""
     robots = [("bt", 2), ("inferno", 3)]
-    race = run_race(find_entrants(["bt", "inferno"], game), SHORT, laps=2)
+    race = run_race(find_drivers(["bt", "inferno"]), SHORT, laps=2)
     for one, other in zip(
         race.standings, robots_race(robots, SHORT, 2, session="race"), strict=True
     ):
@@ -231,8 +230,8 @@ def test_robots_race_as_by_the_game_s_rules(game):
 
 
 def test_a_race_is_the_same_race_twice(game):
-    entrants = find_entrants(["scripted", "bt"], game)
-    one, other = (run_race(entrants, SHORT, laps=1) for _ in range(2))
+    drivers = find_drivers(["scripted", "bt"])
+    one, other = (run_race(drivers, SHORT, laps=1) for _ in range(2))
     assert one.standings == other.standings
     assert np.array_equal(one.distances, other.distances)
     assert [standing.driver for standing in one.standings] == ["bt", "scripted"]
@@ -241,7 +240,7 @@ def test_a_race_is_the_same_race_twice(game):
 
 def test_distances_count_from_the_line_and_not_from_each_car_s_slot(game):
     """After a second, before anybody has overtaken: as they stood, and behind the line."""
-    race = run_race(find_entrants(["bt", "inferno"], game), SHORT, laps=1)
+    race = run_race(find_drivers(["bt", "inferno"]), SHORT, laps=1)
     first, second = race.distances[0]
     assert second < first - 5.0
     assert first < 0.0
@@ -257,7 +256,7 @@ def test_an_agent_that_answers_no_number_is_out_and_the_others_race_on(monkeypat
         return (action * np.nan if len(asked) > 50 else action), state
 
     monkeypatch.setattr(ScriptedDriver, "predict", failing)
-    race = run_race(find_entrants(["scripted", "bt"], game), SHORT, laps=1)
+    race = run_race(find_drivers(["scripted", "bt"]), SHORT, laps=1)
     first, second = race.standings
     assert (first.driver, first.out, second.driver, second.out) == ("bt", False, "scripted", True)
     assert "steering is nan" in race.failures["scripted"]
@@ -274,8 +273,8 @@ def test_a_policy_that_refuses_to_draw_from_no_numbers_is_out_too(game, tmp_path
             weights.copy_(3e38 * th.sign(weights + 1e-9))
     write_record(model, recipe("ppo", "Torcs-v0", {}))
     model.save(tmp_path / "astray")
-    entrants = find_entrants([str(tmp_path / "astray.zip"), "bt"], game)
-    race = run_race(entrants, SHORT, laps=1)
+    drivers = find_drivers([str(tmp_path / "astray.zip"), "bt"])
+    race = run_race(drivers, SHORT, laps=1)
     assert [standing.out for standing in race.standings] == [False, True]
     assert "computes no numbers" in next(iter(race.failures.values()))
 
@@ -284,8 +283,8 @@ def test_a_policy_that_refuses_to_draw_from_no_numbers_is_out_too(game, tmp_path
 def test_a_race_with_hard_contacts_ends_with_numbers(game, tmp_path):
     """A contact may put a car nowhere: then its driver is out, and the others race on."""
     racer = copied_agent("ppo-racer", tmp_path / "racer.zip", aids=["unstick", "keep_distance"])
-    entrants = find_entrants(["inferno", racer], game)
-    race = run_race(entrants, "aalborg", laps=3)
+    drivers = find_drivers(["inferno", racer])
+    race = run_race(drivers, "aalborg", laps=3)
     assert {one.driver for one in race.standings if one.out} == set(race.failures)
     assert np.isfinite(race.distances).all()
 
@@ -293,7 +292,7 @@ def test_a_race_with_hard_contacts_ends_with_numbers(game, tmp_path):
 @pytest.mark.parametrize("laps", [0, 1 << 31])
 def test_a_race_of_no_laps_or_too_many_is_refused(game, laps):
     with pytest.raises(InvalidOption, match=f"laps is {laps}; expected a whole number"):
-        run_race(find_entrants(["bt"], game), SHORT, laps=laps)
+        run_race(find_drivers(["bt"]), SHORT, laps=laps)
 
 
 def test_no_report_is_made_of_a_race_without_a_whole_lap(capsys, game, monkeypatch, tmp_path):
@@ -304,7 +303,7 @@ def test_no_report_is_made_of_a_race_without_a_whole_lap(capsys, game, monkeypat
     words = ["race", "bt", "inferno", "--track", SHORT, "--laps", "1", "--races", "1"]
     assert main([*words, "--report", str(report), "--picture", str(picture)]) == 0
     printed = capsys.readouterr()
-    assert "no report: nobody drove a whole lap" in printed.err
+    assert "no report: no driver completed a lap" in printed.err
     assert (report.exists(), picture.is_file()) == (False, True)
     assert f"picture: {picture}" in printed.out
     assert "report:" not in printed.out
@@ -315,7 +314,7 @@ def test_an_agent_that_learned_alone_may_get_aids(tmp_path, game):
     alone = "ppo-any-road"
     with_aids = copied_agent(alone, tmp_path / "agent.zip", aids=AIDS)
     races = [
-        run_race(find_entrants(["bt", "inferno", agent], game, aids), SHORT, laps=1)
+        run_race(find_drivers(["bt", "inferno", agent], aids), SHORT, laps=1)
         for agent, aids in ((alone, AIDS), (with_aids, ()), (alone, ()))
     ]
     aided, shipped, alone = (
@@ -344,9 +343,9 @@ def test_robots_get_no_aids(capsys, game):
 def test_an_agent_with_aids_and_without_a_record_is_still_told(game, tmp_path):
     file = tmp_path / "plain.zip"
     PPO("MlpPolicy", "sb3_torcs:TorcsLite-v0", n_steps=2, batch_size=2, device="cpu").save(file)
-    (entrant,) = find_entrants([str(file)], game, ["unstick"])
-    assert not entrant.agent.record.known
-    assert entrant.agent.kept(["action"]) == {"aids": ("unstick",)}
+    (driver,) = find_drivers([str(file)], ["unstick"])
+    assert not driver.record.known
+    assert driver.options(["action"]) == {"aids": ("unstick",)}
 
 
 def test_policies_of_one_driver_are_asked_at_once(monkeypatch, game):
@@ -360,8 +359,8 @@ def test_policies_of_one_driver_are_asked_at_once(monkeypatch, game):
             shapes.append(seen.shape) or predict(self, seen, *words, **options)
         ),
     )
-    (entrant,) = find_entrants(["scripted"], game)
-    run_race([entrant, entrant, entrant], SHORT, laps=1)
+    (driver,) = find_drivers(["scripted"])
+    run_race([driver, driver, driver], SHORT, laps=1)
     assert set(shapes) == {(3, 29)}
 
 

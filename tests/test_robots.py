@@ -5,21 +5,21 @@ This is a choice that takes seconds; ``tools/compare_with_game.py`` compares the
 
 from __future__ import annotations
 
-import csv
 import ctypes
-import itertools
-import resource
 
+import numpy as np
 import pytest
+from text_mode import run as run_game
 
-from sb3_torcs.agents.robots import _result, race, race_to_its_end
+from sb3_torcs.agents.robots import _result, race
 from sb3_torcs.backends.native import make_engine
 from sb3_torcs.car import CONTROL_TICK
-from sb3_torcs.errors import InvalidOption, OutputNotWritable, TrackNotFound, UnknownRobot
-from sb3_torcs.races.text_mode import run as run_game
-from sb3_torcs.telemetry import TELEMETRY_FIELDS
+from sb3_torcs.errors import InvalidOption, TrackNotFound, UnknownRobot
+from sb3_torcs.telemetry import COLUMNS, DriveLog
 from sb3_torcs.torcs import process
 from sb3_torcs.torcs.starting_list import AGENT
+
+COLUMN = {name: number for number, name in enumerate(COLUMNS)}
 
 ROBOTS = ["inferno", "berniw", "bt", "olethros", "tita", "lliaw"]
 EVERYBODY_ON = ["road/aalborg", "oval/michigan", "dirt/dirt-1"]
@@ -157,47 +157,23 @@ class TestItself:
             assert result.total_time == pytest.approx(times, abs=1e-6)
 
 
-class TestTelemetry:
-    def test_it_has_a_row_per_robot_and_call(self, game, tmp_path):
-        file = tmp_path / "drive.csv"
-        drivers = [("inferno", 3), ("berniw", 3)]
-        results = race(drivers, "michigan", 1, session="race", telemetry=file)
-        with file.open(newline="") as opened:
-            rows = list(csv.DictReader(opened))
-        assert tuple(rows[0]) == TELEMETRY_FIELDS
-        times = [float(row["time"]) for row in rows if row["robot"] == "inferno"]
-        *steps, last = (round(later - now, 3) for now, later in itertools.pairwise(times))
+class TestLog:
+    def test_it_has_a_row_per_robot_and_control_tick(self, game):
+        log = DriveLog()
+        results = race([("inferno", 3), ("berniw", 3)], "michigan", 1, session="race", log=log)
+        inferno, berniw = log.episodes().values()
+        assert [label.driver for label in log.episodes()] == ["inferno", "berniw"]
+        assert inferno.shape == berniw.shape
+        *steps, last = np.round(np.diff(inferno[:, COLUMN["time"]]), 3)
         assert set(steps) == {0.02, 0.022} or set(steps) == {0.02}
         assert 0.0 < last <= 0.022  # the race ends where the second car has finished
-        assert len(rows) == 2 * len(times)
-        for result in results:
-            own = [row for row in rows if row["robot"] == result.robot]
-            reached = max(float(row["last_lap_time"]) for row in own)
+        for result, rows in zip(results, (inferno, berniw), strict=True):
+            reached = rows[:, COLUMN["last_lap_time"]].max()
             assert reached == pytest.approx(result.laps[-1].time, abs=1e-9)
 
-    def test_writing_it_changes_nothing(self, game, tmp_path):
-        written = race([("bt", 3)], "dirt-1", 1, telemetry=tmp_path / "drive.csv")
-        assert race([("bt", 3)], "dirt-1", 1) == written
-
-    def test_a_folder_that_is_not_there(self, game, tmp_path):
-        with pytest.raises(OutputNotWritable, match="choose another file"):
-            race([("bt", 3)], "dirt-1", 1, telemetry=tmp_path / "nowhere" / "drive.csv")
-
-    @pytest.mark.parametrize("ending", ["csv", "parquet"])
-    def test_a_full_disk_does_not_lose_the_results(self, game, tmp_path, ending):
-        robots, file = [("bt", 3)], tmp_path / f"drive.{ending}"
-        usual = race(robots, "dirt-1", 1)
-        most = resource.getrlimit(resource.RLIMIT_FSIZE)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, most[1]))
-        try:
-            results, error = race_to_its_end(robots, "dirt-1", 1, telemetry=file)
-            with pytest.raises(OutputNotWritable, match="cannot write"):
-                race(robots, "dirt-1", 1, telemetry=file)
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, most)
-        assert results == usual
-        assert f"cannot write '{file}'" in str(error)
-        assert list(tmp_path.iterdir()) == []
+    def test_to_note_it_changes_nothing(self, game):
+        noted = race([("bt", 3)], "dirt-1", 1, log=DriveLog())
+        assert race([("bt", 3)], "dirt-1", 1) == noted
 
 
 class TestStartsElsewhere:

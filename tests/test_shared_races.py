@@ -720,7 +720,7 @@ class TestAgentsAsOpponents:
             ({"action_repeat": 2}, "action_repeat is 2, .* were trained with 5"),
             ({"conditions": {"grip": 0.9}}, "grip is .* which this world cannot change"),
             ({"picture": "game", "render_mode": "rgb_array"}, "'scripted' is an agent"),
-            ({"opponents": ["infermo"]}, "give the.*no robot 'infermo'; did you mean 'inferno'"),
+            ({"opponents": ["infermo"]}, "no driver 'infermo'; did you mean 'inferno'"),
             ({"opponents": ["inferno"] * 20}, "opponents has 20 names; expected at most 19"),
         ],
     )

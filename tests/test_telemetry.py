@@ -23,7 +23,7 @@ from sb3_torcs.evaluation.protocol import evaluate, race_environment
 from sb3_torcs.evaluation.ticks import log_drives
 from sb3_torcs.sensors import SENSORS
 from sb3_torcs.telemetry import STATE_FIELDS, DriveLabel, DriveLog, read_drives
-from sb3_torcs.telemetry.drives import COLUMNS, LABELS
+from sb3_torcs.telemetry.drives import COLUMNS, LABELS, car_of, controls_of
 from sb3_torcs.telemetry.laps import drives_of
 
 LABEL = DriveLabel("ana", "aalborg", "car1-trb1", "Torcs-v0", 2)
@@ -186,17 +186,24 @@ def test_who_looks_on_draws_no_noise(kwargs):
 
 
 @pytest.mark.usefixtures("game")
-def test_robots_write_the_same_drive_in_both_formats(tmp_path):
-    race([("bt", 3)], "dirt-1", 1, telemetry=tmp_path / "drive.csv")
-    (result,) = race([("bt", 3)], "dirt-1", 1, telemetry=tmp_path / "drive.parquet")
-    table, drives = (
-        pd.read_csv(tmp_path / "drive.csv", engine="python"),
-        read_drives(tmp_path / "drive.parquet"),
-    )
-    for name in ("time", "x", "speed_x", "laps", "throttle", "gear_asked"):
-        assert table[name].tolist() == drives[name].tolist()
+def test_robots_write_their_drive(tmp_path):
+    log = DriveLog()
+    (result,) = race([("bt", 3)], "dirt-1", 1, log=log)
+    log.write(tmp_path / "drive.parquet")
+    drives = read_drives(tmp_path / "drive.parquet")
     assert set(drives["driver"]) == {"bt:3"}
     assert drives["last_lap_time"].iloc[-1] == result.laps[0].time
+
+
+@pytest.mark.usefixtures("game")
+def test_a_row_is_the_car_and_its_controls_again():
+    log = DriveLog()
+    race([("bt", 3)], "dirt-1", 1, log=log)
+    ((label, rows),) = log.episodes().items()
+    assert log.tracks[label].name == "dirt-1"
+    assert car_of(rows[-1]).laps == 1
+    assert car_of(rows[50])[:23] == tuple(rows[50, :23])
+    assert controls_of(rows[50])[:3] == tuple(rows[50, -4:-1])
 
 
 def test_a_file_appears_when_it_is_whole(tmp_path, oval):

@@ -9,7 +9,9 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+import text_mode
 from fake_game import write, write_game, write_program
+from text_mode import run
 
 from sb3_torcs.errors import (
     GameFailed,
@@ -21,8 +23,6 @@ from sb3_torcs.errors import (
     UnknownCar,
     UnknownRobot,
 )
-from sb3_torcs.races import text_mode
-from sb3_torcs.races.text_mode import run
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.libraries import missing_libraries
 from sb3_torcs.torcs.process import game_environment

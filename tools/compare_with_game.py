@@ -10,11 +10,11 @@ import sys
 
 from rich.console import Console
 from rich.progress import track as progress
+from text_mode import run as run_game
 
 from sb3_torcs.agents.robots import race
 from sb3_torcs.cli.common import print_json, quiet_output, table
 from sb3_torcs.errors import Sb3TorcsError
-from sb3_torcs.races.text_mode import run as run_game
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.race_results import RobotResult
 from sb3_torcs.torcs.race_setup import session_for

@@ -5,9 +5,9 @@ import argparse
 import gymnasium as gym
 import numpy as np
 
-from sb3_torcs.agents.models import agent_record, load_driver
+from sb3_torcs.agents.drivers import find_driver
+from sb3_torcs.agents.models import load_driver
 from sb3_torcs.errors import ends_in_a_line
-from sb3_torcs.torcs.installation import find_game
 
 ROBOTS = ("berniw", "bt", "inferno", "lliaw", "olethros", "tita", "inferno:4", "bt:3", "tita:4")
 LOOK, AHEAD, HELD = 3, 22, 6  # timesteps: between two looks, looked ahead, of a change
@@ -63,7 +63,7 @@ class Racer:
 def race(args, seed):
     """Drive a race from the last place, and return the last info."""
     order = np.random.default_rng(seed).permutation(len(ROBOTS))
-    kept = agent_record(args.agent, find_game()).env_kwargs
+    kept = find_driver(args.agent).record.env_kwargs
     options = {"opponents": [ROBOTS[i] for i in order], "laps": args.laps, "max_episode_steps": -1}
     options |= {
         "ends": {"runoff": 30.0, "recovery": 60.0}

@@ -189,20 +189,22 @@ class GhostDriver:
         """
         Give the next action.
 
-        :param observation: unused
+        :param observation: unused, but for its shape: (n,), or (cars, n)
         :param state: timesteps driven; ``None`` begins
         :param episode_start: (1,) whether an episode begins here
         :param deterministic: unused; it always is
         :return: the action, and the state for the next call
         """
-        del observation, deterministic
+        del deterministic
         begins = state is None or (episode_start is not None and bool(np.any(episode_start)))
         step = 0 if begins or state is None else state
         actions = self.ghost.actions
         if step < len(actions):
-            return actions[step], step + 1
-        width = actions.shape[1]
-        return np.array([0.0, AFTERWARDS] if width == 2 else [0.0, 0.0, -AFTERWARDS], "f4"), step
+            action, step = actions[step], step + 1
+        else:
+            brake = [0.0, AFTERWARDS] if actions.shape[1] == 2 else [0.0, 0.0, -AFTERWARDS]
+            action = np.array(brake, np.float32)
+        return np.broadcast_to(action, (*np.shape(observation)[:-1], action.size)), step
 
 
 USUAL: Mapping[str, Any] = {

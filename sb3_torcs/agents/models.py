@@ -7,7 +7,7 @@ import json
 import os
 import pickle
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -39,18 +39,16 @@ from sb3_torcs.errors import (
     InvalidOption,
     ModelMismatch,
     ModelNotTrusted,
+    UnknownDriver,
     near_miss,
 )
 from sb3_torcs.files import readable
-from sb3_torcs.torcs.installation import INSTALL, find_game
-
-if TYPE_CHECKING:
-    from sb3_torcs.torcs.installation import Game
+from sb3_torcs.torcs.installation import find_game
 
 __all__ = [
+    "AGENTS",
     "ModelDriver",
     "TrainingRecord",
-    "agent_record",
     "check_spaces",
     "driver_name",
     "driver_record",
@@ -80,10 +78,11 @@ def find_model(path: str | Path, *, prefer_last: bool = False) -> Path:
     :param prefer_last: of a folder take the last model rather than the best one
     :return: the file
     :raises InvalidOption: if there is none
+    :raises UnknownDriver: if nothing has this name
     """
     advice = (
-        "give the .zip that a training saved, the folder of its run, or a shipped agent: "
-        f"{', '.join(shipped_agents())}"
+        "give the .zip that a training saved, the folder of its run, or a shipped agent, which "
+        "`sb3-torcs drivers` lists"
     )
     if not isinstance(path, str | Path) or not str(path).strip():  # "" is the present folder
         raise InvalidOption(f"{path!r} names no model; {advice}")
@@ -97,10 +96,10 @@ def find_model(path: str | Path, *, prefer_last: bool = False) -> Path:
         if _is_robot(str(path)):
             raise InvalidOption(
                 f"'{path}' is a robot of the game, and a model is asked for; to drive the robot "
-                f"type: sb3-torcs robots {path}"
+                f"type: sb3-torcs evaluate {path}"
             )
         known = [*(file.name for file in given.parent.glob("*.zip")), *shipped_agents()]
-        raise InvalidOption(f"there is no model '{given}'{near_miss(given.name, known, advice)}")
+        raise UnknownDriver(f"there is no model '{given}'{near_miss(given.name, known, advice)}")
     best = given / BEST_MODEL
     last = [
         file for file in (given / f"{sub.name}.zip" for sub in given.iterdir()) if file.is_file()
@@ -157,25 +156,6 @@ def driver_record(driver: str | Path) -> TrainingRecord:
     if is_ghost(driver):
         return TrainingRecord(env_id="Torcs-v0", env_kwargs=read_ghost(driver).env_kwargs)
     return TrainingRecord() if str(driver) == SCRIPTED else training_record(find_model(driver))
-
-
-def agent_record(driver: str | Path, game: Game | None) -> TrainingRecord:
-    """
-    Read how an agent was trained, where a robot of the game could be named as well.
-
-    :param driver: that is none of the game's robots, as of :func:`driver_record`
-    :param game: the installation; without one there are no robots
-    :return: what is known
-    :raises InvalidOption: if there is no such agent; names robots of a similar name
-    """
-    try:
-        return driver_record(driver)
-    except InvalidOption as error:
-        if game is None:
-            no_robot = f"there are no robots, since TORCS was not found; type: {INSTALL}"
-        else:
-            no_robot = f"there is no robot '{driver}'{near_miss(driver, game.robots())}"
-        raise InvalidOption(f"{error}; and {no_robot}") from None
 
 
 def driver_name(driver: str | Path) -> str:

@@ -2,61 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from sb3_torcs.agents.ghosts import is_ghost
-from sb3_torcs.agents.models import agent_record, load_driver
+from sb3_torcs.agents.drivers import NamedDriver, find_driver
+from sb3_torcs.agents.models import load_driver
 from sb3_torcs.agents.saved.record import DRIVEN_WITH
 from sb3_torcs.agents.wrapping import wrapped
 from sb3_torcs.backends.seats import SeatWorld, SharedRace
-from sb3_torcs.car import FloatArray, range_finder_angles
 from sb3_torcs.envs.torcs_race import RaceCarEnv
 from sb3_torcs.errors import InvalidAction, InvalidOption, ModelMismatch
-from sb3_torcs.torcs.installation import find_game
 
-__all__ = ["CarOfAnAgent", "Crew", "Pilots"]
+__all__ = ["AgentOpponents", "Pilots", "check_racers"]
 
 OF_THE_SEAT = ("range_finders", "gearbox")
 """What an agent drives with that its seat brings along: both are chosen before a race is loaded."""
 OF_THE_ENV = tuple(name for name in DRIVEN_WITH if name not in OF_THE_SEAT)
 
 
-class CarOfAnAgent:
-    """
-    What an agent's car needs before its race is loaded.
-
-    :param driver: as of :func:`~sb3_torcs.agents.models.load_driver`
-    :param aids: names of driver aids that it gets besides those that it was trained with
-    :raises InvalidOption: if there is no such agent, or it is a ghost
-    """
-
-    def __init__(self, driver: str, aids: Iterable[str] = ()) -> None:
-        if is_ghost(driver):
-            raise InvalidOption(f"'{driver}' is a ghost, which looks at nobody and cannot race")
-        self.driver = driver
-        self.record = agent_record(driver, find_game())
-        kwargs = self.record.env_kwargs
-        self._aids = (*kwargs.get("aids", ()), *aids)
-        self.car = self.record.one_car
-        self.gearbox: str = kwargs.get("gearbox", "automatic")
-        self.angles: FloatArray = range_finder_angles(kwargs.get("range_finders", "scr"))
-
-    def kept(self, names: Iterable[str]) -> dict[str, Any]:
-        """
-        Tell how the agent drives: as in its training, and with the aids that it was given.
-
-        :param names: of options of an environment
-        :return: those that its training had, and the aids
-        """
-        return {**self.record.kept(names), **({"aids": self._aids} if self._aids else {})}
-
-
 @dataclass
-class _Team:
+class _Policy:
     """Agents with the same policy."""
 
     driver: Any
@@ -68,30 +36,34 @@ class Pilots:
     """
     The agents of a race that is loaded.
 
-    :param cars: of the agents
+    :param drivers: the agents
     :param race: in which they have the seats, in the same order
     :param trust: load models as SB3 does, which runs code that is pickled in them
     :raises ModelMismatch: if an agent does not fit, or was trained behind wrappers that have to
         see each timestep
     """
 
-    def __init__(self, cars: Sequence[CarOfAnAgent], race: SharedRace, trust: bool = False) -> None:
+    def __init__(
+        self, drivers: Sequence[NamedDriver], race: SharedRace, trust: bool = False
+    ) -> None:
         self._envs = [
-            RaceCarEnv(seat, **car.kept(OF_THE_ENV))
-            for car, seat in zip(cars, race.seats, strict=True)
+            RaceCarEnv(seat, **driver.options(OF_THE_ENV))
+            for driver, seat in zip(drivers, race.seats, strict=True)
         ]
-        teams: dict[str, _Team] = {}
-        for number, (car, env) in enumerate(zip(cars, self._envs, strict=True)):
-            if car.driver in teams:
-                teams[car.driver].members.append(number)
+        policies: dict[str, _Policy] = {}
+        for number, (driver, env) in enumerate(zip(drivers, self._envs, strict=True)):
+            if driver.source in policies:
+                policies[driver.source].members.append(number)
                 continue
-            if wrapped(env, car.record.hyperparameters, trust=trust) is not env:
+            if wrapped(env, driver.record.hyperparameters, trust=trust) is not env:
                 raise ModelMismatch(
-                    f"'{car.driver}' was trained behind a wrapper of its environment, which "
+                    f"'{driver.source}' was trained behind a wrapper of its environment, which "
                     "cannot be put around one car of several; race an agent without one"
                 )
-            teams[car.driver] = _Team(load_driver(car.driver, env, trust=trust), [number])
-        self._teams = list(teams.values())
+            policies[driver.source] = _Policy(
+                load_driver(driver.source, env, trust=trust), [number]
+            )
+        self._policies = list(policies.values())
         self.failed: dict[int, str] = {}
         """Agents that were taken out of the race, and why."""
 
@@ -103,8 +75,8 @@ class Pilots:
         """
         for env in self._envs:
             env.reset(seed=seed)
-        for team in self._teams:
-            team.state = None
+        for policy in self._policies:
+            policy.state = None
         self.failed.clear()
 
     def act(self, tick: int) -> int:
@@ -115,25 +87,25 @@ class Pilots:
         :param tick: control ticks that have been driven
         :return: control ticks until the next agent has to be asked
         """
-        for team in self._teams:
-            due = tick % self._envs[team.members[0]].action_repeat == 0
-            if due and any(number not in self.failed for number in team.members):
-                self._ask(team, tick == 0)
+        for policy in self._policies:
+            due = tick % self._envs[policy.members[0]].action_repeat == 0
+            if due and any(number not in self.failed for number in policy.members):
+                self._ask(policy, tick == 0)
         return min(env.action_repeat - tick % env.action_repeat for env in self._envs)
 
-    def _ask(self, team: _Team, race_begins: bool) -> None:
-        """Ask a team's policy once, for all its cars."""
-        seen = [self._envs[number].look() for number in team.members]
-        begins = np.full(len(team.members), race_begins)
+    def _ask(self, policy: _Policy, race_begins: bool) -> None:
+        """Ask a policy once, for all its cars."""
+        seen = [self._envs[number].look() for number in policy.members]
+        begins = np.full(len(policy.members), race_begins)
         try:
-            actions, team.state = team.driver.predict(
-                np.stack(seen), team.state, begins, deterministic=True
+            actions, policy.state = policy.driver.predict(
+                np.stack(seen), policy.state, begins, deterministic=True
             )
         except InvalidAction as error:
-            for number in team.members:
+            for number in policy.members:
                 self._take_out(number, error)
             return
-        for number, action in zip(team.members, actions, strict=True):
+        for number, action in zip(policy.members, actions, strict=True):
             if number in self.failed:
                 continue
             try:
@@ -147,29 +119,31 @@ class Pilots:
         self._envs[number].seat.retire()
 
 
-class Crew:
+class AgentOpponents:
     """
     Agents as opponents, in a race that others have begun.
 
-    :param drivers: as of :class:`CarOfAnAgent`
+    :param sources: their names or paths
+    :raises InvalidOption: if there is no such agent, or one cannot race
     """
 
-    def __init__(self, drivers: Sequence[str]) -> None:
-        self._members = [CarOfAnAgent(driver) for driver in drivers]
-        self.cars = [member.car for member in self._members]
-        self.gearboxes = [member.gearbox for member in self._members]
-        self.angles = [member.angles for member in self._members]
-        repeats = {member.record.env_kwargs.get("action_repeat", 5) for member in self._members}
+    def __init__(self, sources: Sequence[str]) -> None:
+        self._drivers = [find_driver(source) for source in sources]
+        check_racers(self._drivers)
+        self.cars = [driver.car for driver in self._drivers]
+        self.gearboxes = [driver.gearbox for driver in self._drivers]
+        self.angles = [driver.angles for driver in self._drivers]
+        repeats = {driver.record.env_kwargs.get("action_repeat", 5) for driver in self._drivers}
         self.action_repeats: set[int] = repeats
 
-    def board(self, worlds: Sequence[SeatWorld]) -> None:
+    def take_seats(self, worlds: Sequence[SeatWorld]) -> None:
         """
         Load the agents.
 
         :param worlds: their cars, in the order of the drivers
         """
         self._race = SharedRace.of(worlds)
-        self._pilots = Pilots(self._members, self._race)
+        self._pilots = Pilots(self._drivers, self._race)
 
     def begin(self) -> None:
         """Take part in the race that begins."""
@@ -183,3 +157,17 @@ class Crew:
         :param tick: control ticks that have been driven
         """
         self._pilots.act(tick)
+
+
+def check_racers(drivers: Sequence[NamedDriver]) -> None:
+    """
+    Refuse drivers that cannot race others.
+
+    :param drivers: of a race
+    :raises InvalidOption: if one is a ghost
+    """
+    for driver in drivers:
+        if driver.kind == "ghost":
+            raise InvalidOption(
+                f"'{driver.source}' is a ghost, which looks at nobody and cannot race"
+            )

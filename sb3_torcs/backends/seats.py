@@ -53,7 +53,7 @@ class LoadedRace(NamedTuple):
     """A race that is loaded."""
 
     worlds: Sequence[SeatWorld]  # the cars of its agents
-    crew: Any = None  # drives the opponents that are agents; see ``agents.pilots.Crew``
+    opponents: Any = None  # those that are agents; see ``agents.pilots.AgentOpponents``
     flagged: bool = False  # whether its agents are flagged off after the last lap
 
     def close(self) -> None:
@@ -78,7 +78,7 @@ class SharedRace:
     def __init__(self, races: WorldPool[LoadedRace], noise: bool = False) -> None:
         self._turn = Turn(races)
         self._tick = 0  # control ticks since the race began
-        self._asked = -1  # when the crew was asked
+        self._asked = -1  # when the opponents that are agents were asked
         self.agents = len(self.loaded.worlds)
         self._noise = noise
         self._waiting: set[int] = set()  # agents that have not begun an episode in this race
@@ -174,8 +174,8 @@ class SharedRace:
         else:
             engine.start_at(*start)
         self._tick, self._asked = 0, -1
-        if self.loaded.crew is not None:
-            self.loaded.crew.begin()
+        if self.loaded.opponents is not None:
+            self.loaded.opponents.begin()
 
     def join(self) -> None:
         """Let all agents begin in a race that is begun elsewhere."""
@@ -184,11 +184,11 @@ class SharedRace:
 
     def ask(self) -> None:
         """Ask the opponents that are agents what they do next, once before each timestep."""
-        if self.loaded.crew is not None and self._asked != self._tick:
+        if self.loaded.opponents is not None and self._asked != self._tick:
             engine = self.world(0).engine
             muted = engine.mute_noise(False)  # opponents see with noise, whatever looks on
             try:
-                self.loaded.crew.act(self._tick)
+                self.loaded.opponents.act(self._tick)
             finally:
                 engine.mute_noise(muted)
             self._asked = self._tick
@@ -297,7 +297,7 @@ class Seat(Drawn):
 
 
 class LoneSeat(Seat):
-    """The world of the only agent of a shared race that is stepped; a crew drives the others."""
+    """The world of the only agent of a shared race that is stepped; others drive by themselves."""
 
     def step(self, controls: Controls, ticks: int) -> CarState:  # type: ignore[override]
         """Drive on; see :class:`~sb3_torcs.backends.base.Backend`."""

@@ -18,11 +18,11 @@ from sb3_torcs.cli import (
     compare,
     compete,
     doctor,
+    drivers,
     evaluate,
     install_torcs,
     optimize_lap,
     race,
-    robots,
     serve,
     study,
     tracks,
@@ -30,7 +30,7 @@ from sb3_torcs.cli import (
     watch,
 )
 from sb3_torcs.cli.common import CACHE_FIX, INTERRUPTED, READER_LEFT, drop_output, lacks_cache
-from sb3_torcs.cli.parser import Parser
+from sb3_torcs.cli.parser import Parser, grouped
 from sb3_torcs.cli.plain import any_terminal, open_streams
 from sb3_torcs.errors import Sb3TorcsError
 from sb3_torcs.signals import ENDING, EXIT_STATUS, answered, ignored_interrupts
@@ -39,10 +39,15 @@ __all__ = ["main"]
 
 USAGE_ERROR = 2
 PROCESS_NAME = "sb3-racing"
-VERBS = (
-    doctor, install_torcs, tracks, train, evaluate, compare, watch, optimize_lap, study,
-    robots, race, serve, compete, bench,
-)  # fmt: skip
+GROUPS = {
+    "begin": (doctor, install_torcs, tracks, drivers),
+    "learn": (train, study),
+    "look": (evaluate, compare, watch),
+    "race": (race, serve, compete),
+    "measure": (optimize_lap, bench),
+}
+"""The verbs, as the help shows them."""
+VERBS = tuple(verb for verbs in GROUPS.values() for verb in verbs)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -126,10 +131,23 @@ def _end(number: int, frame: FrameType | None) -> None:
 def _parser() -> tuple[Parser, Iterable[str]]:
     """Build the parser; return it and the verbs that it knows."""
     parser = Parser(
-        prog="sb3-torcs", description="Train, watch and measure cars that learn to race."
+        prog="sb3-torcs",
+        usage="%(prog)s [-h] [--version] VERB ...",
+        description="Train, watch and measure cars that learn to race.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
-    subparsers = parser.add_subparsers(dest="verb", metavar="VERB")
-    for verb in VERBS:
-        verb.add_parser(subparsers)
+    subparsers = parser.add_subparsers(
+        dest="verb", metavar="VERB", prog="sb3-torcs", help=argparse.SUPPRESS
+    )
+    groups: dict[str, list[str]] = {}
+    for group, verbs in GROUPS.items():
+        known = set(subparsers.choices)
+        for verb in verbs:
+            verb.add_parser(subparsers)
+        groups[group] = [name for name in subparsers.choices if name not in known]
+    helps = {action.dest: action.help or "" for action in subparsers._get_subactions()}
+    parser.epilog = grouped(
+        {group: {name: helps[name] for name in names} for group, names in groups.items()}
+    )
     return parser, subparsers.choices

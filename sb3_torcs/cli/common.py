@@ -12,22 +12,26 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sb3_torcs.car import DEFAULT_CAR
 from sb3_torcs.files import writable_file
 
 if TYPE_CHECKING:
-    from sb3_torcs.agents.models import TrainingRecord
+    from sb3_torcs.agents.drivers import NamedDriver
+    from sb3_torcs.envs.options import AidName
     from sb3_torcs.torcs.installation import Game
 
 __all__ = [
-    "AGENT_HELP",
     "CACHE_FIX",
+    "DRIVER_HELP",
     "INTERRUPTED",
-    "MODEL_HELP",
     "READER_LEFT",
     "TRUST_HELP",
+    "add_environment",
     "asked_files",
     "drop_output",
+    "environment_settings",
     "lacks_cache",
+    "named_driver",
     "natural",
     "parsed_robots",
     "positive",
@@ -37,7 +41,6 @@ __all__ = [
     "setting",
     "status_of",
     "table",
-    "told_record",
     "warn_unless_known",
 ]
 
@@ -48,8 +51,10 @@ READER_LEFT = 141
 
 CACHE_FIX = "export NUMBA_CACHE_DIR=/tmp/numba"
 
-AGENT_HELP = "a saved .zip, a run's folder, a shipped agent, or 'scripted'"
-MODEL_HELP = AGENT_HELP.replace(", or ", ", a ghost, or ")
+DRIVER_HELP = (
+    "an agent, a robot, a ghost, or 'scripted', as `sb3-torcs drivers` lists them; or a saved "
+    ".zip or its run's folder"
+)
 
 TRUST_HELP = "run the code that is pickled in the model: only if you trust its author"
 
@@ -94,37 +99,71 @@ def lacks_cache(error: Exception) -> bool:
     return isinstance(error, RuntimeError) and "cannot cache function" in str(error)
 
 
-def told_record(driver: str, game: Game | None = None) -> TrainingRecord:
+def named_driver(source: str, aids: Sequence[AidName] = ()) -> NamedDriver:
     """
-    Read how a driver was trained; warn on standard error if no record is found.
+    Find a driver; warn on standard error if an agent has no record of its training.
 
-    :param driver: as typed
-    :param game: the installation, where one of its robots can be named instead
-    :return: the record, which may be empty
+    :param source: as typed
+    :param aids: driver aids that an agent gets besides those of its training
+    :raises InvalidOption: if there is none
     """
-    from sb3_torcs.agents.models import agent_record, driver_record
+    from sb3_torcs.agents.drivers import find_driver
 
-    record = driver_record(driver) if game is None else agent_record(driver, game)
-    warn_unless_known(driver, record)
-    return record
+    driver = find_driver(source, aids)
+    warn_unless_known(driver)
+    return driver
 
 
-def warn_unless_known(driver: str, record: TrainingRecord) -> None:
+def warn_unless_known(driver: NamedDriver) -> None:
     """
-    Warn on standard error if there is no record of how a driver was trained.
+    Warn on standard error if there is no record of how an agent was trained.
 
-    :param driver: as typed
-    :param record: of its training, which may be empty
+    :param driver: that was found
     """
-    from sb3_torcs.agents.scripted import SCRIPTED
-
-    if not record.known and driver != SCRIPTED:
+    if driver.kind == "agent" and not driver.record.known:
         print(
-            f"sb3-torcs: '{driver}' has no record of its training; track, car, action repeat and "
-            "range finders are the defaults, unless you give them. RecordCallback, passed to each "
-            "`learn`, writes the record",
+            f"sb3-torcs: '{driver.source}' has no record of its training; track, car, action "
+            "repeat and range finders are the defaults, unless you give them. RecordCallback, "
+            "passed to each `learn`, writes the record",
             file=sys.stderr,
         )
+
+
+def add_environment(parser: argparse.ArgumentParser, *, world: bool = True) -> None:
+    """
+    Add the options that choose an environment; :func:`environment_settings` reads them.
+
+    :param parser: of the verb
+    :param world: whether the verb drives in any world, not only in the game
+    """
+    add = parser.add_argument
+    if world:
+        add("--env", metavar="ID", help="default: that of an agent's training, or Torcs-v0")
+    add("--track", metavar="T", help="default: that of an agent's training, or aalborg")
+    add("--car", metavar="C", help=f"default: that of an agent's training, or {DEFAULT_CAR}")
+    add("--env-kwargs", nargs="+", type=setting, default=[], metavar="NAME=VALUE",
+        help="arguments of the environment, with values of YAML, e.g. "
+        "conditions='{delay: 2}' aids=[unstick]")  # fmt: skip
+
+
+def environment_settings(args: argparse.Namespace) -> dict[str, Any]:
+    """
+    Read the arguments of an environment that were typed: ``--track``, ``--car``, ``--env-kwargs``.
+
+    :param args: from the command line
+    :return: names and values
+    :raises InvalidOption: if one is given twice
+    """
+    from sb3_torcs.errors import InvalidOption
+
+    typed = [(name, getattr(args, name, None)) for name in ("track", "car")]
+    pairs = [(name, value) for name, value in typed if value is not None]
+    pairs += getattr(args, "env_kwargs", ())
+    names = [name for name, _ in pairs]
+    for name in names:
+        if names.count(name) > 1:
+            raise InvalidOption(f"{name} is given twice; give it one value")
+    return dict(pairs)
 
 
 def _whole_number(least: int, bits: int | None = None) -> Callable[[str], int]:
@@ -165,7 +204,7 @@ def setting(text: str) -> tuple[str, Any]:
     """
     Read a name and a value of YAML, for argparse.
 
-    :param text: from the command line, e.g. ``"delay=[0, 5]"``
+    :param text: from the command line, e.g. ``"aids=[unstick]"``
     :return: the name and the value, of plain Python types
     """
     from yaml import YAMLError
@@ -175,13 +214,13 @@ def setting(text: str) -> tuple[str, Any]:
     name, equals, value = text.partition("=")
     if not (name.isidentifier() and equals):
         raise argparse.ArgumentTypeError(
-            f"{text!r}: expected NAME=VALUE, e.g. delay=2; name anything else before this option"
+            f"{text!r}: expected NAME=VALUE, e.g. track=forza; drivers stand before this option"
         )
     try:
         return name, read_yaml(value)
     except YAMLError:
         raise argparse.ArgumentTypeError(
-            f"{text!r}: {value!r} is no value of YAML; e.g. delay=[0, 5] has one"
+            f"{text!r}: {value!r} is no value of YAML; e.g. aids=[unstick] has one"
         ) from None
 
 

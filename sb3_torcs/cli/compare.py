@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sb3_torcs.car import KMH
-from sb3_torcs.cli.common import MODEL_HELP, TRUST_HELP, positive, print_json, quiet_output, table
+from sb3_torcs.cli.common import DRIVER_HELP, TRUST_HELP, positive, print_json, quiet_output, table
 from sb3_torcs.files import writable_file
 
 if TYPE_CHECKING:
@@ -16,12 +16,12 @@ if TYPE_CHECKING:
 __all__ = ["add_parser", "run"]
 
 LAP_HEADERS = ("driver", "lap s", "behind s")
-CORNER_HEADERS = ("corner", "m", "driver", "brakes m before", "entry km/h", "slowest km/h",
+CORNER_HEADERS = ("corner", "m", "brakes m before", "entry km/h", "slowest km/h",
                   "exit km/h", "lost s")  # fmt: skip
 
 DESCRIPTION = """\
 Compare the best laps of drivers on one track: agents, robots, ghosts, and files of saved drives
-(.parquet, see --telemetry of evaluate and robots). All but saved drives drive --laps laps from the
+(.parquet, see --telemetry of evaluate and race). All but saved drives drive --laps laps from the
 grid, each alone; the best flying lap of each counts. The first driver is what the others are
 measured against.
 
@@ -42,7 +42,7 @@ def add_parser(subparsers: Any) -> None:
     )
     add = parser.add_argument
     add("drivers", nargs="+", metavar="DRIVER",
-        help=f"{MODEL_HELP}; a robot, e.g. inferno; or a file of drives")  # fmt: skip
+        help=f"{DRIVER_HELP}; or a file of drives")  # fmt: skip
     add("--track", metavar="T", help="default: that of a file or of an agent's training")
     add("--laps", type=positive, default=3, metavar="L", help="laps to drive; default: 3")
     add("--html", default="report.html", metavar="FILE.html",
@@ -82,25 +82,20 @@ def _show(comparison: Comparison, html: Path) -> None:
     print(table(LAP_HEADERS, [
         (d["driver"], f"{d['lap_time']:.3f}", f"{d['delta_at_end']:.3f}") for d in drivers
     ]))  # fmt: skip
-    rows = [
-        _corner_row(number, driver["driver"], driver["corners"][number])
-        for number in range(len(comparison.corners))
-        for driver in drivers
-    ]
-    if rows:
-        print()
+    for driver in drivers if comparison.corners else ():
+        print(f"\n{driver['driver']}, by corner")
+        rows = [_corner_row(number, corner) for number, corner in enumerate(driver["corners"])]
         print(table(CORNER_HEADERS, rows))
     for sentence in (*summary(comparison), *missing(comparison)):
         print(sentence)
 
 
-def _corner_row(number: int, driver: str, corner: dict[str, Any]) -> tuple[str, ...]:
+def _corner_row(number: int, corner: dict[str, Any]) -> tuple[str, ...]:
     brakes = corner["braking_point"]
     speeds = (corner["entry_speed"], corner["apex_speed"], corner["exit_speed"])
     return (
         str(number + 1),
         f"{corner['distance']:.0f}",
-        driver,
         "-" if brakes is None else f"{round(corner['distance'] - brakes)}",
         *(f"{KMH * speed:.0f}" for speed in speeds),
         f"{corner['time_lost']:.3f}",

@@ -7,12 +7,14 @@ import gc
 from typing import TYPE_CHECKING, Any
 
 from sb3_torcs.cli.common import (
-    MODEL_HELP,
+    DRIVER_HELP,
     TRUST_HELP,
+    add_environment,
+    environment_settings,
+    named_driver,
     positive,
     print_json,
     quiet_output,
-    told_record,
 )
 
 if TYPE_CHECKING:
@@ -43,15 +45,10 @@ def add_parser(subparsers: Any) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
-    add("model", metavar="MODEL", help=MODEL_HELP)
+    add("driver", metavar="DRIVER", help=f"{DRIVER_HELP}; no robot")
     add("--host", default="127.0.0.1", metavar="H", help="default: 127.0.0.1")
     add("--port", type=positive, default=3001, metavar="P", help="default: 3001")
-    add(
-        "--track",
-        metavar="T",
-        help="track of that race, for an agent that sees the road; default: that of the training",
-    )
-    add("--car", metavar="C", help="car of that race; default: that of the training")
+    add_environment(parser, world=False)
     add("--name", metavar="N", help="name of the driver, which `serve` shows; default: the model's")
     add("--algo", help="the model's algorithm, if it cannot be found out")
     add("--trust", action="store_true", help=TRUST_HELP)
@@ -68,32 +65,36 @@ def run(args: argparse.Namespace) -> int:
         _check_name(args.name)
     where = f"{args.host}, UDP port {args.port}"
     with quiet_output(args.json):  # said first, because loading takes seconds
-        print(f"{args.model} is being loaded for the race at {where}", flush=True)
+        print(f"{args.driver} is being loaded for the race at {where}", flush=True)
 
-    from sb3_torcs.agents.ghosts import is_ghost
-    from sb3_torcs.agents.models import driver_name, one_of
+    from sb3_torcs.agents.models import one_of
     from sb3_torcs.agents.remote import Agent, check_told
     from sb3_torcs.agents.saved.record import DRIVEN_WITH
+    from sb3_torcs.errors import InvalidOption
     from sb3_torcs.sensors import NEEDS_ROAD
 
-    record = told_record(args.model)
-    settings = record.kept(("track", "car", *DRIVEN_WITH))
+    driver = named_driver(args.driver)
+    if driver.robot is not None:
+        raise InvalidOption(
+            f"'{args.driver}' is a robot, which drives in the game's own races only"
+        )
+    settings = driver.record.kept(("track", "car", *DRIVEN_WITH))
     check_told(
-        args.model, settings, f"`sb3-torcs race {args.model} inferno` races it in the engine"
+        args.driver, settings, f"`sb3-torcs race {args.driver} inferno` races it in the engine"
     )
-    given = {"track": args.track, "car": args.car, "host": args.host, "port": args.port}
-    settings |= {name: value for name, value in given.items() if value is not None}
+    given = environment_settings(args)
+    settings |= {**given, "scr": {"host": args.host, "port": args.port}}
     sees_road = NEEDS_ROAD.intersection(settings.get("sensors", ()))
-    if args.track is None and not sees_road and not is_ghost(args.model):
+    if "track" not in given and not sees_road and driver.kind != "ghost":
         settings["track"] = None  # the race may be on another track than the training was
     one_of("track", settings.get("track"))
     one_of("car", settings.get("car"))
     with quiet_output(args.json):
-        name = args.name or driver_name(args.model)
-        agent = Agent(args.model, settings, args.algo, args.trust, name)
+        name = args.name or driver.name
+        agent = Agent(args.driver, settings, args.algo, args.trust, name)
         assumed = settings.get("track", "aalborg")
-        if args.track is None and assumed is not None:
-            print(f"{args.model} takes {assumed} to be the track; give another one with --track")
+        if "track" not in given and assumed is not None:
+            print(f"{args.driver} takes {assumed} to be the track; give another one with --track")
         print(f"waiting for the SCR server at {where} and the start of its race", flush=True)
     # A garbage collection over everything that was loaded would take longer than a tick.
     gc.collect()

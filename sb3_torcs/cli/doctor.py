@@ -25,7 +25,7 @@ OLDEST_PYTHON = (3, 11)
 EXTENSION = "sb3_torcs._engine"
 COMPILERS = ("c++", "g++", "clang++")
 GAME_LIBRARIES = ("_scr_server", "_game_window")
-PROGRAM_USERS = "`watch`, `serve`, `robots --game`, backend 'scr' and render_mode 'game'"
+PROGRAM_USERS = "`watch`, `serve`, backend 'scr' and picture 'game'"
 LIBRARY_USERS = "`watch`, `serve`, backend 'scr' and render_mode 'game'"
 REINSTALL = "sudo apt-get install --reinstall torcs torcs-data"
 

@@ -10,8 +10,11 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from sb3_torcs.cli.common import (
-    MODEL_HELP,
+    DRIVER_HELP,
     TRUST_HELP,
+    add_environment,
+    environment_settings,
+    named_driver,
     positive,
     print_json,
     quiet_output,
@@ -22,6 +25,7 @@ from sb3_torcs.cli.common import (
 from sb3_torcs.files import writable_file
 
 if TYPE_CHECKING:
+    from sb3_torcs.agents.drivers import NamedDriver
     from sb3_torcs.agents.ghosts import Ghost
     from sb3_torcs.training.lap_search.search import Budget, LapSearch, State
 
@@ -55,18 +59,16 @@ def add_parser(subparsers: Any) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
-    add("agent", metavar="AGENT", help=f"in whose environment the ghost drives: {MODEL_HELP}")
-    add("--track", metavar="T", help="default: that of the training, or aalborg")
-    add("--car", metavar="C", help="default: that of the training, or car1-trb1")
+    add("driver", metavar="DRIVER",
+        help=f"whose drive the search begins with: {DRIVER_HELP}")  # fmt: skip
+    add_environment(parser, world=False)
     add("--seconds", type=positive, metavar="S",
         help=f"how long to search; default: {SECONDS}, or no limit with --rollouts")  # fmt: skip
     add("--rollouts", type=positive, metavar="N",
         help="end the search after N tries; a ghost takes some 10,000")  # fmt: skip
     add("--seed", type=seed, default=0, metavar="S", help="seed of the search; default: 0")
-    add("--action-repeat", type=positive, metavar="N",
-        help="control ticks of 0.02 s per timestep; default: that of the training")  # fmt: skip
-    add("--alone", action="store_true", help="begin with the agent's drive, not with a robot's")
-    add("--out", metavar="FILE.npz", help="the ghost; default: ghost-AGENT-TRACK.npz")
+    add("--alone", action="store_true", help="begin with the driver's drive, however slow")
+    add("--out", metavar="FILE.npz", help="the ghost; default: ghost-DRIVER-TRACK.npz")
     add("--trust", action="store_true", help=TRUST_HELP)
     add("--json", action="store_true", help="print one JSON object and nothing else")
     parser.set_defaults(run=run)
@@ -77,18 +79,19 @@ def run(args: argparse.Namespace) -> int:
     :param args: from the command line
     :return: the exit status
     """
-    from sb3_torcs.agents.models import driver_name
     from sb3_torcs.errors import InvalidOption
     from sb3_torcs.training.lap_search.starts import ghost_environment
 
-    kwargs = ghost_environment(args.agent, args.track, args.car)
-    if args.action_repeat is not None:
-        kwargs["action_repeat"] = args.action_repeat
-    name, track = driver_name(args.agent), str(kwargs["track"]).rpartition("/")[2]
+    driver = named_driver(args.driver)
+    kwargs = ghost_environment(driver, environment_settings(args))
+    name, track = (
+        driver.name.replace("/", "-").replace(":", "-"),
+        str(kwargs["track"]).rpartition("/")[2],
+    )
     out = writable_file(args.out or f"ghost-{name}-{track.removesuffix('.xml')}.npz", (".npz",))
     begun = time.monotonic()
     with quiet_output(args.json):
-        ghost, state, status = _search(args, kwargs)
+        ghost, state, status = _search(args, driver, kwargs)
     seconds = time.monotonic() - begun
     if ghost is None:
         why = (
@@ -103,7 +106,7 @@ def run(args: argparse.Namespace) -> int:
     figures = {
         "track": track,
         "car": kwargs["car"],
-        "agent": args.agent,
+        "agent": args.driver,
         "standing_lap": standing,
         "flying_lap": min(flying),
         "rollouts": state.rollouts,
@@ -122,7 +125,9 @@ def run(args: argparse.Namespace) -> int:
     return status
 
 
-def _search(args: argparse.Namespace, kwargs: dict[str, Any]) -> tuple[Ghost | None, State, int]:
+def _search(
+    args: argparse.Namespace, driver: NamedDriver, kwargs: dict[str, Any]
+) -> tuple[Ghost | None, State, int]:
     """
     Search until the budget is used up or somebody stops it.
 
@@ -132,7 +137,7 @@ def _search(args: argparse.Namespace, kwargs: dict[str, Any]) -> tuple[Ghost | N
     from sb3_torcs.training.lap_search.starts import find_starts
 
     begun = time.monotonic()
-    starts = find_starts(args.agent, kwargs, alone=args.alone, trust=args.trust)
+    starts = find_starts(driver, kwargs, alone=args.alone, trust=args.trust)
     first = starts[0]
     print(
         f"beginning with {first.driver}: {', '.join(f'{lap:.3f}' for lap in first.lap_times)} s",
@@ -141,7 +146,7 @@ def _search(args: argparse.Namespace, kwargs: dict[str, Any]) -> tuple[Ghost | N
     seconds = args.seconds or (None if args.rollouts else SECONDS)
     left = math.inf if seconds is None else seconds - (time.monotonic() - begun)
     budget = Budget(left, args.rollouts or math.inf)
-    search = LapSearch(args.agent, kwargs, starts, seed=args.seed)
+    search = LapSearch(driver.source, kwargs, starts, seed=args.seed)
     status = 0
     try:
         for _ in _shown(search, budget):

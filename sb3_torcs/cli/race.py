@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sb3_torcs.cli.common import (
-    AGENT_HELP,
+    DRIVER_HELP,
     INTERRUPTED,
     TRUST_HELP,
     asked_files,
@@ -21,12 +21,13 @@ from sb3_torcs.cli.common import (
     table,
     warn_unless_known,
 )
+from sb3_torcs.cli.results import show_standings
 from sb3_torcs.files import PICTURES
 from sb3_torcs.signals import held_back
 from sb3_torcs.torcs.starting_list import GRIDS
 
 if TYPE_CHECKING:
-    from sb3_torcs.races.entrants import Entrant
+    from sb3_torcs.agents.drivers import NamedDriver
     from sb3_torcs.races.protocol import Race
     from sb3_torcs.races.video import Footage
     from sb3_torcs.telemetry import DriveLog
@@ -43,9 +44,7 @@ NEED_THE_LAST = ("telemetry", "report")
 
 DRAWING = "sb3-torcs: drawing the video of the first race; Ctrl-C again leaves it out\n"
 BAR = "{l_bar}{bar}| {n:.1f}/{total} races [{elapsed}<{remaining}]"
-UNKNOWN = "-"  # in tables
 HEADERS = ("driver", "races", "wins", "win rate", "mean place", "finished", "damage/km", "rating")
-LAST_RACE = ("place", "driver", "from", "laps", "time s", "best lap s", "damage", "contacts")
 
 DESCRIPTION = """\
 Let drivers race against each other: robots of the game, shipped agents, files of trained ones. Each
@@ -62,9 +61,6 @@ Win rates and mean places come with their 95 % intervals. Ratings are those of o
 
 Ctrl-C ends the command after the races that are over, and tells how they went. Then it draws the
 video of the first one, if there is to be any; Ctrl-C again leaves it out.
-
-With --game the installed game holds the same races, and comes to the same standings. It does not
-count contacts and metres.
 """
 
 
@@ -82,7 +78,7 @@ def add_parser(subparsers: Any) -> None:
     )
     add = parser.add_argument
     add("drivers", nargs="+", metavar="DRIVER",
-        help=f"{AGENT_HELP}; or a robot, e.g. inferno or bt:3")  # fmt: skip
+        help=f"{DRIVER_HELP}; no ghost")  # fmt: skip
     add("--track", default="aalborg", metavar="T", help="the track; default: aalborg")
     add("--laps", type=positive, default=5, metavar="N", help="laps of a race; default: 5")
     add("--races", type=positive, default=20, metavar="N", help="races to hold; default: 20")
@@ -101,8 +97,6 @@ def add_parser(subparsers: Any) -> None:
     add("--telemetry", metavar="FILE.parquet", help="write the drives of the last race")
     add("--report", metavar="FILE.html",
         help="make the lap report of the last race, as `sb3-torcs compare` does")  # fmt: skip
-    add("--game", action="store_true",
-        help="let the installed game hold the races; it has seats for 10 agents")  # fmt: skip
     add("--trust", action="store_true", help=TRUST_HELP)
     add("--json", action="store_true", help="print one JSON object and nothing else")
     parser.set_defaults(run=run)
@@ -114,17 +108,15 @@ def run(args: argparse.Namespace) -> int:
     :return: the exit status
     """
     files = asked_files(args, FILES)
-    from sb3_torcs.errors import InvalidOption, check_extras
+    from sb3_torcs.errors import check_extras
     from sb3_torcs.telemetry import DriveLog
 
-    if args.game and files:
-        raise InvalidOption(f"--{next(iter(files))} is for races of the engine; leave out --game")
     check_extras("a rating", "openskill")
     with quiet_output(args.json):
-        entrants = _entrants(args)
+        drivers = _find(args)
         log = DriveLog() if "telemetry" in files or "report" in files else None
         footage = _footage(args)
-        races, status = _held(args, entrants, log, footage)
+        races, status = _held(args, drivers, log, footage)
     with held_back():  # to compute the figures takes a while
         _tell(args, races)
     stopped = len(races) < args.races
@@ -134,10 +126,10 @@ def run(args: argparse.Namespace) -> int:
     if status not in (0, INTERRUPTED):
         _drop(files, ("video",), "the command was told to end")
     with quiet_output(args.json):
-        _write(files, races[-1], log, entrants[0].name)
+        _write(files, races[-1], log, drivers[0].name)
         if footage is not None and "video" in files:  # last: it takes longest, and may fail
             sys.stderr.write(DRAWING if stopped else "")
-            footage.save(files["video"], _followed(entrants, races[0]), args.laps)
+            footage.save(files["video"], _followed(drivers, races[0]), args.laps)
     if not args.json:
         for what, path in files.items():
             print(f"{what}: {path}")
@@ -156,21 +148,22 @@ def _tell(args: argparse.Namespace, races: list[Race]) -> None:
     sys.stdout.flush()
 
 
-def _entrants(args: argparse.Namespace) -> list[Entrant]:
+def _find(args: argparse.Namespace) -> list[NamedDriver]:
     """Find the drivers, and warn of agents without a record."""
+    from sb3_torcs.agents.drivers import find_drivers
+    from sb3_torcs.agents.pilots import check_racers
     from sb3_torcs.envs.aids import aids_named
     from sb3_torcs.errors import InvalidOption
-    from sb3_torcs.races.entrants import find_entrants
-    from sb3_torcs.torcs.installation import find_game
 
     aids = () if args.aids is None else aids_named(args.aids)
-    entrants = find_entrants(args.drivers, find_game(), aids)
-    agents = [entrant.agent for entrant in entrants if entrant.agent is not None]
+    drivers = find_drivers(args.drivers, aids)
+    check_racers(drivers)
+    agents = [driver for driver in drivers if driver.robot is None]
     if aids and not agents:
         raise InvalidOption("--aids is for agents, and all drivers are robots; leave it out")
     for agent in agents:
-        warn_unless_known(agent.driver, agent.record)
-    return entrants
+        warn_unless_known(agent)
+    return drivers
 
 
 def _drop(files: dict[str, Path], kinds: Sequence[str], why: str) -> None:
@@ -185,6 +178,7 @@ def _footage(args: argparse.Namespace) -> Footage | None:
     from sb3_torcs.errors import InvalidOption
     from sb3_torcs.races.video import GAME_SIZE, Footage
     from sb3_torcs.torcs.installation import find_game
+    from sb3_torcs.torcs.window import Window
 
     if args.view is not None:
         if args.video is None:
@@ -192,14 +186,14 @@ def _footage(args: argparse.Namespace) -> Footage | None:
         from sb3_torcs.rendering.game_camera import check_view
 
         check_view(find_game(), args.track, GAME_SIZE)
-    return None if args.video is None else Footage(args.view)
+    return None if args.video is None else Footage(view=args.view or Window.view)
 
 
-def _followed(entrants: Sequence[Entrant], race: Race) -> str:
+def _followed(drivers: Sequence[NamedDriver], race: Race) -> str:
     """Name the driver whom the camera follows: the best agent, or else the first one named."""
-    agents = {entrant.name for entrant in entrants if entrant.agent is not None}
+    agents = {driver.name for driver in drivers if driver.robot is None}
     places = [standing.driver for standing in race.standings if standing.driver in agents]
-    return next(iter(places), entrants[0].name)
+    return next(iter(places), drivers[0].name)
 
 
 def _write(files: dict[str, Path], race: Race, log: DriveLog | None, first: str) -> None:
@@ -223,13 +217,13 @@ def _write(files: dict[str, Path], race: Race, log: DriveLog | None, first: str)
         if any(standing.laps for standing in race.standings):
             report_of(log.frame(), first=first).save(files["report"])
         else:
-            print("sb3-torcs: no report: nobody drove a whole lap", file=sys.stderr)
+            print("sb3-torcs: no report: no driver completed a lap", file=sys.stderr)
             del files["report"]
 
 
 def _held(
     args: argparse.Namespace,
-    entrants: Sequence[Entrant],
+    drivers: Sequence[NamedDriver],
     log: DriveLog | None,
     footage: Footage | None,
 ) -> tuple[list[Race], int]:
@@ -242,8 +236,8 @@ def _held(
     """
     from tqdm import tqdm
 
-    from sb3_torcs.races.in_the_game import run_game_race, setup_in_the_game
     from sb3_torcs.races.protocol import Notes, Watcher, run_race, run_races
+    from sb3_torcs.races.video import race_setup
 
     races: list[Race] = []
     with tqdm(total=args.races, file=sys.stderr, leave=False, disable=None, bar_format=BAR) as bar:
@@ -251,16 +245,14 @@ def _held(
         def tell(share: float) -> None:
             bar.update(len(races) + share - bar.n)
 
-        def hold(order: Sequence[Entrant], number: int) -> Race:
+        def hold(order: Sequence[NamedDriver], number: int) -> Race:
             options: dict[str, Any] = {
                 "laps": args.laps, "seed": number, "trust": args.trust, "progress": tell,
             }  # fmt: skip
-            if args.game:
-                return run_game_race(order, args.track, **options)
             watchers: list[Watcher] = []
             if footage is not None and number == args.seed:
                 if args.view is not None:
-                    footage.setup = setup_in_the_game(order, args.track, args.laps)
+                    footage.setup = race_setup(order, args.track, args.laps)
                 watchers.append(footage)
             if log is not None and number == args.seed + args.races - 1:
                 watchers.append(Notes(log))
@@ -268,7 +260,7 @@ def _held(
 
         try:
             for race in run_races(
-                entrants, hold, races=args.races, grid=args.grid, field_size=args.field,
+                drivers, hold, races=args.races, grid=args.grid, field_size=args.field,
                 seed=args.seed,
             ):  # fmt: skip
                 races.append(race)
@@ -313,18 +305,10 @@ def _show(races: list[Race]) -> None:
             f["driver"], str(f["races"]), str(f["wins"]),
             "{1:.0%} ({0:.0%} to {2:.0%})".format(*f["win_rate"]), _mean_place(f),
             str(f["finished"]),
-            UNKNOWN if f["damage_per_km"] is None else f"{f['damage_per_km']:.0f}",
+            f"{f['damage_per_km']:.0f}",
             "{:.1f} ± {:.1f}".format(*f["rating"]),
         )
         for f in driver_figures(races)
     ]))  # fmt: skip
     print(f"\nlast race, seed {races[-1].seed}")
-    print(table(LAST_RACE, [
-        (
-            "out" if s.out else str(s.place), s.driver, str(s.grid_slot), str(s.laps),
-            f"{s.time:.3f}" if s.laps else UNKNOWN,
-            UNKNOWN if s.best_lap is None else f"{s.best_lap:.3f}",
-            f"{s.damage:.0f}", UNKNOWN if s.contacts is None else str(s.contacts),
-        )
-        for s in races[-1].standings
-    ]))  # fmt: skip
+    show_standings(races[-1])

@@ -1,51 +1,27 @@
-"""Results of races, as text and as JSON."""
+"""Results of races, as text."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from sb3_torcs.cli.common import table
 
 if TYPE_CHECKING:
+    from sb3_torcs.races.protocol import Race
     from sb3_torcs.torcs.race_results import RobotResult
 
-__all__ = ["results_as_json", "show_results"]
+__all__ = ["UNKNOWN", "show_results", "show_standings"]
+
+UNKNOWN = "-"  # in tables
 
 LAP_HEADERS = ("lap", "time s", "damage")
 RACE_HEADERS = ("rank", "driver", "car", "laps", "total s", "best lap s", "damage", "out")
+STANDINGS = ("place", "driver", "from", "laps", "time s", "best lap s", "damage", "contacts")
 
 
 def _own(results: list[RobotResult], robot: tuple[str, int]) -> RobotResult:
     """Find the result of one robot."""
     return next(result for result in results if (result.robot, result.index) == robot)
-
-
-def results_as_json(
-    results: list[RobotResult], robot: tuple[str, int], track: str
-) -> dict[str, Any]:
-    """
-    Make the JSON object: the named robot's drive, and in a race all drivers'.
-
-    :param results: of all
-    :param robot: that was named
-    :param track: ``category/name``, or the path of a file
-    """
-    own = _own(results, robot)
-    laps = [{"time": lap.time, "damage": lap.damage} for lap in own.laps]
-    value: dict[str, Any] = {"robot": own.robot, "index": own.index, "track": _short(track)}
-    value |= {"car": own.car, "laps": laps}
-    if len(results) > 1:
-        value["race"] = [
-            {
-                "rank": result.rank, "robot": result.robot, "index": result.index,
-                "car": result.car, "laps_completed": result.laps_completed,
-                "total_time": result.total_time, "best_lap": result.best_lap,
-                "damage": result.damage, "out": result.out,
-                "laps": [{"time": lap.time, "damage": lap.damage} for lap in result.laps],
-            }
-            for result in results
-        ]  # fmt: skip
-    return value
 
 
 def show_results(results: list[RobotResult], robot: tuple[str, int], track: str) -> None:
@@ -66,6 +42,23 @@ def show_results(results: list[RobotResult], robot: tuple[str, int], track: str)
     print(table(LAP_HEADERS, rows) if rows else "no whole lap")
     best = "none without a fault" if own.best_lap is None else f"{own.best_lap:.3f} s"
     print(f"best lap: {best}{'; out' if own.out else ''}")
+
+
+def show_standings(race: Race) -> None:
+    """
+    Print how a race of the engine ended.
+
+    :param race: that is over
+    """
+    print(table(STANDINGS, [
+        (
+            "out" if s.out else str(s.place), s.driver, str(s.grid_slot), str(s.laps),
+            f"{s.time:.3f}" if s.laps else UNKNOWN,
+            UNKNOWN if s.best_lap is None else f"{s.best_lap:.3f}",
+            f"{s.damage:.0f}", str(s.contacts),
+        )
+        for s in race.standings
+    ]))  # fmt: skip
 
 
 def _race_row(result: RobotResult) -> list[str]:

@@ -17,7 +17,7 @@ from sb3_torcs.envs.racing import RacingEnv
 from sb3_torcs.envs.torcs_race import make_race
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.torcs.installation import find_game
-from sb3_torcs.torcs.starting_list import guests_of
+from sb3_torcs.torcs.opponents import agents_among
 
 __all__ = [
     "MANY_RACES",
@@ -86,20 +86,20 @@ def env_makers(races: int, agents: int, env_id: str, env_kwargs: dict[str, Any])
     module, _, env_id = env_id.rpartition(":")
     if module:
         importlib.import_module(module)
-    if agents > 1 or _has_guests(env_id, env_kwargs):
+    if agents > 1 or _has_agents(env_id, env_kwargs):
         return _shared(races, agents, env_id, env_kwargs)
     limits = _limits(env_kwargs.get("max_episode_steps"), env_id, races)
     kwargs = [{**env_kwargs, "max_episode_steps": limit} for limit in limits]
     return [partial(gym.make, env_id, **each) for each in kwargs]
 
 
-def _has_guests(env_id: str, env_kwargs: dict[str, Any]) -> bool:
+def _has_agents(env_id: str, env_kwargs: dict[str, Any]) -> bool:
     """Whether agents are among the opponents, whom only a shared race can ask."""
     opponents = env_kwargs.get("opponents", ())
     if not isinstance(opponents, (list, tuple)):
         return False
     several = any(not isinstance(name, str) for name in opponents)
-    return env_id == "Torcs-v0" and (several or bool(guests_of(opponents, find_game())))
+    return env_id == "Torcs-v0" and (several or bool(agents_among(opponents, find_game())))
 
 
 def _shared(races: int, agents: int, env_id: str, env_kwargs: dict[str, Any]) -> list[EnvMaker]:

@@ -21,8 +21,8 @@ from sb3_torcs.envs.racing import RacingEnv
 from sb3_torcs.envs.torcs_race import make_shared_race
 from sb3_torcs.errors import InvalidOption, UnknownRobot
 from sb3_torcs.torcs.installation import find_game
+from sb3_torcs.torcs.opponents import agents_among
 from sb3_torcs.torcs.scenery import find_scenery
-from sb3_torcs.torcs.starting_list import guests_of
 from sb3_torcs.torcs.track_names import find_track
 from sb3_torcs.torcs.window import Window
 
@@ -57,23 +57,23 @@ class TorcsEnv(RacingEnv):
         self._window = _window(given)
         opponents = given["opponents"]
         named = opponents if isinstance(opponents, (list, tuple)) else ()
-        guests = guests_of(named, find_game()) if named else []
-        if guests and given["backend"] != "native":
+        agents = agents_among(named, find_game()) if named else []
+        if agents and given["backend"] != "native":
             try:
-                find_game().parse_robot(guests[0])
+                find_game().parse_robot(agents[0])
             except UnknownRobot as error:
                 only = "agents are opponents with backend 'native' only"
                 raise UnknownRobot(f"{error}; {only}") from None
         if self._window is not None:
-            if guests:
+            if agents:
                 raise InvalidOption(
-                    f"picture 'game' is for races against robots, and '{guests[0]}' is an agent; "
+                    f"picture 'game' is for races against robots, and '{agents[0]}' is an agent; "
                     "use picture 'above'"
                 )
             self.metadata = {**self.metadata, "render_modes": ["rgb_array"]}
             game = find_game()
             find_scenery(game, find_track(given["track"], game).path)
-        super().__init__(_world(given, bool(guests)), **select(RACING, given))
+        super().__init__(_world(given, bool(agents)), **select(RACING, given))
 
     def render(self) -> npt.NDArray[np.uint8] | None:
         """
@@ -103,12 +103,12 @@ class TorcsEnv(RacingEnv):
         return frame
 
 
-def _world(given: Mapping[str, Any], guests: bool) -> Backend:
+def _world(given: Mapping[str, Any], agents: bool) -> Backend:
     """
     Make the backend.
 
     :param given: all options of :class:`TorcsEnv`
-    :param guests: whether there are agents among the opponents
+    :param agents: whether there are agents among the opponents
     :raises InvalidOption: if an option is for another world
     """
     track, car, noise = given["track"], given["car"], given["conditions"]["sensor_noise"]
@@ -135,7 +135,7 @@ def _world(given: Mapping[str, Any], guests: bool) -> Backend:
         raise InvalidOption(
             f"scr is {given['scr']!r}, the address of an SCR server; add backend='scr'"
         )
-    if guests:
+    if agents:
         race = make_shared_race(
             1, track, car, **field, sensor_noise=noise, action_repeat=given["action_repeat"],
             **shared,

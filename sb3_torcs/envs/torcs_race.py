@@ -25,9 +25,9 @@ from sb3_torcs.envs.arguments import read_options, select
 from sb3_torcs.envs.options import CONDITIONS, RACING, TORCS, TorcsOptions
 from sb3_torcs.envs.racing import Observation, RacingEnv
 from sb3_torcs.errors import InvalidOption
-from sb3_torcs.torcs.drivers import crew_of
 from sb3_torcs.torcs.installation import find_game
-from sb3_torcs.torcs.starting_list import guests_of, starting_list
+from sb3_torcs.torcs.opponents import agents_among, load_opponents
+from sb3_torcs.torcs.starting_list import starting_list
 
 __all__ = ["RaceCarEnv", "load_shared_race", "make_race", "make_shared_race"]
 
@@ -92,11 +92,11 @@ def load_shared_race(
     :return: the cars of the agents, and who drives the opponents that are agents
     """
     game = find_game()
-    guests = guests_of(opponents, game)
-    entries = starting_list(game, opponents, grid_place, agents, guests)
-    crew = crew_of(guests) if guests else None
+    named = agents_among(opponents, game)
+    entries = starting_list(game, opponents, grid_place, agents, named)
+    others = load_opponents(named) if named else None
     every: list[list[Any]] = [[car], [gearbox], [range_finder_angles(range_finders)]]
-    more = ([], [], []) if crew is None else (crew.cars, crew.gearboxes, crew.angles)
+    more = ([], [], []) if others is None else (others.cars, others.gearboxes, others.angles)
     cars, gearboxes, angles = (a * agents + b for a, b in zip(every, more, strict=True))
     engine, road = load_race(
         track, entries, cars=cars, gearboxes=gearboxes, angles=angles,
@@ -106,9 +106,9 @@ def load_shared_race(
         SeatWorld(engine, seat, road, beams)
         for seat, beams in zip(engine.agents, angles, strict=True)
     ]
-    if crew is not None:
-        crew.board(worlds[agents:])
-    return LoadedRace(worlds[:agents], crew, flagged)
+    if others is not None:
+        others.take_seats(worlds[agents:])
+    return LoadedRace(worlds[:agents], others, flagged)
 
 
 def make_race(
@@ -198,9 +198,9 @@ def make_shared_race(
         ]
     )
     for race in races.examples:
-        if race.crew is not None and race.crew.action_repeats != {action_repeat}:
+        if race.opponents is not None and race.opponents.action_repeats != {action_repeat}:
             raise InvalidOption(
                 f"action_repeat is {action_repeat!r}, and agents among the opponents were trained "
-                f"with {', '.join(map(str, sorted(race.crew.action_repeats)))}; give all the same"
+                f"with {', '.join(map(str, sorted(race.opponents.action_repeats)))}; give the same"
             )
     return SharedRace(races, sensor_noise)

@@ -11,20 +11,20 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sb3_torcs.agents.models import agent_record, driver_name, load_driver, one_of
-from sb3_torcs.agents.robots import drive_log
+from sb3_torcs.agents.drivers import NamedDriver, find_driver
+from sb3_torcs.agents.models import load_driver, one_of
+from sb3_torcs.agents.robots import race
 from sb3_torcs.agents.rollout import drive
 from sb3_torcs.car import MANY_LAPS, check_count
-from sb3_torcs.errors import BackendUnavailable, DriveFileError, InvalidOption
-from sb3_torcs.evaluation.protocol import RACE_LAPS, choose_world, race_environment
+from sb3_torcs.errors import DriveFileError, InvalidOption
+from sb3_torcs.evaluation.protocol import DEFAULT_TRACK, GAME, RACE_LAPS, race_environment
 from sb3_torcs.evaluation.ticks import log_drives
 from sb3_torcs.files import writable_file
 from sb3_torcs.telemetry.comparison import Comparison, compare_drives
 from sb3_torcs.telemetry.document import write_document
-from sb3_torcs.telemetry.drives import read_drives
+from sb3_torcs.telemetry.drives import DriveLog, read_drives
 from sb3_torcs.telemetry.laps import Drive, drives_of
 from sb3_torcs.telemetry.page import lap_report
-from sb3_torcs.torcs.installation import Game, find_game
 from sb3_torcs.torcs.track_names import RANDOM_TRACK
 from sb3_torcs.tracks.catalogue import load_track
 from sb3_torcs.tracks.track import Track
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 
 __all__ = ["LapReport", "compare", "report_of", "saved_drives"]
 
-DEFAULT_TRACK = "aalborg"
 HEIGHT = 900  # [px] of a report in a notebook
 
 SAVED: dict[str, Callable[[Path], pd.DataFrame]] = {".parquet": read_drives}
@@ -87,34 +86,30 @@ def compare(
     :param trust: run the code that is pickled in a model
     :return: the report
     :raises InvalidOption: if there is no such driver, or a drive is of another track
-    :raises DriveFileError: if a file cannot be read, or nobody drives a whole lap
+    :raises DriveFileError: if a file cannot be read, or no driver completes a lap
     """
     check_count("laps", laps, MANY_LAPS)
     if not drivers:
-        raise InvalidOption("there is nobody to compare; name drivers, e.g. ddpg-aalborg inferno")
+        raise InvalidOption("no driver is named; name some, e.g. ddpg-aalborg inferno")
     for driver in drivers:
         if not isinstance(driver, str | os.PathLike):
             raise InvalidOption(
                 f"a driver is {driver!r}; expected names and paths, one after the other, e.g. "
                 'compare("ddpg-aalborg", "inferno")'
             )
-        if Path(driver).suffix.lower() == ".csv":
-            raise DriveFileError(
-                f"'{driver}' is a CSV file; saved drives are compared from files that --telemetry "
-                f"writes with the ending {' or '.join(SAVED)}"
-            )
     saved = {driver: saved_drives(driver) for driver in drivers if is_saved(driver)}
-    where = _track(track, drivers, saved)
+    named = {driver: find_driver(driver) for driver in drivers if driver not in saved}
+    where = _track(track, [*named.values()], saved)
     drives = []
     with ExitStack() as worlds:
         # All are made ready before anybody drives, so that what is wrong is told at once.
         ready = [
-            None if driver in saved else _ready(str(driver), where, laps, trust, worlds)
+            None if driver in saved else _ready(named[driver], where, laps, trust, worlds)
             for driver in drivers
         ]
         for driver, drive_alone in zip(drivers, ready, strict=True):
             drives += saved[driver] if drive_alone is None else drive_alone()
-    return LapReport(compare_drives(_told_apart(drives), load_track(where)))
+    return LapReport(compare_drives(_numbered(drives), load_track(where)))
 
 
 def report_of(
@@ -127,7 +122,7 @@ def report_of(
     :param track: which it is; ``None`` finds it by its name
     :param first: driver that the others are measured against; ``None`` is the first of the table
     :return: the report
-    :raises DriveFileError: if nobody drove a whole lap
+    :raises DriveFileError: if no driver completed a lap
     """
     drives = sorted(drives_of(frame), key=lambda drive: drive.driver != first)
     if track is None:
@@ -153,7 +148,7 @@ def saved_drives(file: str | Path) -> list[Drive]:
 
 
 def _track(
-    given: str | None, drivers: Sequence[str | Path], saved: dict[str | Path, list[Drive]]
+    given: str | None, drivers: Sequence[NamedDriver], saved: dict[str | Path, list[Drive]]
 ) -> str:
     """Choose the track, and make sure that saved drives are of it."""
     stored = [drive for drives in saved.values() for drive in drives]
@@ -181,49 +176,39 @@ def _same_track(stored: str, track: str) -> bool:
     return Path(stored).stem in (Path(track).stem, load_track(track).name)
 
 
-def _trained_on(drivers: Sequence[str | Path]) -> str:
+def _trained_on(drivers: Sequence[NamedDriver]) -> str:
     """Return the track of the first agent whose training is known."""
     for driver in drivers:
-        if _robot(str(driver)) is None:
-            track = agent_record(driver, _game()).env_kwargs.get("track")
-            if track is not None:
-                return str(one_of("track", track))
+        track = driver.record.env_kwargs.get("track")
+        if track is not None:
+            return str(one_of("track", track))
     return DEFAULT_TRACK
 
 
-def _game() -> Game | None:
-    """Return the installation; without one there are no robots, and agents drive elsewhere."""
-    try:
-        return find_game()
-    except BackendUnavailable:
-        return None
-
-
-def _robot(driver: str) -> tuple[str, int] | None:
-    """Return the name and the index of a robot; ``None`` if there is none of this name."""
-    game = _game()
-    return None if game is None or not game.has_robot(driver) else game.parse_robot(driver)
-
-
 def _ready(
-    driver: str, track: str, laps: int, trust: bool, worlds: ExitStack
+    driver: NamedDriver, track: str, laps: int, trust: bool, worlds: ExitStack
 ) -> Callable[[], list[Drive]]:
     """
     Make a robot or an agent ready to drive, an agent where it was trained.
 
-    :param driver: its name
+    :param driver: that drives
     :param track: that it drives on
     :param laps: to drive
     :param trust: run the code that is pickled in a model
     :param worlds: which closes the agent's
     :return: what lets it drive
     """
-    robot = _robot(driver)
+    robot, record = driver.robot, driver.record
     if robot is not None:
-        return lambda: drives_of(drive_log([robot], track, laps).frame())
-    record = agent_record(driver, _game())
+        log = DriveLog()
+
+        def race_alone() -> list[Drive]:
+            race([robot], track, laps, log=log)
+            return drives_of(log.frame())
+
+        return race_alone
     env = race_environment(
-        choose_world(driver, record.env_id, track).env_id,
+        record.env_id or GAME,
         {**record.env_kwargs, "car": record.one_car},
         track,
         laps=laps,
@@ -231,7 +216,8 @@ def _ready(
         trust=trust,
     )
     worlds.callback(env.close)
-    log, pilot = log_drives(env, driver_name(driver)), load_driver(driver, env, trust=trust)
+    log = log_drives(env, driver.name)
+    pilot = load_driver(driver.source, env, trust=trust)
 
     def drive_alone() -> list[Drive]:
         for _ in drive(env, pilot, seed=0):
@@ -241,7 +227,7 @@ def _ready(
     return drive_alone
 
 
-def _told_apart(drives: Sequence[Drive]) -> list[Drive]:
+def _numbered(drives: Sequence[Drive]) -> list[Drive]:
     """Number drivers of one name."""
     told: dict[str, Drive] = {}
     for one in drives:

@@ -17,26 +17,28 @@ from sb3_torcs.agents.rollout import Driver, Timestep, drive
 from sb3_torcs.agents.saved.record import DRIVEN_WITH
 from sb3_torcs.car import CONTROL_TICK, MANY_LAPS, check_count
 from sb3_torcs.envs.options import TORCS
-from sb3_torcs.errors import BackendUnavailable, InvalidOption, near_miss
-from sb3_torcs.torcs.track_names import RANDOM_TRACK, kind_without_game
+from sb3_torcs.errors import InvalidOption, near_miss
+from sb3_torcs.telemetry import COLUMNS, DriveLog
+from sb3_torcs.torcs.track_names import RANDOM_TRACK
 
 __all__ = [
+    "DEFAULT_TRACK",
     "GAME",
     "KEPT",
     "RACE_LAPS",
-    "ChosenWorld",
     "Driver",
     "Episode",
     "Merit",
     "Timestep",
-    "choose_world",
     "drive",
     "evaluate",
+    "evaluate_robot",
     "merit",
     "race_environment",
     "time_limit",
 ]
 
+DEFAULT_TRACK = "aalborg"
 RACE_LAPS = 3  # from the grid in a row: what it takes to *complete* a track
 GAME, WITHOUT_GAME = "Torcs-v0", "TorcsLite-v0"
 LONGEST_TRACK = 10000.0  # [m] for such a one, whose length is not known beforehand
@@ -53,7 +55,7 @@ class Episode:
     distance: float  # [m]
     end: str  # as in ``info``, or "time_limit"
     damage: float  # [points]
-    episode_return: float
+    episode_return: float | None  # ``None`` of a robot, which gets no reward
 
     @property
     def finished(self) -> bool:
@@ -100,40 +102,6 @@ def merit(races: Sequence[Episode]) -> Merit:
     return Merit(len(finished), sum(others), -sum(race.race_time for race in finished))
 
 
-class ChosenWorld(NamedTuple):
-    """An environment and the reason for its choice."""
-
-    env_id: str
-    reason: str
-
-
-def choose_world(driver: str, trained_on: str | None, track: Any = None) -> ChosenWorld:
-    """
-    Choose the environment: that of the training, or else the game if it runs here.
-
-    :param driver: what it is called, for the reason
-    :param trained_on: the environment of its training, if that is known
-    :param track: to drive on
-    :return: the environment
-    """
-    from sb3_torcs.backends.native import check_layout
-    from sb3_torcs.torcs.installation import find_game
-
-    if trained_on is not None:
-        return ChosenWorld(trained_on, f"'{driver}' was trained there")
-    unknown = f"'{driver}' does not say where it was trained"
-    kind = kind_without_game(track)
-    if kind is not None:
-        return ChosenWorld(WITHOUT_GAME, f"{unknown}, and {kind} tracks are there alone")
-    try:
-        check_layout(find_game())
-    except BackendUnavailable:
-        missing = "and Torcs-v0 does not run here, `sb3-torcs doctor` says why"
-        return ChosenWorld(WITHOUT_GAME, f"{unknown}, {missing}")
-    other = f"--env {WITHOUT_GAME} drives it without the game"
-    return ChosenWorld(GAME, f"{unknown}, and the game is installed; {other}")
-
-
 def time_limit(kwargs: Mapping[str, Any]) -> int:
     """
     Compute the time limit of an evaluation, long enough for the slowest car that is not stuck.
@@ -145,7 +113,7 @@ def time_limit(kwargs: Mapping[str, Any]) -> int:
     from sb3_torcs.envs.ends import STUCK_SPEED
     from sb3_torcs.tracks.catalogue import load_track
 
-    track = kwargs.get("track", "aalborg")
+    track = kwargs.get("track", DEFAULT_TRACK)
     length = LONGEST_TRACK if track == RANDOM_TRACK else load_track(track).length
     # One lap more than asked for: for the way from the grid to the line, and as a margin.
     seconds = (kwargs["laps"] + 1) * length / STUCK_SPEED
@@ -255,3 +223,27 @@ def evaluate(
             )
         )
     return results
+
+
+def evaluate_robot(robot: tuple[str, int], track: str, laps: int, log: DriveLog) -> Episode:
+    """
+    Let a robot of the game drive laps from the grid, alone.
+
+    :param robot: name and index
+    :param track: its name, or the path of a file
+    :param laps: to drive
+    :param log: gets a row per control tick
+    :return: what it drove
+    """
+    from sb3_torcs.agents.robots import race
+
+    (result,) = race([robot], track, laps, log=log)
+    *_, rows = log.episodes().values()
+    return Episode(
+        laps=result.laps_completed,
+        lap_times=[lap.time for lap in result.laps],
+        distance=float(rows[-1, [*COLUMNS].index("distance_raced")]),
+        end="out" if result.out else "laps",
+        damage=float(result.damage),
+        episode_return=None,
+    )

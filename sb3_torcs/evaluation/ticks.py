@@ -65,6 +65,7 @@ class LoggedWorld(TickedWorld):
 
     def __init__(self, world: Backend, log: DriveLog, driver: str, env_id: str) -> None:
         super().__init__(world, lambda car, controls: log.add(self._label, car, controls))
+        self._log = log
         self._label = DriveLabel(driver, "", "", env_id, episode=0)
 
     def reset(self, rng: np.random.Generator, start: Start | None) -> CarState:
@@ -74,6 +75,7 @@ class LoggedWorld(TickedWorld):
         self._label = self._label._replace(
             track=track, car=self._world.car, episode=self._label.episode + 1
         )
+        self._log.tracks[self._label] = self._world.track
         return state
 
 

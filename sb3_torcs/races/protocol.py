@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from sb3_torcs.agents.pilots import Pilots
+from sb3_torcs.agents.drivers import NamedDriver
+from sb3_torcs.agents.pilots import Pilots, check_racers
 from sb3_torcs.backends.native import load_race
 from sb3_torcs.backends.seats import SeatWorld, SharedRace
 from sb3_torcs.car import (
@@ -21,7 +22,6 @@ from sb3_torcs.car import (
     checked_laps,
 )
 from sb3_torcs.errors import InvalidOption
-from sb3_torcs.races.entrants import Entrant
 from sb3_torcs.telemetry import DriveLabel, DriveLog
 from sb3_torcs.torcs.starting_list import GRID_SLOTS, GRIDS, GridName
 from sb3_torcs.tracks.catalogue import lasting_name
@@ -58,9 +58,9 @@ class Standing:
     time: float  # [s] with penalties, of whole laps
     best_lap: float | None  # [s] of those that count
     damage: float  # [points]
-    contacts: int | None  # with other cars; the game itself does not count them
+    contacts: int  # with other cars
     out: bool  # did not finish
-    distance: float | None = field(repr=False, default=0.0)  # [m] which the game does not tell
+    distance: float = field(repr=False, default=0.0)  # [m]
 
     def as_dict(self) -> dict[str, Any]:
         """Return the fields as the command prints them: times in whole milliseconds."""
@@ -96,8 +96,8 @@ class Watcher(Protocol):
         :param road: of the race
         """
 
-    def look(self) -> None:
-        """Look at the race, a control tick later."""
+    def look(self) -> bool:
+        """Look at the race, a control tick later; return whether it may go on."""
 
 
 class Notes:
@@ -119,16 +119,17 @@ class Notes:
             for slot, name in enumerate(names)
         ]
 
-    def look(self) -> None:
+    def look(self) -> bool:
         """See :class:`Watcher`."""
         for slot, label in enumerate(self._labels):
             controls = Controls(*self._engine.controls(slot))
             self._log.add(label, self._engine.read(slot), controls)
+        return True
 
 
 def run_races(
-    entrants: Sequence[Entrant],
-    hold: Callable[[Sequence[Entrant], int], Race],
+    drivers: Sequence[NamedDriver],
+    hold: Callable[[Sequence[NamedDriver], int], Race],
     *,
     races: int,
     grid: GridName = "last",
@@ -141,7 +142,7 @@ def run_races(
     Worlds and drivers are deterministic, so what differs between races is the grid, and with
     ``field_size`` who stands on it; both are drawn from the seed of the race.
 
-    :param entrants: the drivers; the first one takes part in every race
+    :param drivers: the drivers; the first one takes part in every race
     :param hold: holds a race of drivers, the one in front first; with the seed of the race
     :param races: their number
     :param grid: ``"last"``: the first driver behind all others, who are drawn; ``"random"``: all
@@ -152,11 +153,11 @@ def run_races(
     """
     checked_choice("grid", grid, GRIDS)
     check_count("races", races)
-    size = len(entrants) if field_size is None else field_size
-    if not 1 <= size <= len(entrants):
+    size = len(drivers) if field_size is None else field_size
+    if not 1 <= size <= len(drivers):
         raise InvalidOption(
             f"{size} drivers in each race, by --field or field_size; expected a whole number from "
-            f"1 to {len(entrants)}, as many as there are"
+            f"1 to {len(drivers)}, as many as there are"
         )
     if size > GRID_SLOTS:
         raise InvalidOption(
@@ -167,7 +168,7 @@ def run_races(
     def held() -> Iterator[Race]:  # what is checked above is refused before the first race
         before: list[str] = []
         for number in range(seed, seed + races):
-            order = _grid(entrants, size, grid, before, np.random.default_rng(number))
+            order = _grid(drivers, size, grid, before, np.random.default_rng(number))
             race = hold(order, number)
             before = [standing.driver for standing in race.standings]
             yield race
@@ -176,24 +177,24 @@ def run_races(
 
 
 def _grid(
-    entrants: Sequence[Entrant],
+    drivers: Sequence[NamedDriver],
     size: int,
     grid: GridName,
     before: list[str],
     rng: np.random.Generator,
-) -> list[Entrant]:
+) -> list[NamedDriver]:
     """Draw who stands on the grid, and where; the one in front comes first."""
-    others = [entrants[1 + i] for i in rng.permutation(len(entrants) - 1)[: size - 1]]
+    others = [drivers[1 + i] for i in rng.permutation(len(drivers) - 1)[: size - 1]]
     if grid == "last":
-        return [*others, entrants[0]]
-    order = [[entrants[0], *others][i] for i in rng.permutation(size)]
+        return [*others, drivers[0]]
+    order = [[drivers[0], *others][i] for i in rng.permutation(size)]
     if grid == "reverse" and before:
         order.sort(key=lambda e: -before.index(e.name) if e.name in before else 0)
     return order
 
 
 def run_race(
-    order: Sequence[Entrant],
+    order: Sequence[NamedDriver],
     track: str,
     *,
     laps: int,
@@ -215,9 +216,11 @@ def run_race(
     :raises ModelMismatch: if an agent does not fit this race
     """
     checked_laps(laps)
-    agents = [entrant.agent for entrant in order if entrant.agent is not None]
+    if len(order) > 1:
+        check_racers(order)
+    agents = [driver for driver in order if driver.robot is None]
     numbers = iter(range(len(agents)))
-    entries = [entrant.robot or ("", next(numbers)) for entrant in order]
+    entries = [driver.robot or ("", next(numbers)) for driver in order]
     engine, road = load_race(
         track,
         entries,
@@ -227,7 +230,7 @@ def run_race(
         laps=laps,
         flagged=True,
     )
-    names = [entrant.name for entrant in order]
+    names = [driver.name for driver in order]
     pilots: Pilots | None = None
     moments: list[list[tuple[float, int]]] = []
     try:
@@ -289,24 +292,27 @@ def _stretches(
         look = tick + LOOK
         while tick < look and not engine.ended:
             ticks = look - tick if pilots is None else min(pilots.act(tick), look - tick)
-            _drive(engine, ticks, watchers)
+            if not _drive(engine, ticks, watchers):
+                yield
+                return
             tick += ticks
         yield
         if all(out or engine.finished(car) for car, *_, out in engine.results()):
             return
 
 
-def _drive(engine: Engine, ticks: int, watchers: Sequence[Watcher]) -> None:
-    """Drive on, as far as the race goes."""
+def _drive(engine: Engine, ticks: int, watchers: Sequence[Watcher]) -> bool:
+    """Drive on, as far as the race goes; return whether all watchers let it go on."""
     if not watchers:
         engine.drive(ticks)
-        return
+        return True
     for _ in range(ticks):
         if engine.ended:  # what has been looked at already
-            return
+            return True
         engine.drive(1)
-        for watcher in watchers:
-            watcher.look()
+        if not all([watcher.look() for watcher in watchers]):
+            return False
+    return True
 
 
 def _standings(engine: Engine, names: Sequence[str]) -> list[Standing]:

@@ -82,10 +82,7 @@ def _figures(driver: str, standings: Sequence[Standing]) -> dict[str, Any]:
     }
 
 
-def _damage_per_km(standings: Sequence[Standing]) -> float | None:
-    """Divide damage by distance; ``None`` if that is not known."""
-    distances = [standing.distance for standing in standings if standing.distance is not None]
-    if len(distances) < len(standings):
-        return None
+def _damage_per_km(standings: Sequence[Standing]) -> float:
     damage = sum(standing.damage for standing in standings)
-    return 1000.0 * damage / sum(distances) if sum(distances) > 0.0 else 0.0
+    distance = sum(standing.distance for standing in standings)
+    return 1000.0 * damage / distance if distance > 0.0 else 0.0

@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import colorsys
 import contextlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import itertools
+import math
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from sb3_torcs.car import CarState, Controls, FloatArray
+from sb3_torcs.agents.drivers import NamedDriver
+from sb3_torcs.car import CONTROL_TICK, CarState, Controls, FloatArray
+from sb3_torcs.envs.ends import GRACE_TICKS, end_of, stands
+from sb3_torcs.errors import InvalidOption
 from sb3_torcs.races.protocol import behind_the_line
 from sb3_torcs.telemetry import STATE_FIELDS
 from sb3_torcs.torcs.installation import find_game
-from sb3_torcs.torcs.race_setup import RaceSetup
+from sb3_torcs.torcs.race_setup import SCR_DRIVERS, SCR_SERVER, RaceSetup, session_for
 from sb3_torcs.torcs.window import ViewName, Window
 from sb3_torcs.tracks.track import Track
 
@@ -24,12 +29,13 @@ if TYPE_CHECKING:
     from sb3_torcs.rendering.board import Field
     from sb3_torcs.rendering.scenery import Colour
 
-__all__ = ["GAME_SIZE", "Footage", "gaps"]
+__all__ = ["FPS", "GAME_SIZE", "Footage", "gaps", "race_setup", "save_beside"]
 
 Frame = npt.NDArray[np.uint8]
 
 SIZE, GAME_SIZE = (960, 720), (1280, 720)  # [px] of pictures from above, and of the game's
 FPS = 25
+AFTERMATH = 2.0  # [s] that are shown after an agent's drive has ended
 LAST_PICTURE = 3 * FPS  # frames for which the final board is shown
 
 FIELDS = len(STATE_FIELDS)
@@ -38,6 +44,26 @@ NOTHING_SENSED = {
 }  # fmt: skip
 HUE_STEP = 0.62  # of all hues, from one car to the next: so neighbours differ most
 RED_MARGIN = 0.08  # of all hues, on both sides of red, which is for the car that is followed
+
+
+def race_setup(order: Sequence[NamedDriver], track: str, laps: int) -> RaceSetup:
+    """
+    Describe a race to the game, whose SCR server has a seat for each agent.
+
+    :param order: the drivers, the one in front first
+    :param track: as of ``Torcs-v0``
+    :param laps: to drive
+    :raises InvalidOption: if there are more agents than the game has seats
+    """
+    seats = itertools.count()
+    drivers = [driver.robot or (SCR_SERVER, next(seats)) for driver in order]
+    cars = [driver.car for driver in order if driver.robot is None]
+    if len(cars) > SCR_DRIVERS:
+        raise InvalidOption(
+            f"{len(cars)} agents in a race that the game draws, which has {SCR_DRIVERS} seats for "
+            "them; name fewer, or leave out --view"
+        )
+    return RaceSetup(track, drivers, laps, session_for(drivers), cars)
 
 
 class Moment(NamedTuple):
@@ -54,15 +80,26 @@ class Footage:
     """
     What a camera recorded of a race; a :class:`~sb3_torcs.races.protocol.Watcher`.
 
-    :param view: one of :data:`sb3_torcs.torcs.window.VIEWS`, from which the game draws the race;
-        ``None`` draws it from above
+    :param setup: the race as the game would hold it, which then draws it; ``None`` draws it from
+        above
+    :param view: one of :data:`sb3_torcs.torcs.window.VIEWS`, for the game's picture
+    :param size: width and height of the game's picture [px]; ``None`` is 1280x720
+    :param agent: name of the driver whose end ends the race: two seconds after it has left the
+        road, or stands; ``None`` ends it by the rules
     """
 
-    def __init__(self, view: ViewName | None = None) -> None:
-        self.view = view
-        self.setup: RaceSetup | None = None
-        """The race as the game would hold it, which it has to know to draw it."""
+    def __init__(
+        self,
+        setup: RaceSetup | None = None,
+        view: ViewName = "behind",
+        size: tuple[int, int] | None = None,
+        agent: str | None = None,
+    ) -> None:
+        self.setup, self.view, self._agent = setup, view, agent
+        self.size = size or GAME_SIZE
         self.moments: list[Moment] = []
+        self._moving = 0.0  # [s] when the agent last drove along the road
+        self._ended: float | None = None  # [s] when its episode would have ended
 
     def begin(self, engine: Engine, names: Sequence[str], road: Track) -> None:
         """See ``Watcher``."""
@@ -70,10 +107,19 @@ class Footage:
         self.behind = behind_the_line(engine, road, len(names))
         self._record()
 
-    def look(self) -> None:
+    def look(self) -> bool:
         """See ``Watcher``. Control ticks differ in length, so pictures go by the race's clock."""
         if self._engine.read(0).time >= len(self.moments) / FPS:
             self._record()
+        if self._agent is None:
+            return True
+        car = self._engine.read(self.names.index(self._agent))
+        if not stands(car):
+            self._moving = car.time
+        stuck = car.time - self._moving > GRACE_TICKS * CONTROL_TICK
+        if self._ended is None and (stuck or end_of(car, math.inf, 0.0, 0.0)):
+            self._ended = car.time
+        return self._ended is None or car.time < self._ended + AFTERMATH
 
     def _record(self) -> None:
         engine, slots = self._engine, range(len(self.names))
@@ -86,7 +132,7 @@ class Footage:
                 np.array([engine.controls(slot) for slot in slots], float),
                 np.array([engine.finished(slot) for slot in slots]),
                 out,
-                b"" if self.view is None else engine.appearance(),
+                b"" if self.setup is None else engine.appearance(),
             )
         )
 
@@ -100,14 +146,26 @@ class Footage:
         :raises DisplayUnavailable: if there is no virtual display, which the game needs
         :raises OutputNotWritable: if the file cannot be written; no part of it is left behind
         """
-        followed = self.names.index(driver)
-        if self.setup is None or self.view is None:
-            self._save_from_above(path, followed, laps)
-        else:
-            self._save_game_view(path, followed, laps, self.setup, self.view)
+        from sb3_torcs.rendering.encoder import ENCODING, PHOTOGRAPHIC, write_video
 
-    def _save_from_above(self, path: Path, followed: int, laps: int) -> None:
-        from sb3_torcs.rendering.encoder import ENCODING
+        encoding = ENCODING if self.setup is None else PHOTOGRAPHIC
+        total = len(self.moments) + LAST_PICTURE
+        write_video(path, self.pictures(driver, laps), FPS, total, encoding)
+
+    def pictures(self, driver: str, laps: int) -> Iterator[Frame]:
+        """
+        Draw the pictures of the video.
+
+        :param driver: whom the camera follows
+        :param laps: of the race
+        """
+        followed = self.names.index(driver)
+        if self.setup is None:
+            yield from self._from_above(followed, laps)
+        else:
+            yield from self._of_the_game(followed, laps, self.setup)
+
+    def _from_above(self, followed: int, laps: int) -> Iterator[Frame]:
         from sb3_torcs.rendering.viewer import Viewer
 
         with contextlib.closing(Viewer(size=SIZE)) as viewer:
@@ -116,38 +174,24 @@ class Footage:
                 controls = Controls(*moment.controls[followed])
                 return viewer.frame(self.road, car, controls, None, field)
 
-            self._write(path, followed, laps, draw, ENCODING)
+            yield from self._frames(followed, laps, draw)
 
-    def _save_game_view(
-        self, path: Path, followed: int, laps: int, race: RaceSetup, view: ViewName
-    ) -> None:
+    def _of_the_game(self, followed: int, laps: int, race: RaceSetup) -> Iterator[Frame]:
         from sb3_torcs.rendering.board import Board
-        from sb3_torcs.rendering.encoder import PHOTOGRAPHIC
         from sb3_torcs.rendering.game_camera import GameView
 
-        game = find_game()
-        window = Window(GAME_SIZE, view, driver=race.driver_name(followed, game), boards=False)
-        board = Board(GAME_SIZE)
+        game, alone = find_game(), len(self.names) == 1
+        name = race.driver_name(followed, game)
+        window = Window(self.size, self.view, driver=name, boards=alone)
+        board = Board(self.size)
         with GameView(game, race, window) as camera:
 
             def draw(moment: Moment, car: CarState, field: Field) -> Frame:
                 del car
-                return board.over(camera.frame(moment.appearance), field)
+                picture = camera.frame(moment.appearance)
+                return picture if alone else board.over(picture, field)
 
-            self._write(path, followed, laps, draw, PHOTOGRAPHIC)
-
-    def _write(
-        self,
-        path: Path,
-        followed: int,
-        laps: int,
-        draw: Callable[[Moment, CarState, Field], Frame],
-        encoding: Mapping[str, Any],
-    ) -> None:
-        from sb3_torcs.rendering.encoder import write_video
-
-        total = len(self.moments) + LAST_PICTURE
-        write_video(path, self._frames(followed, laps, draw), FPS, total, encoding)
+            yield from self._frames(followed, laps, draw)
 
     def _frames(
         self, followed: int, laps: int, draw: Callable[[Moment, CarState, Field], Frame]
@@ -173,6 +217,40 @@ class Footage:
             yield picture
         for _ in range(LAST_PICTURE):
             yield picture
+
+
+def save_beside(footages: Sequence[Footage], drivers: Sequence[str], path: Path, laps: int) -> None:
+    """
+    Draw two races side by side, and by how much the second driver is behind the first.
+
+    :param footages: of the races, from left to right
+    :param drivers: whom the cameras follow
+    :param path: of the video, ending in ``.mp4``
+    :param laps: of both races
+    :raises OutputNotWritable: if the file cannot be written; no part of it is left behind
+    """
+    from sb3_torcs.rendering.encoder import PHOTOGRAPHIC, write_video
+    from sb3_torcs.rendering.gap import Passing, draw_gap, side_by_side, time_behind
+
+    passings = [Passing() for _ in footages]
+
+    def noted(footage: Footage, driver: str, passing: Passing) -> Iterator[Frame]:
+        slot, goal = footage.names.index(driver), laps * footage.road.length
+        for number, picture in enumerate(footage.pictures(driver, laps)):
+            if number < len(footage.moments):
+                car = _car(footage.moments[number].states[slot])
+                way = car.distance_raced - footage.behind[slot]
+                passing.note(car.time, min(max(way / goal, 0.0), 1.0))
+            yield picture
+
+    def joint() -> Iterator[Frame]:
+        shown = zip(footages, drivers, passings, strict=True)
+        for picture in side_by_side(*(noted(*each) for each in shown)):
+            behind = time_behind(*passings)
+            yield picture if behind is None else draw_gap(picture, drivers[1], behind)
+
+    total = max(len(footage.moments) for footage in footages) + LAST_PICTURE
+    write_video(path, joint(), FPS, total, PHOTOGRAPHIC)
 
 
 def gaps(footage: Footage, laps: int) -> list[list[str]]:

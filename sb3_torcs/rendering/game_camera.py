@@ -7,7 +7,10 @@ however long the drawing takes, and two pictures of one moment are equal.
 
 from __future__ import annotations
 
+import os
+import select
 import socket
+import struct
 import weakref
 from contextlib import ExitStack
 from dataclasses import replace
@@ -15,8 +18,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from sb3_torcs.errors import GameFailed
-from sb3_torcs.rendering.game_video import read_frame
+from sb3_torcs.errors import GameFailed, GameTimeout
 from sb3_torcs.torcs.display import VirtualDisplay
 from sb3_torcs.torcs.installation import Game
 from sb3_torcs.torcs.process import GameProcess
@@ -26,10 +28,14 @@ from sb3_torcs.torcs.track_names import find_track
 from sb3_torcs.torcs.window import Window, window_arguments
 from sb3_torcs.tracks.trial import check_track
 
-__all__ = ["GameView", "check_view"]
+__all__ = ["HEADER", "GameView", "check_view", "read_frame"]
 
 AGENT = f"{SCR_SERVER} 0"  # the agent's name in the game
+PATIENCE = 120.0  # [s] for one frame, on a busy machine
 GRACE = 5.0  # [s] for a game to end after it closed the connection
+
+HEADER = struct.Struct("=4sIIIdd")  # as in native/window/frames.cpp
+MARK = b"SB3F"
 
 
 def check_view(game: Game, track: str, size: tuple[int, int]) -> None:
@@ -103,8 +109,54 @@ class GameView:
         if frame is None:
             self._game.wait(GRACE)  # its error is more precise
             raise GameFailed(self._game.epitaph())
-        return frame.picture
+        return frame
 
     def close(self) -> None:
         """End the game and its display. A second call does nothing."""
         self._end()
+
+
+def read_frame(file: int, game: GameProcess) -> npt.NDArray[np.uint8] | None:
+    """
+    Read the next picture that the game sends.
+
+    :param file: the open file
+    :param game: that sends it
+    :return: (height, width, 3); ``None`` if the game has sent its last one
+    :raises GameFailed: if the game ends within a frame
+    :raises GameTimeout: if no frame comes
+    """
+    header = bytearray(HEADER.size)
+    got = _fill(file, memoryview(header), game)
+    if got == 0:
+        return None
+    mark, width, height, *_ = HEADER.unpack(header)
+    if got < HEADER.size or mark != MARK:
+        raise GameFailed(game.epitaph())
+    picture = np.empty((height, width, 3), np.uint8)
+    if _fill(file, picture.reshape(-1).data, game) < picture.nbytes:
+        raise GameFailed(game.epitaph())
+    return picture
+
+
+def _fill(file: int, buffer: memoryview, game: GameProcess) -> int:
+    """
+    Read until the buffer is full.
+
+    :param file: the open file
+    :param buffer: to fill
+    :param game: that sends
+    :return: number of bytes read; fewer only at the end
+    """
+    got = 0
+    while got < len(buffer):
+        ready, _, _ = select.select([file], [], [], PATIENCE)
+        if not ready:
+            raise GameTimeout(
+                f"the game sent no picture for {PATIENCE:g} s; it last said: {game.last_words()}"
+            )
+        count = os.readv(file, [buffer[got:]])
+        if count == 0:
+            break
+        got += count
+    return got

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from itertools import zip_longest
+
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["Passing", "draw_gap", "time_behind"]
+__all__ = ["Passing", "draw_gap", "side_by_side", "time_behind"]
+
+Frame = npt.NDArray[np.uint8]
 
 HEIGHT = 0.055  # of the letters, as a share of the picture's height
 TOP = 0.02  # of the board, likewise
@@ -92,3 +97,18 @@ def draw_gap(picture: npt.NDArray[np.uint8], name: str, behind: float) -> npt.ND
     )
     draw.text((middle, top), text, LETTERS, font, anchor="ma")
     return np.asarray(image)
+
+
+def side_by_side(*videos: Iterator[Frame]) -> Iterator[Frame]:
+    """
+    Join videos of one height. A video that ends before the others keeps its last picture.
+
+    :param videos: pictures of each, from left to right
+    :return: joint pictures
+    """
+    last: list[Frame] = []
+    for pictures in zip_longest(*videos):
+        last = [
+            last[place] if picture is None else picture for place, picture in enumerate(pictures)
+        ]
+        yield np.concatenate(last, axis=1)

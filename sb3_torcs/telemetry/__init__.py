@@ -1,23 +1,9 @@
-"""Telemetry: drives as tables, and the lap report, which says where one lap is faster than another.
+"""Telemetry: drives as tables, and the lap report, which shows where a lap is faster.
 
-``drives`` writes and reads them as Parquet, ``table`` writes CSV. ``laps`` and ``corners`` cut them
-up, ``comparison`` lays laps on each other, and ``page`` shows that as one HTML ``document``.
+``drives`` notes them, and writes and reads them as Parquet. ``laps`` and ``corners`` cut them up,
+``comparison`` lays laps on each other, and ``page`` shows that as one HTML ``document``.
 """
 
-from sb3_torcs.telemetry.drives import DriveLabel, DriveLog, read_drives
-from sb3_torcs.telemetry.table import (
-    CONTROL_FIELDS,
-    STATE_FIELDS,
-    TELEMETRY_FIELDS,
-    write_telemetry,
-)
+from sb3_torcs.telemetry.drives import COLUMNS, STATE_FIELDS, DriveLabel, DriveLog, read_drives
 
-__all__ = [
-    "CONTROL_FIELDS",
-    "STATE_FIELDS",
-    "TELEMETRY_FIELDS",
-    "DriveLabel",
-    "DriveLog",
-    "read_drives",
-    "write_telemetry",
-]
+__all__ = ["COLUMNS", "STATE_FIELDS", "DriveLabel", "DriveLog", "read_drives"]

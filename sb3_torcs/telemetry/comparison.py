@@ -91,14 +91,14 @@ def compare_drives(drives: Sequence[Drive], track: Track) -> Comparison:
 
     :param drives: on this track
     :param track: that they were driven on
-    :raises DriveFileError: if nobody drove a whole lap, or a lap is of another road
+    :raises DriveFileError: if no driver completed a lap, or a lap is of another road
     """
     able = [drive for drive in drives if drive.laps]
     if not able:
         far = ", ".join(f"{drive.driver} drove {drive.distance:.0f} m" for drive in drives)
         raise DriveFileError(
-            f"nobody drove a whole lap of {track.name}, {track.length:.0f} m: {far}; name a driver "
-            "who does, e.g. inferno"
+            f"no driver completed a lap of {track.name} ({track.length:.0f} m): {far}; choose "
+            "another driver, e.g. inferno"
         )
     flying = all(drive.best(flying=True) for drive in able)
     grid = grid_of(track)

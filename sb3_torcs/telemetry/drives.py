@@ -17,17 +17,31 @@ from sb3_torcs.car import CarState, Controls
 from sb3_torcs.errors import DriveFileError, InvalidOption, needs_extra
 from sb3_torcs.files import checked_ending, readable, whole_file
 from sb3_torcs.sensors import SENSORS
-from sb3_torcs.telemetry.table import CONTROL_FIELDS, STATE_FIELDS
+from sb3_torcs.tracks.track import Track
 
 if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
-__all__ = ["COLUMNS", "LABELS", "WHEELS", "DriveLabel", "DriveLog", "read_drives"]
+__all__ = [
+    "COLUMNS",
+    "LABELS",
+    "STATE_FIELDS",
+    "WHEELS",
+    "DriveLabel",
+    "DriveLog",
+    "car_of",
+    "controls_of",
+    "read_drives",
+]
+
+STATE_FIELDS = CarState._fields[: CarState._fields.index("wheel_speeds")]
+CONTROL_FIELDS = ("steering", "throttle", "brake", "gear_asked")
 
 FORMAT = "sb3-torcs drives, version 1"
 AT_ONCE = 5000  # rows that are turned into columns together
 
+NO_OPPONENTS = np.full(36, 200.0)  # [m] as of CarState
 WHEELS = ("front_right", "front_left", "rear_right", "rear_left")
 WHOLE = {"gear", "laps", "race_position", "gear_asked"}  # columns of whole numbers
 LEFT_BY_PHYSICS = {"engine_speed", "fuel"}  # as wheels: may stay no number in a car that it lost
@@ -73,6 +87,8 @@ class DriveLog:
         self._labels: list[DriveLabel] = []
         self._numbers: list[np.ndarray[Any, Any]] = []
         self._open: list[tuple[Any, ...]] = []
+        self.tracks: dict[DriveLabel, Track] = {}
+        """Where was driven, if the world has told: a track that was drawn has no lasting name."""
 
     def add(self, label: DriveLabel, car: CarState, controls: Controls) -> None:
         """
@@ -105,6 +121,7 @@ class DriveLog:
             log._close()
         self._labels += other._labels
         self._numbers += other._numbers
+        self.tracks |= other.tracks
 
     def _close(self) -> None:
         """Pack the newest rows into an array."""
@@ -112,13 +129,25 @@ class DriveLog:
             self._numbers.append(np.array(self._open))
             self._open = []
 
+    def episodes(self) -> dict[DriveLabel, np.ndarray[Any, Any]]:
+        """Return the rows of each drive: (n, columns), as of :data:`COLUMNS`."""
+        self._close()
+        numbers = self._joined()
+        places: dict[DriveLabel, list[int]] = {}
+        for place, label in enumerate(self._labels):
+            places.setdefault(label, []).append(place)
+        return {label: numbers[rows] for label, rows in places.items()}
+
+    def _joined(self) -> np.ndarray[Any, Any]:
+        return np.concatenate(self._numbers or [np.empty((0, len(COLUMNS)))])
+
     def table(self) -> pa.Table:
         """Return all rows as a table of Apache Arrow."""
         with needs_extra("a table of drives"):
             import pyarrow as pa
 
         self._close()
-        numbers = np.concatenate(self._numbers or [np.empty((0, len(COLUMNS)))])
+        numbers = self._joined()
         columns: dict[str, pa.Array] = {
             name: pa.array(
                 [readable(getattr(label, name)) for label in self._labels]
@@ -164,6 +193,30 @@ class DriveLog:
             )  # fmt: skip
 
 
+def car_of(row: np.ndarray[Any, Any]) -> CarState:
+    """
+    Make the car of a row, without opponents.
+
+    :param row: of :meth:`DriveLog.episodes`
+    """
+    state, wheels = len(STATE_FIELDS), len(WHEELS)
+    values = dict(zip(STATE_FIELDS, row[:state].tolist(), strict=True))
+    whole = {name: int(values[name]) for name in STATE_FIELDS if name in WHOLE}
+    beams = row[state + wheels : -len(CONTROL_FIELDS)]
+    sensed = {"wheel_speeds": row[state : state + wheels], "range_finders": beams}
+    return CarState(**{**sensed, "opponents": NO_OPPONENTS, **values, **whole})
+
+
+def controls_of(row: np.ndarray[Any, Any]) -> Controls:
+    """
+    Make the controls of a row.
+
+    :param row: of :meth:`DriveLog.episodes`
+    """
+    steering, throttle, brake, gear = row[-len(CONTROL_FIELDS) :].tolist()
+    return Controls(steering, throttle, brake, None if np.isnan(gear) else int(gear))
+
+
 def read_drives(path: str | Path) -> pd.DataFrame:
     """
     Read the drives of a file, and make sure that they are drives.
@@ -191,7 +244,7 @@ def read_drives(path: str | Path) -> pd.DataFrame:
             f"'{path}' is no drive of ours: it has no column {', '.join(missing[:3])}; {again}"
         )
     if frame.empty:
-        raise DriveFileError(f"'{path}' holds no rows: nobody has driven; {again}")
+        raise DriveFileError(f"'{path}' holds no rows; {again}")
     damage = _damage(frame)
     if damage is not None:
         raise DriveFileError(f"'{path}' is damaged: {damage}; {again}")

@@ -141,7 +141,7 @@ class Game:
             raise InvalidOption(f"car is {name!r}; expected the name of one, e.g. '{DEFAULT_CAR}'")
         cars = self.cars()
         if name not in cars:
-            hint = near_miss(name, cars, f"it has {', '.join(cars)}")
+            hint = near_miss(name, cars) or f"; it has {', '.join(cars)}"
             raise UnknownCar(f"the game at {self.data} has no car '{name}'{hint}")
         return cars[name]
 
@@ -175,6 +175,15 @@ class Game:
         best = min(drivers, key=lambda d: (d.car != DEFAULT_CAR, d.car not in cars, d.index))
         return name, self.find_robot(name, best.index).index
 
+    def robot_name(self, robot: tuple[str, int]) -> str:
+        """
+        Return the shortest name of a robot's driver, as one types it.
+
+        :param robot: name and index
+        """
+        name, index = robot
+        return name if self.parse_robot(name) == robot else f"{name}:{index}"
+
     def find_robot(self, name: str, index: int) -> RobotEntry:
         """
         Find one driver of a robot.
@@ -187,7 +196,7 @@ class Game:
         """
         robots = self.robots()
         if name not in robots:
-            hint = near_miss(name, robots, f"it has {', '.join(robots)}")
+            hint = near_miss(name, robots, "`sb3-torcs drivers` lists them")
             raise UnknownRobot(f"the game at {self.data} has no robot '{name}'{hint}")
         for entry in robots[name]:
             if entry.index == index:
@@ -195,7 +204,7 @@ class Game:
                     return entry
                 raise UnknownCar(
                     f"robot '{name}' with index {index} drives '{entry.car}', a car that the game "
-                    f"at {self.data} does not have; `sb3-torcs robots` lists who can drive"
+                    f"at {self.data} does not have; `sb3-torcs drivers` lists those that can drive"
                 )
         indices = ", ".join(str(entry.index) for entry in robots[name])
         raise UnknownRobot(f"robot '{name}' has no index {index}; it has {indices}")

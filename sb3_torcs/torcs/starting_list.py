@@ -10,7 +10,7 @@ from sb3_torcs.car import is_count
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.torcs.installation import Game
 
-__all__ = ["AGENT", "GRIDS", "GRID_SLOTS", "GridName", "guests_of", "starting_list"]
+__all__ = ["AGENT", "GRIDS", "GRID_SLOTS", "GridName", "starting_list"]
 
 AGENT = ("", 0)
 """The entry of the first agent in a starting list; robots have a name and an index."""
@@ -28,7 +28,7 @@ def starting_list(
     opponents: Sequence[str],
     grid_place: int | None,
     agents: int = 1,
-    guests: Sequence[str] = (),
+    agents_named: Sequence[str] = (),
 ) -> list[tuple[str, int]]:
     """
     Make the starting list.
@@ -37,7 +37,7 @@ def starting_list(
     :param opponents: robots, e.g. ``("inferno", "berniw:3")``
     :param grid_place: of the first agent among them, 1 in front; ``None`` is behind them all
     :param agents: that follow each other
-    :param guests: the opponents that are agents; they are numbered after the others
+    :param agents_named: the opponents that are agents; they are numbered after the others
     :return: names and indices, and those of the agents: no name, and 0, 1 and so on
     :raises InvalidOption: if there is no such slot, or not enough of them, or the opponents are no
         list
@@ -50,7 +50,7 @@ def starting_list(
         )
     numbers = itertools.count(agents if is_count(agents) else 1)
     entries = [
-        (AGENT[0], next(numbers)) if name in guests else game.parse_robot(name)
+        (AGENT[0], next(numbers)) if name in agents_named else game.parse_robot(name)
         for name in opponents
     ]
     slot = len(entries) + 1 if grid_place is None else grid_place
@@ -70,15 +70,3 @@ def starting_list(
     name, first = AGENT
     entries[slot - 1 : slot - 1] = [(name, first + number) for number in range(agents)]
     return entries
-
-
-def guests_of(opponents: Sequence[str], game: Game) -> list[str]:
-    """
-    Tell the agents among opponents.
-
-    :param opponents: names
-    :param game: the installation, whose robots are none
-    """
-    if not isinstance(opponents, (list, tuple)):
-        return []
-    return [name for name in opponents if isinstance(name, str) and not game.has_robot(name)]

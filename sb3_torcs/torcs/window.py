@@ -36,7 +36,6 @@ VIEWS: Mapping[ViewName, tuple[int, int]] = {
 """The game's cameras: the list, which has a key (0 is F2), and the place in it."""
 
 SMALLEST, LARGEST = 64, 4096  # [pixels] of either side
-FEWEST_FPS, MOST_FPS = 1.0, 500.0  # [1/s] the physics has 500 steps
 
 SCREEN, GRAPHICS, SOUND = "config/screen.xml", "config/graph.xml", "config/sound.xml"
 BOARDS = {
@@ -66,9 +65,8 @@ class Window:
     :param display: of the X server, e.g. ``":0"``
     :param driver: the name, as the game shows it, of the one who is looked at, e.g.
         ``"scr_server 0"``; ``None`` for the first on the grid
-    :param frames: an open file for pictures, see :mod:`sb3_torcs.rendering.game_video`;
+    :param frames: an open file for pictures, see :mod:`sb3_torcs.rendering.game_camera`;
         ``None`` shows the race in real time
-    :param fps: frames per second of simulated time; ``None`` for single pictures
     :param boards: whether lap times, instruments and a map are drawn over the picture
     :param traces: whether smoke and skid marks are drawn, which depend on earlier moments
     :raises InvalidOption: if there is no such view, or the game cannot draw this
@@ -79,21 +77,18 @@ class Window:
     display: str = ":0"
     driver: str | None = None
     frames: int | None = None
-    fps: float | None = None
     boards: bool = True
     traces: bool = True
 
     def __post_init__(self) -> None:
         if not isinstance(self.view, str) or self.view not in VIEWS:
-            hint = near_miss(self.view, VIEWS, f"it is {' or '.join(VIEWS)}")
+            hint = near_miss(self.view, VIEWS) or f"; it is {' or '.join(VIEWS)}"
             raise InvalidOption(f"there is no view {self.view!r}{hint}")
         if not all(SMALLEST <= side <= LARGEST for side in self.size):
             raise InvalidOption(
                 f"size is {self.size[0]}x{self.size[1]}; "
                 f"expected {SMALLEST} to {LARGEST} pixels for each side, e.g. 1280x720"
             )
-        if self.fps is not None and not FEWEST_FPS <= self.fps <= MOST_FPS:
-            raise InvalidOption(f"fps is {self.fps:g}; expected {FEWEST_FPS:g} to {MOST_FPS:g}")
 
 
 class WindowArguments(TypedDict):
@@ -137,8 +132,6 @@ def _environment(window: Window) -> dict[str, str]:
     variables["DISPLAY"] = window.display
     if window.frames is not None:
         variables["SB3_TORCS_FRAMES"] = str(window.frames)
-        if window.fps is not None:
-            variables["SB3_TORCS_FRAME_TIME"] = repr(1.0 / window.fps)
     return variables
 
 

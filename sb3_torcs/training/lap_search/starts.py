@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 
+from sb3_torcs.agents.drivers import NamedDriver
 from sb3_torcs.agents.models import driver_record, load_driver, one_of
 from sb3_torcs.agents.rollout import drive
 from sb3_torcs.agents.scripted import SCRIPTED
@@ -37,20 +38,18 @@ class FirstDrive(NamedTuple):
         return sum(self.lap_times) if len(self.lap_times) == RACE_LAPS else math.inf
 
 
-def ghost_environment(agent: str, track: str | None, car: str | None) -> dict[str, Any]:
+def ghost_environment(driver: NamedDriver, given: Mapping[str, Any]) -> dict[str, Any]:
     """
-    Choose the environment of a ghost: that of the agent, so that the agent can learn from it.
+    Choose the environment of a ghost: that of an agent, so that the agent can learn from it.
 
-    :param agent: what :func:`~sb3_torcs.agents.models.load_driver` loads
-    :param track: ``None`` is that of the training, or ``"aalborg"``
-    :param car: ``None`` is that of the training
+    :param driver: whose drive the search begins with
+    :param given: keyword arguments that replace those of the training
     :return: keyword arguments of ``Torcs-v0``
     :raises InvalidOption: if the training had several cars or tracks, and none is given
     """
-    usual = {"track": "aalborg", "car": DEFAULT_CAR, "action_repeat": 5, "action": "pedals"}
-    kwargs = {**usual, **driver_record(agent).kept(KEPT), "laps": RACE_LAPS}
-    given = {"track": track, "car": car}
-    kwargs.update({name: value for name, value in given.items() if value is not None})
+    car = DEFAULT_CAR if driver.robot is None else find_game().find_robot(*driver.robot).car
+    usual = {"track": "aalborg", "car": car, "action_repeat": 5, "action": "pedals"}
+    kwargs = {**usual, **driver.record.kept(KEPT), **given, "laps": RACE_LAPS}
     one_of("track", kwargs["track"])
     one_of("car", kwargs["car"])
     kwargs["track"] = lasting_track(kwargs["track"])
@@ -60,21 +59,24 @@ def ghost_environment(agent: str, track: str | None, car: str | None) -> dict[st
 
 
 def find_starts(
-    agent: str, env_kwargs: Mapping[str, Any], *, alone: bool = False, trust: bool = False
+    named: NamedDriver, env_kwargs: Mapping[str, Any], *, alone: bool = False, trust: bool = False
 ) -> list[FirstDrive]:
     """
     Find drives of three laps to begin a search with.
 
-    :param agent: what :func:`~sb3_torcs.agents.models.load_driver` loads
+    :param named: the driver to begin with
     :param env_kwargs: of :func:`ghost_environment`
-    :param alone: whether to take the agent's drive only, however slow it is
+    :param alone: whether to take its drive only, however slow it is
     :param trust: run code that is pickled in the model
     :return: the fastest first
-    :raises InvalidOption: if nobody drives three laps there
+    :raises InvalidOption: if no driver finishes three laps there
     """
-    starts = [agents_start(agent, env_kwargs, trust)]
+    track, car, ticks = (env_kwargs[name] for name in ("track", "car", "action_repeat"))
+    if named.robot is not None:
+        starts = [_robots_start(track, named.robot, ticks)]
+    else:
+        starts = [agents_start(named.source, env_kwargs, trust)]
     if not alone:
-        track, car, ticks = (env_kwargs[name] for name in ("track", "car", "action_repeat"))
         starts += robots_starts(track, car, ticks)
     whole = [start for start in starts if start.seconds < math.inf]
     if not whole and not alone:
@@ -82,9 +84,9 @@ def find_starts(
         whole = [scripted] if scripted.seconds < math.inf else []
     if not whole:
         raise InvalidOption(
-            f"{agent if alone else 'nobody'} finishes no race of {RACE_LAPS} laps on "
+            f"{named.source if alone else 'no driver'} finishes no race of {RACE_LAPS} laps on "
             f"{env_kwargs['track']} in {env_kwargs['car']}, and a search begins with one; give "
-            "another agent" + (", or leave out --alone" if alone else "")
+            "another driver" + (", or leave out --alone" if alone else "")
         )
     return sorted(whole, key=lambda start: start.seconds)
 
