@@ -441,9 +441,9 @@ def check(args):
         assert read_study(args.file).trials
     if args.verb == "evaluate":
         saved = r"logs/(?:\w+/)?(\w+)/Torcs(?:Lite)?-v0_1(?:/best_model\.zip)?"
-        run = re.fullmatch(saved, args.model)
+        run = re.fullmatch(saved, args.driver)
         named = ("scripted", *shipped_agents(), *ROBOTS)
-        assert args.model.partition(":")[0] in named or zoo.config_file(run[1])
+        assert args.driver.partition(":")[0] in named or zoo.config_file(run[1])
 
 
 def check_zoo(args):

@@ -50,6 +50,10 @@ CLASSES = {  # documented by their docstrings
     "Environments": [
         "sb3_torcs.envs.torcs.TorcsEnv",
         "sb3_torcs.envs.torcs_lite.TorcsLiteEnv",
+        *[
+            f"sb3_torcs.envs.options.{name}Options"
+            for name in ("End", "Condition", "Picture", "Scr")
+        ],
         "sb3_torcs.car.CarState",
         "sb3_torcs.car.Controls",
     ],

@@ -25,7 +25,7 @@ COLUMNS = ("variant", "seed", "timesteps", "laps", "best lap s", "completes", "s
 
 DESCRIPTION = """\
 Run a study: train every variant with every seed, evaluate it while it learns, and measure its best
-model on the study's tracks. docs/evaluation.md describes FILE and the results.
+model on the study's tracks. docs/studies.md describes FILE and the results.
 
 Ctrl-C, a kill or the loss of a machine of a cluster loses at most what was learned since the last
 evaluation. The same command then continues the study, and comes to the same results.
@@ -43,9 +43,8 @@ def add_parser(subparsers: Any) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
-    what = parser.add_mutually_exclusive_group(required=True).add_argument
-    what("file", nargs="?", metavar="FILE.yml", help="e.g. examples/studies/smoke.yml")
-    what(
+    add("file", nargs="?", metavar="FILE.yml", help="e.g. examples/studies/smoke.yml")
+    add(
         "--report",
         metavar="FOLDER",
         help="instead of running a study, write its learning curves and tables, with every seed: "
@@ -69,6 +68,10 @@ def run(args: argparse.Namespace) -> int:
     :param args: from the command line
     :return: the exit status
     """
+    from sb3_torcs.errors import InvalidOption
+
+    if (args.report is None) == (args.file is None):
+        raise InvalidOption("name a study, FILE.yml, or a folder of results: --report FOLDER")
     if args.report is not None:
         return _report(Path(args.report).expanduser(), args.output)
     from sb3_torcs.studies.config import read_study

@@ -21,6 +21,8 @@ __all__ = [
     "STUCK_TICKS",
     "TRUNCATING",
     "end_episodes",
+    "end_of",
+    "stands",
 ]
 
 cos = maths.compiled(maths.cos)
@@ -40,7 +42,7 @@ TRUNCATING = ("laps", "race")
 
 
 @register_jitable
-def _end_of(car: CarState, laps: float, runoff: float, recovery: float) -> int:
+def end_of(car: CarState, laps: float, runoff: float, recovery: float) -> int:
     """Return why the state of a car ends its episode, 0 if it does not."""
     if car.laps >= laps:
         return FINISHED
@@ -52,7 +54,7 @@ def _end_of(car: CarState, laps: float, runoff: float, recovery: float) -> int:
 
 
 @register_jitable
-def _stands(car: CarState) -> bool:
+def stands(car: CarState) -> bool:
     """Check whether a car is slower along the road than walking, or faces backwards."""
     along = cos(car.heading_error)
     return along < 0.0 or car.speed_x * along < STUCK_SPEED
@@ -73,9 +75,9 @@ def end_episodes(episodes: Episodes, rules: Episodes) -> None:
         episode.timesteps += 1.0
         episode.lap_time = car.last_lap_time if car.laps > episode.laps else 0.0
         episode.laps = car.laps
-        over = _end_of(car, rule.laps, rule.runoff, rule.recovery)
+        over = end_of(car, rule.laps, rule.runoff, rule.recovery)
         if over == 0:
-            if _stands(car):
+            if stands(car):
                 episode.standing += rule.ticks
             else:
                 episode.standing, episode.patience = 0.0, max(float(STUCK_TICKS), rule.recovery)

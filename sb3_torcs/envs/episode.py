@@ -86,7 +86,7 @@ def new_episodes(number: int) -> Episodes:
 
 def numbers_of(records: Any) -> FloatArray:
     """
-    Look at records as a matrix, which shares their memory.
+    Look at records as a matrix: a view of their numbers.
 
     :param records: (n,) contiguous, of :data:`EPISODE` or :data:`RULES`
     :return: (n, numbers of a record)
@@ -127,6 +127,6 @@ def car_of(episodes: Episodes, index: int = 0) -> CarState:
 
     :param episodes: (n,)
     :param index: of the episode
-    :return: the car, which shares no memory with the record
+    :return: the car, a copy
     """
     return car_from_record(numbers_of(episodes)[index, :CAR_NUMBERS])

@@ -56,7 +56,7 @@ FIELDS = (
     "laps", "completes", "lap_times_s", "best_flying_lap_s", "race_time_s", "distance_m", "end",
     "damage", "return", "kept", "ladder",
 )  # fmt: skip
-"""Columns of the results; ``docs/evaluation.md`` says what they mean."""
+"""Columns of the results; ``docs/studies.md`` says what they mean."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ def read_study(path: str | Path) -> Study:
     """
     Read a study file, and check all that can be checked without training.
 
-    :param path: of a YAML file; ``docs/evaluation.md`` says what it holds
+    :param path: of a YAML file; ``docs/studies.md`` says what it holds
     :return: the study
     :raises StudyError: if the file has a mistake
     :raises ZooConfigError: if the hyperparameters of a variant have a mistake
