@@ -335,10 +335,8 @@ def _write_rivals(car: CarState, values: FloatArray) -> None:
 
 
 def _write_race(car: CarState, values: FloatArray) -> None:
-    values[0] = car.race_position
-    values[1] = car.race[GAP_AHEAD]
-    values[2] = car.race[GAP_BEHIND]
-    values[3] = car.race[LAPS_LEFT]
+    values[0], values[1] = car.race_position, car.race[GAP_AHEAD]
+    values[2], values[3] = car.race[GAP_BEHIND], car.race[LAPS_LEFT]
 
 
 def _write_car(_car: CarState, values: FloatArray, facts: FloatArray) -> None:
@@ -346,8 +344,7 @@ def _write_car(_car: CarState, values: FloatArray, facts: FloatArray) -> None:
 
 
 def _write_motion(car: CarState, values: FloatArray) -> None:
-    values[0] = car.yaw_rate
-    values[1] = car.height - REST_HEIGHT
+    values[0], values[1] = car.yaw_rate, car.height - REST_HEIGHT
 
 
 def _nothing(_world: Any) -> Constants:

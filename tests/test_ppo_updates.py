@@ -142,7 +142,7 @@ def interrupted(model, when, *callbacks):
 
 @pytest.mark.parametrize("when", ["rollout", "before", "update"])
 @pytest.mark.parametrize(
-    "callbacks", [*permutations([LeanUpdatesCallback, AdaptiveLearningRateCallback])]
+    "kinds", [*permutations([LeanUpdatesCallback, AdaptiveLearningRateCallback])]
 )
 def test_a_model_is_saved_after_ctrl_c(when, kinds, tmp_path):
     """Its environment cannot be pickled, so nothing of the callbacks may be left in it."""

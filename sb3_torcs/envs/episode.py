@@ -86,7 +86,7 @@ def new_episodes(number: int) -> Episodes:
 
 def numbers_of(records: Any) -> FloatArray:
     """
-    Look at records as a matrix: a view of their numbers.
+    Look at records as a matrix of the same numbers.
 
     :param records: (n,) contiguous, of :data:`EPISODE` or :data:`RULES`
     :return: (n, numbers of a record)
