@@ -48,7 +48,6 @@ def add_parser(subparsers: Any) -> None:
         action="store_true",
         help="also get Xvfb, for videos where there is no display",
     )
-    add("--film", dest="video", action="store_true", help=argparse.SUPPRESS)  # its older name
     parser.set_defaults(run=run)
 
 

@@ -44,7 +44,7 @@ class TorcsEnv(RacingEnv):
 
     With ``backend="scr"`` the game runs in a process of its own and sends its sensors by the
     protocol of the Simulated Car Racing championship. The drive is the same to the bit, and slower.
-    With ``host`` the game is one that runs already; other servers than ours send six digits.
+    With ``scr`` the game is one that runs already; other servers than ours send six digits.
 
     Units are SI and radians; left is positive.
 
