@@ -6,12 +6,12 @@ import re
 
 import pytest
 from game_copy import copy_game, replace
+from text_mode import run as run_game
 
 from sb3_torcs.agents.robots import race
 from sb3_torcs.backends.lite.backend import LiteBackend
 from sb3_torcs.backends.native import NativeBackend
 from sb3_torcs.errors import TrackFileError
-from text_mode import run as run_game
 from sb3_torcs.torcs.installation import find_game
 
 WEATHER = '<section name="Weather"><attnum name="station" val="{}"/></section>'
