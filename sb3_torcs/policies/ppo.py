@@ -5,8 +5,9 @@ The policy and the value function share no layer, so two threads find their grad
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from types import MethodType
 from typing import Any, NamedTuple
 
@@ -64,6 +65,13 @@ class _Stack:
         self.part = slice(start, start + sum(map(th.numel, self.parameters)))
         self._rooms: dict[int, np.ndarray] = {}
 
+    def hidden(self) -> Iterator[tuple[slice, tuple[int, int]]]:
+        """Find the matrices of the hidden layers in the whole vector, with their shapes."""
+        start = self.part.start
+        for inputs, units in itertools.pairwise(self.sizes[:-1]):
+            yield slice(start, start + inputs * units), (units, inputs)
+            start += (inputs + 1) * units
+
     def room(self, batch: int) -> np.ndarray:
         """
         Take the work space of a pass. It stays in the cache of the thread that uses it.
@@ -99,6 +107,9 @@ class LeanPPO:
             (4, self.critic.part.stop), np.float32
         )
         self.log_std = self.weights[:first]
+        # The norm is summed input by input: another order would round it otherwise.
+        self._summed = np.empty_like(self.gradient)
+        self._hidden = [*self.actor.hidden(), *self.critic.hidden()]
         self.count = 0  # steps of Adam
         self.average: ActorAverage | None = getattr(policy, "average", None)
         self._modules = [part for part in policy.modules() if part is not policy]
@@ -221,7 +232,10 @@ class LeanPPO:
 
     def _step(self) -> None:
         """Make a step of Adam with the gradient, whose norm is limited."""
-        norm = math.sqrt(float(self.gradient @ self.gradient))
+        np.copyto(self._summed, self.gradient)
+        for part, shape in self._hidden:
+            self._summed[part] = self.gradient[part].reshape(shape).T.ravel()
+        norm = math.sqrt(float(self._summed @ self._summed))
         self.gradient *= np.float32(min(1.0, self.model.max_grad_norm / (norm + SPARE)))
         (group,) = self.policy.optimizer.param_groups
         self.count += 1

@@ -426,7 +426,6 @@ def is_for(model: TD3) -> bool:
         and isinstance(policy.actor.mu.activation, nn.ReLU)
         and isinstance(policy.critic, LateActionCritic)
         and all(isinstance(network.activation, nn.ReLU) for network in policy.critic.networks)
-        and all(map(_is_known, policy.parameters()))
         # Noises read the output of the actor as a whole by a hook.
         and _learns_all(policy.actor.mu, policy.actor.optimizer, policy.average is not None)
         and _learns_all(policy.critic, policy.critic.optimizer)
@@ -443,7 +442,7 @@ def _learns_all(network: Any, optimizer: Any, is_averaged: bool = False) -> bool
     own = list(network.parameters())
     return (
         is_usual(optimizer)
-        and all(parameter.requires_grad for parameter in own)
+        and all(parameter.requires_grad and _is_known(parameter) for parameter in own)
         and [list(map(id, group["params"])) for group in optimizer.param_groups]
         == [list(map(id, own))]
         and not has_hooks(network.modules(), optimizer, own_hooks=int(is_averaged))
