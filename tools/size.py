@@ -15,7 +15,7 @@ from sb3_torcs.envs.torcs import TorcsEnv
 ROOT = Path(__file__).parent.parent
 LIMITS = {  # by the names of what counts
     "lines of Python in sb3_torcs/": 41_500,
-    "lines of Python in tests/": 31_500,
+    "lines of Python in tests/": 30_000,
     "words in docs/ and README.md": 66_000,
 }
 
