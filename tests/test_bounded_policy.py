@@ -165,14 +165,11 @@ def test_an_actor_may_see_less_than_its_value_function(actor_sensors, names, tmp
     """Whatever the other numbers are, it does the same; and what it learned tells the values."""
     model = make_asymmetric(actor_sensors=actor_sensors)
     model.learn(40)
-    model.save(tmp_path / "model.zip")
-    model.policy.save(tmp_path / "policy.pth")
     where = feature_slices(SEES)
     chosen = {sensor.name for name in names for sensor in GROUPS[name]}
     first, second = (model.observation_space.sample() for _ in range(2))
     for name in chosen:
         second[where[name]] = first[where[name]]
-    loaded = PPO.load(tmp_path / "model.zip").policy, BoundedPolicy.load(tmp_path / "policy.pth")
     for policy in (model.policy, *loaded(model, tmp_path)):
         assert policy.actor_sensors == tuple(names)
         actions = [policy.predict(seen, deterministic=True)[0] for seen in (first, second)]
