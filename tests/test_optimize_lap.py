@@ -14,6 +14,7 @@ import pytest
 from stable_baselines3.common.buffers import ReplayBuffer
 
 import sb3_torcs  # noqa: F401  registers the environments
+from sb3_torcs.agents.drivers import find_driver
 from sb3_torcs.agents.ghosts import GhostDriver, demonstration, read_ghost, shipped_ghosts
 from sb3_torcs.agents.models import driver_name, driver_record, load_driver
 from sb3_torcs.agents.remote import Agent
@@ -51,11 +52,13 @@ def tiny():
 
 @pytest.fixture(scope="module")
 def starts(game):
-    return find_starts("scripted", ghost_environment("scripted", TRACK, None))
+    return find_starts(
+        find_driver("scripted"), ghost_environment(find_driver("scripted"), {"track": TRACK})
+    )
 
 
 def searched(starts, threads=2, seed=0):
-    kwargs = ghost_environment("scripted", TRACK, None)
+    kwargs = ghost_environment(find_driver("scripted"), {"track": TRACK})
     search = LapSearch("scripted", kwargs, starts, threads=threads, seed=seed)
     for _ in search.run(Budget(rollouts=ONE_RACE)):
         pass
@@ -99,19 +102,19 @@ def test_a_ghost_drives_again_to_the_bit(ghost):
 def test_a_search_begins_with_the_fastest_driver_or_with_the_agent_alone(starts):
     assert [start.seconds for start in starts] == sorted(start.seconds for start in starts)
     assert "inferno:3" in [start.driver for start in starts]
-    kwargs = ghost_environment("scripted", TRACK, None)
-    (own,) = find_starts("scripted", kwargs, alone=True)
+    kwargs = ghost_environment(find_driver("scripted"), {"track": TRACK})
+    (own,) = find_starts(find_driver("scripted"), kwargs, alone=True)
     assert own.driver == "scripted"
 
 
 def test_a_driver_that_does_not_finish_alone_is_refused():
-    kwargs = ghost_environment("ddpg-aalborg", "dirt-1", None)
+    kwargs = ghost_environment(find_driver("ddpg-aalborg"), {"track": "dirt-1"})
     with pytest.raises(InvalidOption, match=r"ddpg-aalborg finishes no race .* --alone"):
-        find_starts("ddpg-aalborg", kwargs, alone=True)
+        find_starts(find_driver("ddpg-aalborg"), kwargs, alone=True)
 
 
 def test_a_ghost_drives_in_the_environment_of_the_agent():
-    kwargs = ghost_environment("ddpg-aalborg", "forza", "155-DTM")
+    kwargs = ghost_environment(find_driver("ddpg-aalborg"), {"track": "forza", "car": "155-DTM"})
     assert (kwargs["track"], kwargs["car"], kwargs["laps"]) == ("forza", "155-DTM", 3)
     kept = driver_record("ddpg-aalborg").env_kwargs
     assert all(kwargs[name] == kept[name] for name in ("reward", "action_repeat") if name in kept)
@@ -403,5 +406,5 @@ def test_an_interrupted_search_keeps_what_it_found(tiny, ghost, tmp_path, monkey
 
 def test_a_ghost_on_a_track_file_holds_in_another_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    kwargs = ghost_environment("scripted", "mine.xml", None)
+    kwargs = ghost_environment(find_driver("scripted"), {"track": "mine.xml"})
     assert kwargs["track"] == str(tmp_path / "mine.xml")

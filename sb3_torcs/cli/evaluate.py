@@ -35,6 +35,9 @@ FILES = {
 }  # fmt: skip
 """Endings of what can be written of a drive."""
 
+NEEDS = {"video": "imageio_ffmpeg", "telemetry": "pyarrow", "report": "plotly"}
+"""Packages of extras that files need."""
+
 OTHERWISE = {
     "render_mode": "type --video FILE.mp4 for a video, or sb3-torcs watch DRIVER for a window",
     "max_episode_steps": "the time limit follows from the laps; type --laps L instead",
@@ -98,7 +101,11 @@ def run(args: argparse.Namespace) -> int:
     :param args: from the command line
     :return: the exit status
     """
+    from sb3_torcs.errors import check_extras
+
     files = asked_files(args, FILES)
+    for what in files.keys() & NEEDS.keys():
+        check_extras(f"--{what}", NEEDS[what])
     with quiet_output(args.json):
         driver = named_driver(args.driver)
         driven = _race(args, driver) if driver.robot else _drive(args, driver, bool(files))

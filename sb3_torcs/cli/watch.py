@@ -64,9 +64,11 @@ def run(args: argparse.Namespace) -> int:
     :param args: from the command line
     :return: the exit status
     """
-    from sb3_torcs.errors import InvalidOption
+    from sb3_torcs.errors import InvalidOption, check_extras
     from sb3_torcs.torcs.installation import find_game
 
+    if args.video is not None:
+        check_extras("a video", "imageio_ffmpeg")
     if args.beside is not None and args.video is None:
         raise InvalidOption("--beside is for videos; add --video FILE.mp4")
     video = writable_file(args.video, (".mp4",)) if args.video else None
