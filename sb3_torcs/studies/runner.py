@@ -59,6 +59,8 @@ Progress = Callable[[Trial, dict[str, Any]], None]
 SETTINGS = {
     "RAY_USAGE_STATS_ENABLED": "0",  # it shall phone nobody
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # else it warns
+    # On a busy machine its parts need longer than Ray waits for them.
+    "RAY_DASHBOARD_STARTUP_TIMEOUT_S": "600",
     "RAY_gcs_server_port_wait_time_s": "120",
     "RAY_worker_register_timeout_seconds": "600",
 }

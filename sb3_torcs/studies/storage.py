@@ -234,7 +234,8 @@ class StudyFolder:
             except OSError:
                 shutil.rmtree(aside, ignore_errors=True)  # it may fill the disk
                 raise
-        write_whole(folder / BEST_MODEL, files[BEST_MODEL])
+        if BEST_MODEL in files:
+            write_whole(folder / BEST_MODEL, files[BEST_MODEL])
         write_whole(folder / ROWS, json.dumps(rows).encode())
         for old in before:
             shutil.rmtree(old, ignore_errors=True)
