@@ -96,7 +96,7 @@ HEAVY = {"highway_env", "matplotlib", "numba", "pandas", "rl_zoo3", "scipy", "te
     ("import sb3_torcs", set()),
     ("from sb3_torcs.cli import main; main([])", set()),
     ("from sb3_torcs.cli import main; main(['tracks'])", set()),
-    ("from sb3_torcs.cli import main; main(['drivers'])", set()),
+    ("from sb3_torcs.cli import main; main(['drivers'])", {"numba", "scipy"}),
     ("from sb3_torcs.cli import main; main(['doctor'])", {"numba", "scipy"}),
     ("from sb3_torcs.cli import main; main(['evaluate', 'ppo-aalborg', '--laps', '1'])",
      {"numba", "scipy", "tensorboard", "torch"}),
@@ -287,7 +287,7 @@ for module in pkgutil.walk_packages(sb3_torcs.__path__, "sb3_torcs."):
 """
 VERBS = """
 from sb3_torcs.cli import main
-words = ["evaluate", "model.zip", "--laps", "1", "--telemetry", "a.csv", "--line", "a.png"]
+words = ["evaluate", "model.zip", "--laps", "1", "--telemetry", "a.parquet", "--line", "a.png"]
 assert main(words) == 0
 words = ["evaluate", "scripted", "--env", "TorcsLite-v0", "--laps", "1", "--report", "a.html"]
 assert main(words) == 0
@@ -308,7 +308,7 @@ def test_torcslite_is_driven_learned_and_reported_where_there_is_no_posix(tmp_pa
     out = ended_well(AS_ON_WINDOWS + TRAINING + VERBS, tmp_path)
     assert "ok       TorcsLite-v0 " in out
     written = {path.name for path in tmp_path.iterdir()}
-    assert {"a.csv", "a.html", "a.png", "board", "model.zip"} <= written
+    assert {"a.parquet", "a.html", "a.png", "board", "model.zip"} <= written
 
 
 @pytest.mark.slow
