@@ -14,11 +14,11 @@ from typing import Any
 __all__ = [
     "ENDING",
     "EXIT_STATUS",
-    "answered",
-    "counted_interrupts",
-    "handlers_kept",
-    "held_back",
-    "ignored_interrupts",
+    "count_interrupts",
+    "defer_signals",
+    "keep_handlers",
+    "on_signal",
+    "redeliver_interrupts",
 ]
 
 SOON = 0.1  # [s] until a signal that was ignored comes again
@@ -30,7 +30,7 @@ EXIT_STATUS = 128  # of a process that a signal has ended, plus the number of th
 
 
 @contextlib.contextmanager
-def answered(by: Callable[[int, FrameType | None], None], *numbers: int) -> Iterator[None]:
+def on_signal(by: Callable[[int, FrameType | None], None], *numbers: int) -> Iterator[None]:
     """
     Handle signals by a function. Python allows that in the main thread only; in others nothing
     changes.
@@ -41,18 +41,18 @@ def answered(by: Callable[[int, FrameType | None], None], *numbers: int) -> Iter
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    with handlers_kept(*numbers):
+    with keep_handlers(*numbers):
         for number in numbers:
             signal.signal(number, by)
         yield
 
 
 @contextlib.contextmanager
-def held_back() -> Iterator[None]:
+def defer_signals() -> Iterator[None]:
     """Let Ctrl-C, SIGTERM and SIGHUP wait until something has been done whole."""
     waiting: list[int] = []
     try:
-        with answered(lambda number, _: waiting.append(number), signal.SIGINT, *ENDING):
+        with on_signal(lambda number, _: waiting.append(number), signal.SIGINT, *ENDING):
             yield
     finally:
         for number in waiting[:1]:
@@ -60,7 +60,7 @@ def held_back() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def counted_interrupts(passed: int, message: str) -> Iterator[list[int]]:
+def count_interrupts(passed: int, message: str) -> Iterator[list[int]]:
     """
     Count Ctrl-C and SIGTERM. All but one raise ``KeyboardInterrupt``, as usual.
 
@@ -77,12 +77,12 @@ def counted_interrupts(passed: int, message: str) -> Iterator[list[int]]:
             raise KeyboardInterrupt
         sys.stderr.write(message)
 
-    with answered(note, signal.SIGINT, signal.SIGTERM):
+    with on_signal(note, signal.SIGINT, signal.SIGTERM):
         yield seen
 
 
 @contextlib.contextmanager
-def ignored_interrupts() -> Iterator[None]:
+def redeliver_interrupts() -> Iterator[None]:
     """
     Let signals come again where Python ignores what their handlers raise: in functions that C
     calls, as numba's compiler does.
@@ -132,7 +132,7 @@ def _send_again(number: int) -> None:
 
 
 @contextlib.contextmanager
-def handlers_kept(*numbers: int) -> Iterator[None]:
+def keep_handlers(*numbers: int) -> Iterator[None]:
     """
     Put back the handlers of signals that a library replaces and leaves replaced. Python allows that
     in the main thread only; elsewhere no library can replace them.

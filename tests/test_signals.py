@@ -8,13 +8,13 @@ import time
 import pytest
 from processes import raise_in_c
 
-from sb3_torcs.signals import answered, held_back, ignored_interrupts
+from sb3_torcs.signals import defer_signals, on_signal, redeliver_interrupts
 
 
 def test_a_signal_waits_until_the_work_is_done():
     done = []
 
-    @held_back()
+    @defer_signals()
     def work():
         signal.raise_signal(signal.SIGINT)
         signal.raise_signal(signal.SIGINT)
@@ -28,7 +28,7 @@ def test_a_signal_waits_until_the_work_is_done():
 def test_an_ignored_signal_stays_ignored():
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
-        with held_back():
+        with defer_signals():
             signal.raise_signal(signal.SIGHUP)
         assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     finally:
@@ -36,7 +36,7 @@ def test_an_ignored_signal_stays_ignored():
 
 
 def test_an_interrupt_that_python_ignores_comes_again():
-    @ignored_interrupts()
+    @redeliver_interrupts()
     def work():
         raise_in_c(signal.SIGINT)
         time.sleep(60.0)
@@ -46,7 +46,7 @@ def test_an_interrupt_that_python_ignores_comes_again():
 
 
 def test_an_error_that_follows_an_ignored_interrupt_is_the_interrupt():
-    @ignored_interrupts()
+    @redeliver_interrupts()
     def work():
         raise_in_c(signal.SIGINT)
         raise RuntimeError("no compiled object yet")
@@ -62,8 +62,8 @@ def test_so_does_the_end_that_python_ignores():
         del frame
         raise SystemExit(128 + number)
 
-    @answered(end, signal.SIGTERM)
-    @ignored_interrupts()
+    @on_signal(end, signal.SIGTERM)
+    @redeliver_interrupts()
     def work():
         raise_in_c(signal.SIGTERM)
         time.sleep(60.0)
@@ -73,5 +73,5 @@ def test_so_does_the_end_that_python_ignores():
 
 
 def test_other_errors_are_none():
-    with pytest.raises(RuntimeError, match="else"), ignored_interrupts():
+    with pytest.raises(RuntimeError, match="else"), redeliver_interrupts():
         raise RuntimeError("something else")

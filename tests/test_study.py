@@ -22,7 +22,7 @@ from sb3_torcs.agents.saved.record import BEST_MODEL
 from sb3_torcs.cli import main
 from sb3_torcs.cli.study import Board
 from sb3_torcs.errors import RayUnavailable, StudyError
-from sb3_torcs.signals import handlers_kept
+from sb3_torcs.signals import keep_handlers
 from sb3_torcs.studies import runner as study_module
 from sb3_torcs.studies.config import FIELDS, read_study
 from sb3_torcs.studies.report import write_report
@@ -383,7 +383,7 @@ def cluster(short_folder):
         started.append(with_patience(lambda: Cluster(**arguments)))
         return started[0], lambda: with_patience(lambda: started[0].add_node(**node))
 
-    with handlers_kept(*HANDLED):
+    with keep_handlers(*HANDLED):
         yield start
         for each in started:
             each.shutdown()

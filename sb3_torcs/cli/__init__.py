@@ -33,7 +33,7 @@ from sb3_torcs.cli.common import CACHE_FIX, INTERRUPTED, READER_LEFT, drop_outpu
 from sb3_torcs.cli.parser import Parser, grouped
 from sb3_torcs.cli.plain import any_terminal, open_streams
 from sb3_torcs.errors import Sb3TorcsError
-from sb3_torcs.signals import ENDING, EXIT_STATUS, answered, ignored_interrupts
+from sb3_torcs.signals import ENDING, EXIT_STATUS, on_signal, redeliver_interrupts
 
 __all__ = ["main"]
 
@@ -94,7 +94,7 @@ def _run(args: argparse.Namespace) -> int:
     try:
         # Under nohup, SIGHUP is ignored and stays so.
         ends = [n for n in ENDING if signal.getsignal(n) == signal.SIG_DFL]
-        with answered(_end, *ends), ignored_interrupts():
+        with on_signal(_end, *ends), redeliver_interrupts():
             status: int = args.run(args)
         sys.stdout.flush()
     except Sb3TorcsError as error:

@@ -23,7 +23,7 @@ from sb3_torcs.cli.common import (
 )
 from sb3_torcs.cli.results import show_standings
 from sb3_torcs.files import PICTURES
-from sb3_torcs.signals import held_back
+from sb3_torcs.signals import defer_signals
 from sb3_torcs.torcs.starting_list import GRIDS
 
 if TYPE_CHECKING:
@@ -117,7 +117,7 @@ def run(args: argparse.Namespace) -> int:
         log = DriveLog() if "telemetry" in files or "report" in files else None
         footage = _footage(args)
         races, status = _held(args, drivers, log, footage)
-    with held_back():  # to compute the figures takes a while
+    with defer_signals():  # to compute the figures takes a while
         _tell(args, races)
     stopped = len(races) < args.races
     if stopped:

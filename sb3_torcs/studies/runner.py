@@ -34,7 +34,7 @@ from sb3_torcs.errors import (
     TrainingDiverged,
     install_line,
 )
-from sb3_torcs.signals import EXIT_STATUS, answered, handlers_kept
+from sb3_torcs.signals import EXIT_STATUS, keep_handlers, on_signal
 from sb3_torcs.studies.config import Study, Trial
 from sb3_torcs.studies.storage import Files, StudyFolder
 
@@ -168,7 +168,7 @@ def run_study(
                 tell(trial, {"state": "done"})
         if left:
             # Ray replaces this handler and never puts it back.
-            kept = handlers_kept(signal.SIGTERM)
+            kept = keep_handlers(signal.SIGTERM)
             with kept, _ray(store, jobs, address, signals) as scratch:
                 _train_all(left, store, scratch, tell)
     return store.results
@@ -262,7 +262,7 @@ def _ray(
                 f"the Ray at '{address}' belongs to another study, and ends with it; leave "
                 "--address out, or start a cluster with `ray start --head`"
             )
-        with answered(end, signal.SIGTERM):
+        with on_signal(end, signal.SIGTERM):
             yield scratch
     finally:
         ray.shutdown()

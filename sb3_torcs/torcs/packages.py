@@ -17,7 +17,7 @@ from typing import IO, Any
 
 from sb3_torcs.errors import BackendUnavailable, InstallFailed
 from sb3_torcs.files import writable_folder
-from sb3_torcs.signals import held_back
+from sb3_torcs.signals import defer_signals
 from sb3_torcs.torcs.installation import HOME_VARIABLE, Game, find_game, user_folder
 
 __all__ = ["VIDEO_PACKAGES", "Tell", "install_display", "install_game"]
@@ -145,7 +145,7 @@ def _unpack_for_user(target: Path) -> Game:
         root = staging / "root"
         _unpack(archives, root, staging)
         _verify(find_game(root))
-        with held_back():  # Ctrl-C in between would leave no game
+        with defer_signals():  # Ctrl-C in between would leave no game
             _replace(target, root, staging / "old")
     return find_game()
 

@@ -19,7 +19,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from sb3_torcs.errors import BackendUnavailable, GameFailed, GameIncomplete, GameTimeout
-from sb3_torcs.signals import held_back
+from sb3_torcs.signals import defer_signals
 from sb3_torcs.torcs.building import build_command
 from sb3_torcs.torcs.installation import Game
 from sb3_torcs.torcs.race_setup import RACE_FILE, SCR_SERVER, RaceSetup, write_race
@@ -366,7 +366,7 @@ def _end(process: subprocess.Popen[bytes], folder: Path, owner: int) -> None:
     """End the game and remove its folder."""
     if os.getpid() != owner:
         return
-    with held_back():
+    with defer_signals():
         process.kill()  # the game has nothing to save
         process.wait(GRACE)
         shutil.rmtree(folder, ignore_errors=True)

@@ -23,7 +23,7 @@ from sb3_torcs.callbacks.learning import end_changes
 from sb3_torcs.callbacks.progress import RacingProgressCallback
 from sb3_torcs.errors import InvalidOption, OutputNotWritable, TrainingDiverged
 from sb3_torcs.files import writable_folder
-from sb3_torcs.signals import counted_interrupts
+from sb3_torcs.signals import count_interrupts
 
 if TYPE_CHECKING:
     from sb3_torcs.training.trial import Training
@@ -126,7 +126,7 @@ class Keeper:
                         raise
                 self._end_callbacks()
                 if self.training.model.num_timesteps:
-                    with counted_interrupts(1, SAVING):
+                    with count_interrupts(1, SAVING):
                         self.keep()
         except Exception as error:
             self._end_callbacks()

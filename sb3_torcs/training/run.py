@@ -27,7 +27,7 @@ from sb3_torcs.callbacks.progress import RacingProgressCallback
 from sb3_torcs.car import check_count
 from sb3_torcs.errors import OutputNotWritable, TrainingDiverged
 from sb3_torcs.files import listed, lock, writable_folder
-from sb3_torcs.signals import counted_interrupts
+from sb3_torcs.signals import count_interrupts
 from sb3_torcs.torcs.track_names import lasting_kwargs
 from sb3_torcs.training import zoo
 from sb3_torcs.training.keeping import REPLAY_BUFFER, SAVING, Keeper, tensorboard_folder
@@ -303,7 +303,7 @@ def _learn(options: TrainOptions, training: Training, folder: Path) -> Run:
     redirected = contextlib.redirect_stdout(out), contextlib.redirect_stderr(err)
     with contextlib.closing(training), redirected[0], redirected[1]:
         try:
-            with counted_interrupts(2, SAVING) as seen:
+            with count_interrupts(2, SAVING) as seen:
                 keeper.learn(seen)
         except (OSError, TrainingDiverged) as error:
             raise _explained(error, _result(training, folder, None), options) from error

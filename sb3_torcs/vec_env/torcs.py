@@ -23,7 +23,7 @@ from sb3_torcs.envs.ends import RACE_OVER
 from sb3_torcs.envs.making import MANY_RACES, EnvMaker, checked_threads, env_makers, refuse_flag
 from sb3_torcs.envs.racing import RacingEnv
 from sb3_torcs.errors import EnvClosed, InvalidOption
-from sb3_torcs.signals import held_back
+from sb3_torcs.signals import defer_signals
 from sb3_torcs.vec_env.info import TRUNCATED, LazyInfo
 
 __all__ = ["TorcsVecEnv"]
@@ -170,7 +170,7 @@ class TorcsVecEnv(DummyVecEnv):
         over = timestep.ended | (self._elapsed + 1 >= self._limits)
         failures: list[Exception] = []
         # Ctrl-C waits meanwhile: a race between two episodes could not be driven on.
-        with held_back() if over.any() else contextlib.nullcontext():
+        with defer_signals() if over.any() else contextlib.nullcontext():
             self._end_races(over, timestep)
             values = batch.value(timestep, ~over)
             rewards = np.array(values, np.float32)
