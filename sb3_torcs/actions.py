@@ -33,12 +33,12 @@ __all__ = [
     "action_rows",
     "automatic_gear",
     "checked_gearbox",
+    "choose_gearbox",
     "controls_from_action",
     "launch_clutch",
     "layout_of_width",
-    "listed_actions",
+    "list_actions",
     "read_actions",
-    "used_gearbox",
 ]
 
 ActionName = Literal["pedals", "pedal", "manual"]
@@ -184,7 +184,7 @@ def checked_gearbox(gearbox: str) -> str:
     return checked_choice("gearbox", gearbox, GEARBOXES)
 
 
-def used_gearbox(gearbox: str, action: str) -> str:
+def choose_gearbox(gearbox: str, action: str) -> str:
     """
     Make sure that the choice of a gearbox has an effect.
 
@@ -292,7 +292,7 @@ def action_rows(actions: Any, shape: tuple[int, ...]) -> npt.NDArray[np.floating
     return rows
 
 
-def listed_actions(actions: Any, shape: tuple[int, ...], advice: str) -> list[Any]:
+def list_actions(actions: Any, shape: tuple[int, ...], advice: str) -> list[Any]:
     """
     Make sure that there is an action for each of several environments, which read their own.
 

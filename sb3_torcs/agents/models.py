@@ -54,7 +54,7 @@ __all__ = [
     "driver_record",
     "find_model",
     "load_driver",
-    "one_of",
+    "require_one",
     "saved_spaces",
     "saved_timesteps",
     "shipped_agents",
@@ -172,7 +172,7 @@ def driver_name(driver: str | Path) -> str:
     return readable(given.absolute().name.removesuffix(".zip").removesuffix(".npz"))
 
 
-def one_of(option: str, choice: Any) -> Any:
+def require_one(option: str, choice: Any) -> Any:
     """
     Make sure that there is one track, or one car: a training may have had several.
 

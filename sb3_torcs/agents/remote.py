@@ -17,10 +17,10 @@ from sb3_torcs.sensors import NEEDS_CAR, NEEDS_RACE
 from sb3_torcs.telemetry import DriveLabel, DriveLog
 from sb3_torcs.tracks.catalogue import lasting_name
 
-__all__ = ["Agent", "check_told"]
+__all__ = ["Agent", "check_observable"]
 
 
-def check_told(driver: str, options: Mapping[str, Any], advice: str) -> None:
+def check_observable(driver: str, options: Mapping[str, Any], advice: str) -> None:
     """
     Refuse an agent that needs more than the SCR protocol tells.
 

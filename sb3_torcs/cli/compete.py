@@ -67,8 +67,8 @@ def run(args: argparse.Namespace) -> int:
     with quiet_output(args.json):  # said first, because loading takes seconds
         print(f"{args.driver} is being loaded for the race at {where}", flush=True)
 
-    from sb3_torcs.agents.models import one_of
-    from sb3_torcs.agents.remote import Agent, check_told
+    from sb3_torcs.agents.models import require_one
+    from sb3_torcs.agents.remote import Agent, check_observable
     from sb3_torcs.agents.saved.record import DRIVEN_WITH
     from sb3_torcs.errors import InvalidOption
     from sb3_torcs.sensors import NEEDS_ROAD
@@ -79,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
             f"'{args.driver}' is a robot, which drives in the game's own races only"
         )
     settings = driver.record.kept(("track", "car", *DRIVEN_WITH))
-    check_told(
+    check_observable(
         args.driver, settings, f"`sb3-torcs race {args.driver} inferno` races it in the engine"
     )
     given = environment_settings(args)
@@ -87,8 +87,8 @@ def run(args: argparse.Namespace) -> int:
     sees_road = NEEDS_ROAD.intersection(settings.get("sensors", ()))
     if "track" not in given and not sees_road and driver.kind != "ghost":
         settings["track"] = None  # the race may be on another track than the training was
-    one_of("track", settings.get("track"))
-    one_of("car", settings.get("car"))
+    require_one("track", settings.get("track"))
+    require_one("car", settings.get("car"))
     with quiet_output(args.json):
         name = args.name or driver.name
         agent = Agent(args.driver, settings, args.algo, args.trust, name)

@@ -190,7 +190,7 @@ def _drive(args: argparse.Namespace, driver: NamedDriver, noted: bool) -> Evalua
     """
     import gymnasium as gym
 
-    from sb3_torcs.agents.models import load_driver, one_of
+    from sb3_torcs.agents.models import load_driver, require_one
     from sb3_torcs.agents.wrapping import wrapped
     from sb3_torcs.errors import InvalidOption
     from sb3_torcs.evaluation.protocol import GAME, KEPT, evaluate, time_limit
@@ -208,7 +208,7 @@ def _drive(args: argparse.Namespace, driver: NamedDriver, noted: bool) -> Evalua
     check_env_kwargs(given, env_id, "--env-kwargs")
     kwargs = {**record.kept(KEPT), **given, "laps": args.laps}
     for name in ("track", "car"):
-        one_of(name, kwargs.get(name))
+        require_one(name, kwargs.get(name))
     if args.report is not None and kwargs.get("track") == RANDOM_TRACK:
         raise InvalidOption("--report compares laps of one track; give --track a name")
     bare = gym.make(env_id, max_episode_steps=time_limit(kwargs), **kwargs)

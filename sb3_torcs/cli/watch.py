@@ -106,7 +106,7 @@ def _checked(drivers: Sequence[NamedDriver], args: argparse.Namespace) -> str:
     :return: the track of all
     """
     from sb3_torcs.agents.ghosts import check_laps, read_ghost
-    from sb3_torcs.agents.models import one_of
+    from sb3_torcs.agents.models import require_one
     from sb3_torcs.errors import InvalidOption
 
     for driver in drivers:
@@ -123,10 +123,10 @@ def _checked(drivers: Sequence[NamedDriver], args: argparse.Namespace) -> str:
         )
     for driver in drivers:
         if args.car is None and driver.robot is None:
-            one_of("car", driver.record.env_kwargs.get("car"))
+            require_one("car", driver.record.env_kwargs.get("car"))
     trained = [driver.record.env_kwargs.get("track") for driver in drivers]
     usual = next((track for track in trained if track is not None), "aalborg")
-    track: str = one_of("track", usual if args.track is None else args.track)
+    track: str = require_one("track", usual if args.track is None else args.track)
     return track
 
 
@@ -139,7 +139,7 @@ def _show(game: Game, driver: NamedDriver, track: str, args: argparse.Namespace)
     :param track: of the race
     :param args: from the command line
     """
-    from sb3_torcs.agents.remote import check_told
+    from sb3_torcs.agents.remote import check_observable
     from sb3_torcs.agents.saved.record import DRIVEN_WITH
     from sb3_torcs.evaluation.watching import Show, show_in_window
     from sb3_torcs.torcs.display import find_display
@@ -147,7 +147,7 @@ def _show(game: Game, driver: NamedDriver, track: str, args: argparse.Namespace)
 
     settings = driver.record.kept(("car", *DRIVEN_WITH))
     settings |= {} if args.car is None else {"car": args.car}
-    check_told(driver.source, settings, "`--video FILE.mp4` records it, driven by the engine")
+    check_observable(driver.source, settings, "`--video FILE.mp4` records it, driven by the engine")
     opponents = parsed_robots(args.robots, game)
     show = Show(game, track, driver, settings, opponents, args.laps, args.trust)
     display = find_display("`--video FILE.mp4` records the race without one")

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sb3_torcs.actions import controls_from_action, listed_actions, read_actions
+from sb3_torcs.actions import controls_from_action, list_actions, read_actions
 from sb3_torcs.backends.base import Backend, Fleet
 from sb3_torcs.backends.lite.backend import LiteBackend
 from sb3_torcs.backends.lite.fleet import LiteFleet
@@ -330,7 +330,7 @@ class Batch:
             if fits and read_actions(np.ascontiguousarray(actions), low, high, controls):
                 return controls
         shape = len(indices), len(low)
-        rows = listed_actions(actions, shape, ", as of model.predict(observations)")
+        rows = list_actions(actions, shape, ", as of model.predict(observations)")
         for place, row in enumerate(rows):
             try:
                 controls[place] = controls_from_action(row, self._layout)

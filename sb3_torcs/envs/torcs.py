@@ -9,7 +9,7 @@ from typing import Any, Unpack
 import numpy as np
 import numpy.typing as npt
 
-from sb3_torcs.actions import used_gearbox
+from sb3_torcs.actions import choose_gearbox
 from sb3_torcs.backends.base import Backend
 from sb3_torcs.backends.native import NativeBackend
 from sb3_torcs.backends.scr import ScrBackend
@@ -114,7 +114,7 @@ def _world(given: Mapping[str, Any], agents: bool) -> Backend:
     track, car, noise = given["track"], given["car"], given["conditions"]["sensor_noise"]
     shared = {
         "range_finders": given["range_finders"],
-        "gearbox": used_gearbox(given["gearbox"], given["action"]),
+        "gearbox": choose_gearbox(given["gearbox"], given["action"]),
         "laps": given["laps"],
     }
     field = {"opponents": given["opponents"], "grid_place": given["grid_place"]}

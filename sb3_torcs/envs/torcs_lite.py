@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 from typing import Unpack
 
-from sb3_torcs.actions import used_gearbox
+from sb3_torcs.actions import choose_gearbox
 from sb3_torcs.backends.lite.backend import LiteBackend
 from sb3_torcs.backends.several import one_or_several
 from sb3_torcs.envs.arguments import read_options, select, takes_options
@@ -62,7 +62,7 @@ class TorcsLiteEnv(RacingEnv):
         make = partial(
             LiteBackend,
             range_finders=given["range_finders"],
-            gearbox=used_gearbox(given["gearbox"], given["action"]),
+            gearbox=choose_gearbox(given["gearbox"], given["action"]),
         )
         world = one_or_several(make, given["track"], given["car"])
         super().__init__(world, **select(RACING, given))

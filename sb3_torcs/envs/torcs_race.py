@@ -11,7 +11,7 @@ from typing import Any, Unpack
 import numpy as np
 import numpy.typing as npt
 
-from sb3_torcs.actions import used_gearbox
+from sb3_torcs.actions import choose_gearbox
 from sb3_torcs.backends.native import load_race
 from sb3_torcs.backends.seats import LoadedRace, Seat, SeatWorld, SharedRace
 from sb3_torcs.backends.several import is_several, world_pool
@@ -131,7 +131,7 @@ def make_race(
         agents, given["track"], given["car"], given["opponents"], given["grid_place"],
         sensor_noise=given["conditions"]["sensor_noise"], action_repeat=given["action_repeat"],
         range_finders=given["range_finders"],
-        gearbox=used_gearbox(given["gearbox"], given["action"]), laps=given["laps"],
+        gearbox=choose_gearbox(given["gearbox"], given["action"]), laps=given["laps"],
         flagged=checked_flag("flagged", flagged),
     )  # fmt: skip
     return [RaceCarEnv(seat, **select(RACING, given)) for seat in race.seats]

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from sb3_torcs.actions import listed_actions
+from sb3_torcs.actions import list_actions
 from sb3_torcs.backends.several import shared_worlds
 from sb3_torcs.car import check_count
 from sb3_torcs.envs.batch import Batch, Outcome
@@ -112,7 +112,7 @@ class TorcsVectorEnv(SyncVectorEnv):
         shape = self.action_space.shape or ()
         rows: Any = actions
         if getattr(actions, "shape", None) != shape:
-            rows = listed_actions(actions, shape, ": take them from envs.action_space.sample()")
+            rows = list_actions(actions, shape, ": take them from envs.action_space.sample()")
         starting = self._starting()
         going = np.flatnonzero(~starting)
         if not self._driving:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sb3_torcs.agents.drivers import NamedDriver, find_driver
-from sb3_torcs.agents.models import load_driver, one_of
+from sb3_torcs.agents.models import load_driver, require_one
 from sb3_torcs.agents.robots import race
 from sb3_torcs.agents.rollout import drive
 from sb3_torcs.car import MANY_LAPS, check_count
@@ -181,7 +181,7 @@ def _trained_on(drivers: Sequence[NamedDriver]) -> str:
     for driver in drivers:
         track = driver.record.env_kwargs.get("track")
         if track is not None:
-            return str(one_of("track", track))
+            return str(require_one("track", track))
     return DEFAULT_TRACK
 
 

@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 
 from sb3_torcs.agents.drivers import NamedDriver
-from sb3_torcs.agents.models import driver_record, load_driver, one_of
+from sb3_torcs.agents.models import driver_record, load_driver, require_one
 from sb3_torcs.agents.rollout import drive
 from sb3_torcs.agents.scripted import SCRIPTED
 from sb3_torcs.agents.wrapping import wrapped
@@ -50,8 +50,8 @@ def ghost_environment(driver: NamedDriver, given: Mapping[str, Any]) -> dict[str
     car = DEFAULT_CAR if driver.robot is None else find_game().find_robot(*driver.robot).car
     usual = {"track": "aalborg", "car": car, "action_repeat": 5, "action": "pedals"}
     kwargs = {**usual, **driver.record.kept(KEPT), **given, "laps": RACE_LAPS}
-    one_of("track", kwargs["track"])
-    one_of("car", kwargs["car"])
+    require_one("track", kwargs["track"])
+    require_one("car", kwargs["car"])
     kwargs["track"] = lasting_track(kwargs["track"])
     if kwargs["action"] == "manual":  # the search leaves the gears to the gearbox
         kwargs["action"] = "pedals"
