@@ -23,15 +23,15 @@ except ImportError:  # on Windows
 __all__ = [
     "IN_A_FOLDER",
     "PICTURES",
+    "as_list",
+    "atomic_file",
     "checked_ending",
     "import_advice",
-    "listed",
     "lock",
     "path_and_arguments",
     "plain_python",
     "read_yaml",
     "readable",
-    "whole_file",
     "writable_file",
     "writable_folder",
 ]
@@ -78,7 +78,7 @@ def import_advice(module: str) -> str:
     return "install the package that it is in"
 
 
-def listed(value: Any) -> list[Any]:
+def as_list(value: Any) -> list[Any]:
     """
     Read a list in any of the RL Zoo's forms: callbacks, for one, or wrappers.
 
@@ -158,7 +158,7 @@ def writable_file(file: str | Path, suffixes: tuple[str, ...]) -> Path:
 
 
 @contextlib.contextmanager
-def whole_file(
+def atomic_file(
     path: Path, advice: str = "choose another file", *, parents: bool = False
 ) -> Iterator[Path]:
     """

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from sb3_torcs.errors import OutputNotWritable
-from sb3_torcs.files import whole_file
+from sb3_torcs.files import atomic_file
 
 
 def test_a_symbolic_link_stays_and_its_target_is_written(tmp_path):
@@ -13,7 +13,7 @@ def test_a_symbolic_link_stays_and_its_target_is_written(tmp_path):
     target.parent.mkdir()
     target.write_text("old")
     link.symlink_to(target)
-    with whole_file(link) as path:
+    with atomic_file(link) as path:
         path.write_text("new")
     assert link.is_symlink()
     assert target.read_text() == "new"
@@ -22,5 +22,5 @@ def test_a_symbolic_link_stays_and_its_target_is_written(tmp_path):
 def test_a_link_to_nowhere_is_refused(tmp_path):
     link = tmp_path / "lap.csv"
     link.symlink_to(tmp_path / "gone" / "lap.csv")
-    with pytest.raises(OutputNotWritable, match="No such file"), whole_file(link):
+    with pytest.raises(OutputNotWritable, match="No such file"), atomic_file(link):
         raise AssertionError("it is written nevertheless")

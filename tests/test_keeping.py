@@ -25,7 +25,7 @@ from sb3_torcs.agents.saved.record import STATISTICS
 from sb3_torcs.callbacks.driven_line import LineRecorder
 from sb3_torcs.cli import main
 from sb3_torcs.errors import TrainingDiverged
-from sb3_torcs.training.keeping import REPLAY_BUFFER, UNFINISHED, Keeper, WholeFiles
+from sb3_torcs.training.keeping import REPLAY_BUFFER, UNFINISHED, Keeper, StagingFolder
 from sb3_torcs.training.run import Run, TrainOptions, _explained, _new_run
 from sb3_torcs.training.trial import Recipe, Training
 
@@ -75,7 +75,7 @@ class CompilingCallback(BaseCallback):
 
 
 def test_a_file_is_at_its_place_when_it_is_whole(tmp_path):
-    files = WholeFiles(tmp_path)
+    files = StagingFolder(tmp_path)
     (files.aside / "sub").mkdir(parents=True)
     (tmp_path / "a").write_text("before")
     (files.aside / "a").write_text("after")
@@ -87,7 +87,7 @@ def test_a_file_is_at_its_place_when_it_is_whole(tmp_path):
 
 
 def test_what_is_not_whole_never_comes_to_its_place(tmp_path):
-    files = WholeFiles(tmp_path)
+    files = StagingFolder(tmp_path)
     files.aside.mkdir()
     (files.aside / "a").write_text("ha")
     assert [files.place(file) for file in files.unfinished()] == [tmp_path / "a"]

@@ -10,7 +10,7 @@ from sb3_torcs.agents.scripted import SCRIPTED, ScriptedDriver
 from sb3_torcs.car import DEFAULT_CAR
 from sb3_torcs.evaluation.ladder import REFERENCE_FIELDS, REFERENCE_FILE, ROBOTS
 from sb3_torcs.evaluation.protocol import RACE_LAPS, evaluate, race_environment
-from sb3_torcs.files import whole_file
+from sb3_torcs.files import atomic_file
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.tracks.catalogue import available_tracks
 
@@ -36,7 +36,7 @@ def robot(name, track):
     return [lap.time for lap in result.laps] if result.car == DEFAULT_CAR else []
 
 
-with whole_file(args.out) as aside, aside.open("w", newline="", encoding="utf-8") as file:
+with atomic_file(args.out) as aside, aside.open("w", newline="", encoding="utf-8") as file:
     file.write(f"# python tools/reference_laps.py, sb3_torcs {sb3_torcs.__version__}\n")
     writer = csv.writer(file, lineterminator="\n")
     writer.writerow(REFERENCE_FIELDS)

@@ -19,7 +19,7 @@ from sb3_torcs.agents.rollout import Timestep, drive
 from sb3_torcs.agents.saved.file import BROKEN
 from sb3_torcs.envs.aids import Aids
 from sb3_torcs.errors import InvalidOption, ModelMismatch, near_miss
-from sb3_torcs.files import whole_file, writable_file
+from sb3_torcs.files import atomic_file, writable_file
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.track_names import find_track
 from sb3_torcs.tracks.catalogue import load_track
@@ -101,7 +101,7 @@ class Ghost:
             "start": self.start,
             "rollouts": self.rollouts,
         }
-        with whole_file(file) as aside, aside.open("wb") as output:
+        with atomic_file(file) as aside, aside.open("wb") as output:
             np.savez_compressed(output, actions=self.actions, record=np.array(json.dumps(record)))
         return file
 

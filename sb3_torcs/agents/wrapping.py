@@ -16,7 +16,7 @@ from gymnasium import spaces
 
 from sb3_torcs.agents.saved.file import as_mismatch
 from sb3_torcs.errors import ModelMismatch, ModelNotTrusted, PackageMissing
-from sb3_torcs.files import import_advice, listed, path_and_arguments, plain_python
+from sb3_torcs.files import as_list, import_advice, path_and_arguments, plain_python
 
 __all__ = ["LEFT_OUT", "frames_of", "normalizes", "stacked_space", "unrebuilt", "wrapped"]
 
@@ -143,7 +143,7 @@ def unrebuilt(hyperparameters: Mapping[str, Any]) -> str | None:
 
 def _items(hyperparameters: Mapping[str, Any], key: str) -> Iterator[tuple[str, dict[str, Any]]]:
     """Read dotted paths and arguments in any of the zoo's forms."""
-    for item in listed(hyperparameters.get(key)):
+    for item in as_list(hyperparameters.get(key)):
         try:
             yield path_and_arguments(item)
         except ValueError:

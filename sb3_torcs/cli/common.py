@@ -27,12 +27,12 @@ __all__ = [
     "READER_LEFT",
     "TRUST_HELP",
     "add_environment",
-    "asked_files",
     "drop_output",
     "environment_settings",
     "lacks_cache",
     "named_driver",
     "natural",
+    "output_files",
     "parsed_robots",
     "positive",
     "print_json",
@@ -59,7 +59,7 @@ DRIVER_HELP = (
 TRUST_HELP = "run the code that is pickled in the model: only if you trust its author"
 
 
-def asked_files(args: argparse.Namespace, kinds: Mapping[str, tuple[str, ...]]) -> dict[str, Path]:
+def output_files(args: argparse.Namespace, kinds: Mapping[str, tuple[str, ...]]) -> dict[str, Path]:
     """
     Check the files that are asked for, before anything is driven.
 

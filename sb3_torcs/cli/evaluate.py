@@ -12,9 +12,9 @@ from sb3_torcs.cli.common import (
     DRIVER_HELP,
     TRUST_HELP,
     add_environment,
-    asked_files,
     environment_settings,
     named_driver,
+    output_files,
     positive,
     print_json,
     quiet_output,
@@ -103,7 +103,7 @@ def run(args: argparse.Namespace) -> int:
     """
     from sb3_torcs.errors import check_extras
 
-    files = asked_files(args, FILES)
+    files = output_files(args, FILES)
     for what in files.keys() & NEEDS.keys():
         check_extras(f"--{what}", NEEDS[what])
     with quiet_output(args.json):

@@ -12,7 +12,7 @@ from sb3_torcs.cli.common import (
     DRIVER_HELP,
     INTERRUPTED,
     TRUST_HELP,
-    asked_files,
+    output_files,
     positive,
     print_json,
     quiet_output,
@@ -107,7 +107,7 @@ def run(args: argparse.Namespace) -> int:
     :param args: from the command line
     :return: the exit status
     """
-    files = asked_files(args, FILES)
+    files = output_files(args, FILES)
     from sb3_torcs.errors import check_extras
     from sb3_torcs.telemetry import DriveLog
 

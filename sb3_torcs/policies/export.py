@@ -16,7 +16,7 @@ from stable_baselines3.common.policies import BasePolicy
 from torch import nn
 
 from sb3_torcs.errors import ModelMismatch, check_extras
-from sb3_torcs.files import IN_A_FOLDER, whole_file
+from sb3_torcs.files import IN_A_FOLDER, atomic_file
 
 __all__ = ["INPUT", "OUTPUT", "export_actor"]
 
@@ -102,7 +102,7 @@ def export_actor(model: Any, path: str | os.PathLike[str]) -> Path:
     policy, statistics = _parts(model)
     _check_policy(policy, statistics)
     path = Path(path)
-    with whole_file(path, IN_A_FOLDER) as part:
+    with atomic_file(path, IN_A_FOLDER) as part:
         part.write_bytes(_graph(_RawDriver(policy, statistics), policy.observation_space))
     return path
 

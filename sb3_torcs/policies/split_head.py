@@ -95,7 +95,7 @@ class SplitHeadPolicy(ExactPolicy, TD3Policy):
             )
         net_arch = kwargs.pop("net_arch", None)
         net_arch = list(NET_ARCH) if net_arch is None else net_arch
-        heads = heads_for(action_space) if heads is None else _listed(heads)
+        heads = heads_for(action_space) if heads is None else _as_list(heads)
         _check_heads(heads, action_space)
         bias = _bias(head_bias, len(heads))
         _check_net_arch(net_arch)
@@ -219,7 +219,7 @@ def _check_heads(heads: Any, action_space: spaces.Box) -> None:
         )
 
 
-def _listed(given: Any) -> Any:
+def _as_list(given: Any) -> Any:
     """Make a list of an array, a tensor or a range."""
     if isinstance(given, range):
         return list(given)
@@ -230,7 +230,7 @@ def _bias(given: Any, number: int) -> tuple[float, ...]:
     """Check the initial values before the output functions; ``None`` is 0 for each."""
     if given is None:
         return (0.0,) * number
-    values = _listed(given)
+    values = _as_list(given)
     if not isinstance(values, list | tuple) or not all(map(is_number, values)):
         raise InvalidOption(
             f"head_bias={given!r}: pass one finite number per action, e.g. {(0.0,) * number}"

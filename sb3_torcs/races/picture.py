@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sb3_torcs.files import IN_A_FOLDER, whole_file
+from sb3_torcs.files import IN_A_FOLDER, atomic_file
 from sb3_torcs.races.protocol import Race
 
 __all__ = ["draw_race"]
@@ -49,5 +49,5 @@ def draw_race(race: Race, path: Path) -> None:
     gaps.set_ylabel("behind the leader [m]")
     gaps.invert_yaxis()
     gaps.set_xlabel("distance of the leader [km]")
-    with whole_file(path, IN_A_FOLDER) as aside:
+    with atomic_file(path, IN_A_FOLDER) as aside:
         figure.savefig(aside)

@@ -22,7 +22,7 @@ from rich.progress import (
 )
 
 from sb3_torcs.errors import InvalidOption, OutputNotWritable, needs_extra
-from sb3_torcs.files import whole_file
+from sb3_torcs.files import atomic_file
 
 with needs_extra("a video"):
     import imageio_ffmpeg
@@ -81,7 +81,7 @@ def write_video(
     if path.suffix.lower() != ".mp4":
         raise InvalidOption(f"the video's name is '{path}'; expected a name that ends in '.mp4'")
     with (
-        whole_file(path, ADVICE, parents=True) as part,
+        atomic_file(path, ADVICE, parents=True) as part,
         _progress(path.name, total, share) as advance,
     ):
         _encode(path, part, frames, fps, advance, encoding)

@@ -30,7 +30,7 @@ from sb3_torcs.errors import (
     near_miss,
 )
 from sb3_torcs.evaluation.protocol import GAME
-from sb3_torcs.files import listed, read_yaml
+from sb3_torcs.files import as_list, read_yaml
 from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.track_names import find_track
 from sb3_torcs.tracks.catalogue import CATEGORIES, tracks_of
@@ -328,7 +328,7 @@ def _merged_callbacks(callbacks: Any, changes: Mapping[str, Any]) -> list[Any]:
     :return: the new list
     :raises StudyError: if a change is of one that is there twice
     """
-    pairs = [pair for item in listed(callbacks) for pair in _paths_and_arguments(item)]
+    pairs = [pair for item in as_list(callbacks) for pair in _paths_and_arguments(item)]
     for path, change in _paths_and_arguments(changes):
         found = [index for index, (known, _) in enumerate(pairs) if known == path]
         if len(found) > 1:

@@ -18,7 +18,7 @@ from sb3_torcs.studies.estimates import Estimate, estimate
 from sb3_torcs.studies.page import Section, study_page
 from sb3_torcs.studies.pictures import draw_together, draw_variant
 from sb3_torcs.studies.results import Results
-from sb3_torcs.studies.storage import RECIPE, RESULTS, ROWS, WHY_DIVERGED, write_whole
+from sb3_torcs.studies.storage import RECIPE, RESULTS, ROWS, WHY_DIVERGED, write_atomically
 
 __all__ = ["read_results", "write_report"]
 
@@ -121,11 +121,11 @@ def write_report(folder: Path, output: Path) -> Path:
         lines += _markdown(section)
     variants = [learning_of(variant, group) for variant, group in _variants(trials).items()]
     if len(variants) > 1:
-        write_whole(output / TOGETHER, draw_together(variants))
+        write_atomically(output / TOGETHER, draw_together(variants))
         lines += ["## Learning: all variants", "", f"![all variants]({TOGETHER})", ""]
     for learning in variants:
         picture = output / f"learning-{slug(learning.variant)}.png"
-        write_whole(picture, draw_variant(learning))
+        write_atomically(picture, draw_variant(learning))
         shown = f"![{learning.variant}]({picture.name})"
         lines += [f"## Learning: {learning.variant}", "", shown, ""]
     lines += [
@@ -136,10 +136,10 @@ def write_report(folder: Path, output: Path) -> Path:
         "",
     ]
     report = output / "report.md"
-    write_whole(report, "\n".join(lines).encode())
+    write_atomically(report, "\n".join(lines).encode())
     plain = [note.replace("*", "") for note in notes]
     page = study_page(study, plain, sections, variants, folder=folder, output=output)
-    write_whole(report.with_suffix(".html"), page.encode())
+    write_atomically(report.with_suffix(".html"), page.encode())
     return report
 
 

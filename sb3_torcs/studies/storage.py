@@ -27,7 +27,7 @@ import yaml
 
 from sb3_torcs.agents.saved.record import BEST_MODEL
 from sb3_torcs.errors import StudyError
-from sb3_torcs.files import lock, read_yaml, whole_file
+from sb3_torcs.files import atomic_file, lock, read_yaml
 from sb3_torcs.studies.config import FIELDS, Study, Trial
 from sb3_torcs.training.trial import track_name
 
@@ -39,7 +39,7 @@ __all__ = [
     "WHY_DIVERGED",
     "Files",
     "StudyFolder",
-    "write_whole",
+    "write_atomically",
 ]
 
 Files = dict[str, bytes]
@@ -119,7 +119,7 @@ class StudyFolder:
             file = self.of(trial) / RECIPE
             recipe = trial.recipe()
             if not file.is_file():
-                write_whole(file, yaml.safe_dump(recipe, sort_keys=False).encode())
+                write_atomically(file, yaml.safe_dump(recipe, sort_keys=False).encode())
                 continue
             before = _parsed(file, _recipe)
             if before != recipe:
@@ -229,14 +229,14 @@ class StudyFolder:
             shutil.rmtree(aside, ignore_errors=True)
             try:
                 for file, content in files.items():
-                    write_whole(aside / file, content)
+                    write_atomically(aside / file, content)
                 aside.rename(folder / f"{CHECKPOINT}{len(rows):06d}")
             except OSError:
                 shutil.rmtree(aside, ignore_errors=True)  # it may fill the disk
                 raise
         if BEST_MODEL in files:
-            write_whole(folder / BEST_MODEL, files[BEST_MODEL])
-        write_whole(folder / ROWS, json.dumps(rows).encode())
+            write_atomically(folder / BEST_MODEL, files[BEST_MODEL])
+        write_atomically(folder / ROWS, json.dumps(rows).encode())
         for old in before:
             shutil.rmtree(old, ignore_errors=True)
         self.write_results()
@@ -250,8 +250,8 @@ class StudyFolder:
         :param nothing: its rows if there was no evaluation before
         """
         if not self.rows(trial):
-            write_whole(self.of(trial) / ROWS, json.dumps(nothing).encode())
-        write_whole(self.of(trial) / WHY_DIVERGED, why.encode())
+            write_atomically(self.of(trial) / ROWS, json.dumps(nothing).encode())
+        write_atomically(self.of(trial) / WHY_DIVERGED, why.encode())
         for old in self.of(trial).glob(f"{CHECKPOINT}*"):
             shutil.rmtree(old, ignore_errors=True)
         self.write_results()
@@ -266,7 +266,7 @@ class StudyFolder:
         done = self.rows(trial)
         known = {row["track"] for row in done if row["phase"] == "final"}
         done += [row for row in rows if row["track"] not in known]
-        write_whole(self.of(trial) / ROWS, json.dumps(done).encode())
+        write_atomically(self.of(trial) / ROWS, json.dumps(done).encode())
         self.write_results()
 
     def write_results(self) -> None:
@@ -282,7 +282,7 @@ class StudyFolder:
         writer.writerow(FIELDS)
         for file in (*named, *others):
             writer.writerows([_cell(row[field]) for field in FIELDS] for row in _rows(file))
-        write_whole(self.results, table.getvalue().encode())
+        write_atomically(self.results, table.getvalue().encode())
 
 
 def _rows(file: Path) -> list[dict[str, Any]]:
@@ -360,7 +360,7 @@ def _parsed(file: Path, parse: Callable[[str], Any]) -> Any:
         ) from error
 
 
-def write_whole(file: Path, content: bytes) -> None:
+def write_atomically(file: Path, content: bytes) -> None:
     """
     Write a file of a study completely or not at all.
 
@@ -368,5 +368,5 @@ def write_whole(file: Path, content: bytes) -> None:
     :param content: of it
     :raises OutputNotWritable: if it cannot be written; the previous file is kept
     """
-    with whole_file(file, GOING_ON, parents=True) as aside:
+    with atomic_file(file, GOING_ON, parents=True) as aside:
         aside.write_bytes(content)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from sb3_torcs.errors import needs_extra
-from sb3_torcs.files import whole_file
+from sb3_torcs.files import atomic_file
 
 __all__ = [
     "FOLDER",
@@ -109,7 +109,7 @@ def write_document(path: Path, text: str) -> None:
     :param text: of the page
     :raises OutputNotWritable: if the file cannot be written
     """
-    with whole_file(path) as aside:
+    with atomic_file(path) as aside:
         aside.write_text(text, encoding="utf-8")
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from sb3_torcs.car import CarState, Controls
 from sb3_torcs.errors import DriveFileError, InvalidOption, needs_extra
-from sb3_torcs.files import checked_ending, readable, whole_file
+from sb3_torcs.files import atomic_file, checked_ending, readable
 from sb3_torcs.sensors import SENSORS
 from sb3_torcs.tracks.track import Track
 
@@ -185,7 +185,7 @@ class DriveLog:
         table = self.table()
         floats = [field.name for field in table.schema if str(field.type) == "double"]
         others = [field.name for field in table.schema if field.name not in floats]
-        with whole_file(file) as aside:
+        with atomic_file(file) as aside:
             # Bytes of one weight stand together, which compresses better.
             parquet.write_table(
                 table, aside, compression="zstd", use_dictionary=others,

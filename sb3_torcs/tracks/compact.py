@@ -26,7 +26,7 @@ import math
 from pathlib import Path
 
 from sb3_torcs.errors import TrackFileError
-from sb3_torcs.files import IN_A_FOLDER, whole_file
+from sb3_torcs.files import IN_A_FOLDER, atomic_file
 from sb3_torcs.torcs.params import read_bounded
 from sb3_torcs.tracks.track import Grid, Segment, Surface, Track
 
@@ -291,5 +291,5 @@ def write_track_file(track: Track, path: str | Path, comment: str = "") -> None:
     for segment in track.segments:
         names = [surface.name for surface in _surfaces(segment)]
         rows.writerow(["segment", *segment[:NUMBERS_PER_SEGMENT], *names])
-    with whole_file(Path(path), IN_A_FOLDER) as aside:
+    with atomic_file(Path(path), IN_A_FOLDER) as aside:
         aside.write_text(text.getvalue(), encoding="utf-8")

@@ -10,7 +10,7 @@ import numpy as np
 
 from sb3_torcs.car import KMH, FloatArray
 from sb3_torcs.errors import InvalidOption
-from sb3_torcs.files import IN_A_FOLDER, PICTURES, checked_ending, whole_file
+from sb3_torcs.files import IN_A_FOLDER, PICTURES, atomic_file, checked_ending
 from sb3_torcs.tracks.track import CURVATURE, LENGTH, Track
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ def plot_track(
     axes.set_title(measures if title is None else title)
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")
-    with whole_file(path, IN_A_FOLDER) as aside:
+    with atomic_file(path, IN_A_FOLDER) as aside:
         figure.savefig(aside, dpi=120)
 
 

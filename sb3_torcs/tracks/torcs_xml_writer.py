@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from sb3_torcs.errors import InvalidOption
-from sb3_torcs.files import IN_A_FOLDER, whole_file
+from sb3_torcs.files import IN_A_FOLDER, atomic_file
 from sb3_torcs.torcs.nodes import Node
 from sb3_torcs.tracks.compact import surfaces_of
 from sb3_torcs.tracks.track import Segment, Track
@@ -57,7 +57,7 @@ def write_track_xml(track: Track, path: str | Path) -> None:
     grid.set("distance to start", track.grid.distance)
     grid.set("pole position side", "left" if track.grid.offset > 0.0 else "right")
     grid.set("rows", max(round(width / (0.5 * width - abs(track.grid.offset))) - 1, 1))
-    with whole_file(path, IN_A_FOLDER) as aside:
+    with atomic_file(path, IN_A_FOLDER) as aside:
         root.write(aside)
 
 

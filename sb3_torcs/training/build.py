@@ -28,7 +28,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack,
 
 from sb3_torcs.agents.saved.algorithm import algorithm_class
 from sb3_torcs.errors import Sb3TorcsError, ZooConfigError
-from sb3_torcs.files import listed, path_and_arguments
+from sb3_torcs.files import as_list, path_and_arguments
 from sb3_torcs.training.keeping import REPLAY_BUFFER
 from sb3_torcs.training.resuming import restore_statistics
 from sb3_torcs.training.schedules import FallingSchedule
@@ -181,7 +181,7 @@ def _noise(kind: str, deviation: float, env: VecEnv) -> ActionNoise:
 
 def _classes(entry: Mapping[str, Any], key: str) -> list[tuple[Any, dict[str, Any]]]:
     """Import the classes of a key, with the arguments of each."""
-    items = [path_and_arguments(item) for item in listed(entry.get(key))]
+    items = [path_and_arguments(item) for item in as_list(entry.get(key))]
     return [(_import(path), arguments) for path, arguments in items]
 
 

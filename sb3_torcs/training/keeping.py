@@ -32,7 +32,7 @@ __all__ = [
     "REPLAY_BUFFER",
     "SAVING",
     "Keeper",
-    "WholeFiles",
+    "StagingFolder",
     "check_healthy",
     "tensorboard_folder",
 ]
@@ -43,7 +43,7 @@ UNFINISHED = ".unfinished"
 REPLAY_BUFFER = "replay_buffer.pkl"
 
 
-class WholeFiles:
+class StagingFolder:
     """
     A folder whose files are there whole, or not at all.
 
@@ -103,7 +103,7 @@ class Keeper:
 
         self.training = training
         self.name = folder.name.rpartition("_")[0]  # of the environment
-        self.files = WholeFiles(folder)
+        self.files = StagingFolder(folder)
 
     def learn(self, interrupts: list[int]) -> None:
         """

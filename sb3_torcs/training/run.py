@@ -26,7 +26,7 @@ from sb3_torcs.callbacks.lines import LinePicturesCallback
 from sb3_torcs.callbacks.progress import RacingProgressCallback
 from sb3_torcs.car import check_count
 from sb3_torcs.errors import OutputNotWritable, TrainingDiverged
-from sb3_torcs.files import listed, lock, writable_folder
+from sb3_torcs.files import as_list, lock, writable_folder
 from sb3_torcs.signals import count_interrupts
 from sb3_torcs.torcs.track_names import lasting_kwargs
 from sb3_torcs.training import zoo
@@ -261,7 +261,7 @@ def _training(
         # Within a rollout the policy does not change.
         shortest = min(wanted, SHORTEST_EVAL_FREQ), _rollout(options.algo, entry)
         frequency = max(wanted // SLICES, *shortest)
-    own = listed((entry.get("env_kwargs") or {}).get("track", "aalborg"))
+    own = as_list((entry.get("env_kwargs") or {}).get("track", "aalborg"))
     tracks = tuple(dict.fromkeys(own)) if frequency > 0 else ()
     interval = frequency if frequency > 0 else max(wanted // SLICES, 1)
     recipe = Recipe(options.algo, options.env, entry, options.seed, interval, tracks)

@@ -23,7 +23,7 @@ from sb3_torcs.agents.saved.algorithm import ALGORITHMS, SBX, algorithm_class
 from sb3_torcs.agents.wrapping import normalizes, unrebuilt, wrapped
 from sb3_torcs.car import is_count, look_both_ways, range_finder_angles
 from sb3_torcs.errors import InvalidOption, ModelMismatch, ZooConfigError, near_miss
-from sb3_torcs.files import import_advice, listed, path_and_arguments, read_yaml
+from sb3_torcs.files import as_list, import_advice, path_and_arguments, read_yaml
 from sb3_torcs.training.zoo_data import (
     as_data,
     check_class,
@@ -371,7 +371,7 @@ def _items(value: Any, key: str, place: Place) -> list[tuple[str, Mapping[str, A
     :return: dotted paths and their arguments
     """
     result: list[tuple[str, Mapping[str, Any]]] = []
-    for item in listed(value):
+    for item in as_list(value):
         try:
             result.append(path_and_arguments(item))
         except ValueError:

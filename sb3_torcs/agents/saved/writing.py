@@ -39,7 +39,7 @@ from sb3_torcs.agents.saved.record import (
 )
 from sb3_torcs.agents.wrapping import LEFT_OUT
 from sb3_torcs.errors import InvalidOption, ModelMismatch
-from sb3_torcs.files import whole_file
+from sb3_torcs.files import atomic_file
 from sb3_torcs.policies.inputs import columns_of
 from sb3_torcs.torcs.track_names import lasting_kwargs
 from sb3_torcs.tracks.catalogue import lasting_name
@@ -167,7 +167,7 @@ def write_driver(model: str | Path, driver: str | Path, *, value_function: bool 
 def _write_parts(model: Path, driver: Path, parts: Mapping[str, bytes]) -> None:
     """Write the file of a model with other parts, and with empty optimizers."""
     with (
-        whole_file(driver) as aside,
+        atomic_file(driver) as aside,
         zipfile.ZipFile(model) as source,
         zipfile.ZipFile(aside, "w") as target,
     ):
