@@ -24,7 +24,7 @@ from sb3_torcs.evaluation import evaluate, race_environment
 from sb3_torcs.evaluation.ladder import ROBOTS, reference_laps
 from sb3_torcs.evaluation.protocol import RACE_LAPS
 from sb3_torcs.torcs.installation import find_game
-from sb3_torcs.tracks.catalogue import lasting_name, load_track, tracks_of
+from sb3_torcs.tracks.catalogue import load_track, stable_name, tracks_of
 
 HEADERS = ("track", "laps", "flying lap s", "best robot s", "gap %", "damage", "distance m")
 
@@ -111,7 +111,7 @@ def summary(drives: list[Drive]) -> str:
 def main() -> None:
     args = parser.parse_args()
     names, without = (
-        [lasting_name(load_track(track)) for word in words for track in tracks_of(word)]
+        [stable_name(load_track(track)) for word in words for track in tracks_of(word)]
         for words in (args.track, args.without)
     )
     tracks = [name for name in names if name not in without]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import gymnasium as gym
 import pytest
 
-from sb3_torcs.envs.aids import Aids, aids_named
+from sb3_torcs.envs.aids import Aids, parse_aids
 from sb3_torcs.envs.options import AIDS
 from sb3_torcs.errors import InvalidOption
 
@@ -31,4 +31,4 @@ def test_an_unknown_aid_is_answered_by_the_nearest():
     ("names", "aids"), [("all", AIDS), ("unstick, keep_clear", ("unstick", "keep_clear"))]
 )
 def test_a_command_names_them_with_commas(names, aids):
-    assert aids_named(names) == aids
+    assert parse_aids(names) == aids

@@ -19,7 +19,7 @@ from sb3_torcs.torcs.track_names import (
     TrackFile,
     find_track,
     known_tracks,
-    lasting_track,
+    stable_track,
 )
 
 
@@ -96,7 +96,7 @@ def test_a_path_means_the_same_in_another_folder(tmp_path, monkeypatch):
     monkeypatch.chdir("/")
     copy.deepcopy(env).reset(seed=0)
     pickle.loads(pickle.dumps(env)).reset(seed=0)
-    assert lasting_track(["~/a.xml", "aalborg"]) == [str(Path("~/a.xml").expanduser()), "aalborg"]
+    assert stable_track(["~/a.xml", "aalborg"]) == [str(Path("~/a.xml").expanduser()), "aalborg"]
 
 
 def test_a_path_means_the_same_for_the_game_s_own_process(game, tmp_path, monkeypatch):

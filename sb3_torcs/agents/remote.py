@@ -15,7 +15,7 @@ from sb3_torcs.envs.aids import NEED_RIVALS
 from sb3_torcs.errors import ModelMismatch
 from sb3_torcs.sensors import NEEDS_CAR, NEEDS_RACE
 from sb3_torcs.telemetry import DriveLabel, DriveLog
-from sb3_torcs.tracks.catalogue import lasting_name
+from sb3_torcs.tracks.catalogue import stable_name
 
 __all__ = ["Agent", "check_observable"]
 
@@ -65,7 +65,7 @@ class Agent:
         racing.warns_after_end = False  # it drives on beside the road, too
         self.driver = load_driver(model, self.env, algo, trust)
         self.backend.driver_name = name
-        track = lasting_name(self.backend.track)
+        track = stable_name(self.backend.track)
         self._label = DriveLabel(driver_name(model), track, self.backend.car, "Torcs-v0")
         self.log: DriveLog | None = None
         """What notes each timestep, once it is set."""

@@ -13,7 +13,7 @@ from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.race_results import Lap, RobotResult
 from sb3_torcs.torcs.race_setup import RaceSetup, Session
 from sb3_torcs.torcs.track_names import find_track
-from sb3_torcs.tracks.catalogue import lasting_name, load_track
+from sb3_torcs.tracks.catalogue import load_track, stable_name
 
 __all__ = ["race"]
 
@@ -89,7 +89,7 @@ def _note(engine: Any, robots: Sequence[tuple[str, int]], track: str, log: Drive
     game = find_game()
     road = load_track(find_track(track, game))
     labels = [
-        DriveLabel(game.robot_name(robot), lasting_name(road), engine.car_name(number), WORLD)
+        DriveLabel(game.robot_name(robot), stable_name(road), engine.car_name(number), WORLD)
         for number, robot in enumerate(robots)
     ]
     log.tracks |= dict.fromkeys(labels, road)

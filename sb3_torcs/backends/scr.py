@@ -41,7 +41,7 @@ from sb3_torcs.torcs.installation import find_game
 from sb3_torcs.torcs.process import GameProcess, compiled_library
 from sb3_torcs.torcs.race_setup import SCR_DRIVER, RaceSetup
 from sb3_torcs.torcs.starting_list import AGENT, starting_list
-from sb3_torcs.torcs.track_names import find_track, lasting_track
+from sb3_torcs.torcs.track_names import find_track, stable_track
 from sb3_torcs.tracks.catalogue import load_track
 from sb3_torcs.tracks.profile import RoadProfile, game_profile
 from sb3_torcs.tracks.track import Track
@@ -95,7 +95,7 @@ class ScrBackend:
         gearbox: str = "automatic",
     ) -> None:
         self._settings: dict[str, Any] = {
-            "track": lasting_track(track),
+            "track": stable_track(track),
             "car": car,
             "range_finders": range_finders,
             "opponents": opponents,

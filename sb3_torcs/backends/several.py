@@ -17,7 +17,7 @@ from sb3_torcs.backends.base import Backend, optional
 from sb3_torcs.car import CarState, Controls, Start
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.torcs.car_file import CarFacts
-from sb3_torcs.torcs.track_names import lasting_track
+from sb3_torcs.torcs.track_names import stable_track
 from sb3_torcs.tracks.profile import RoadProfile
 from sb3_torcs.tracks.track import Track
 
@@ -162,7 +162,7 @@ def one_or_several(make: Callable[..., Backend], track: Any, car: Any) -> Backen
     :raises InvalidOption: if a list is empty
     """
     several = is_several(track), is_several(car, "car")
-    track = lasting_track(track)  # for copies, which may be made in another folder
+    track = stable_track(track)  # for copies, which may be made in another folder
     if not any(several):
         return make(track=track, car=car)
     tracks, cars = (track if several[0] else [track]), (car if several[1] else [car])

@@ -152,10 +152,10 @@ def _find(args: argparse.Namespace) -> list[NamedDriver]:
     """Find the drivers, and warn of agents without a record."""
     from sb3_torcs.agents.drivers import find_drivers
     from sb3_torcs.agents.pilots import check_racers
-    from sb3_torcs.envs.aids import aids_named
+    from sb3_torcs.envs.aids import parse_aids
     from sb3_torcs.errors import InvalidOption
 
-    aids = () if args.aids is None else aids_named(args.aids)
+    aids = () if args.aids is None else parse_aids(args.aids)
     drivers = find_drivers(args.drivers, aids)
     check_racers(drivers)
     agents = [driver for driver in drivers if driver.robot is None]

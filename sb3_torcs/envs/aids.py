@@ -15,7 +15,7 @@ from sb3_torcs.envs.episode import Episodes
 from sb3_torcs.envs.options import AIDS, AidName, checked_aids
 from sb3_torcs.rivals import needed_brake, needed_turn
 
-__all__ = ["NEED_RIVALS", "Aids", "aids_named", "help_cars"]
+__all__ = ["NEED_RIVALS", "Aids", "help_cars", "parse_aids"]
 
 atan2, hypot = map(maths.compiled, (maths.atan2, maths.hypot))
 
@@ -136,7 +136,7 @@ NEED_RIVALS = ("keep_distance", "keep_clear")
 """Those that have to see other cars."""
 
 
-def aids_named(names: str) -> tuple[AidName, ...]:
+def parse_aids(names: str) -> tuple[AidName, ...]:
     """
     Read the names of driver aids.
 

@@ -12,7 +12,7 @@ from sb3_torcs.backends.base import Backend
 from sb3_torcs.backends.several import present_world
 from sb3_torcs.car import CarState, Controls, Start
 from sb3_torcs.telemetry.drives import DriveLabel, DriveLog
-from sb3_torcs.tracks.catalogue import lasting_name
+from sb3_torcs.tracks.catalogue import stable_name
 
 __all__ = ["LoggedWorld", "TickedWorld", "log_drives"]
 
@@ -71,7 +71,7 @@ class LoggedWorld(TickedWorld):
     def reset(self, rng: np.random.Generator, start: Start | None) -> CarState:
         """Begin an episode; see :class:`~sb3_torcs.backends.base.Backend`."""
         state = super().reset(rng, start)
-        track = lasting_name(self._world.track)  # track and car may be drawn before the reset
+        track = stable_name(self._world.track)  # track and car may be drawn before the reset
         self._label = self._label._replace(
             track=track, car=self._world.car, episode=self._label.episode + 1
         )

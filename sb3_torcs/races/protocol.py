@@ -24,7 +24,7 @@ from sb3_torcs.car import (
 from sb3_torcs.errors import InvalidOption
 from sb3_torcs.telemetry import DriveLabel, DriveLog
 from sb3_torcs.torcs.starting_list import GRID_SLOTS, GRIDS, GridName
-from sb3_torcs.tracks.catalogue import lasting_name
+from sb3_torcs.tracks.catalogue import stable_name
 from sb3_torcs.tracks.track import Track
 
 if TYPE_CHECKING:
@@ -113,7 +113,7 @@ class Notes:
     def begin(self, engine: Engine, names: Sequence[str], road: Track) -> None:
         """See :class:`Watcher`."""
         self._engine = engine
-        track = lasting_name(road)
+        track = stable_name(road)
         self._labels = [
             DriveLabel(name, track, engine.car_name(slot), "Torcs-v0")
             for slot, name in enumerate(names)

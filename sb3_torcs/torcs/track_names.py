@@ -17,8 +17,8 @@ __all__ = [
     "find_track",
     "kind_without_game",
     "known_tracks",
-    "lasting_kwargs",
-    "lasting_track",
+    "stable_kwargs",
+    "stable_track",
 ]
 
 BUNDLED_FOLDER = Path(__file__).parents[1] / "data" / "tracks"
@@ -56,7 +56,7 @@ def find_track(track: str | os.PathLike[str] | TrackFile, game: Game | None = No
     name = os.fspath(track)
     suffix = _suffix(name)
     if suffix == XML or (suffix == COMPACT and game is None):
-        return _own_file(Path(lasting_track(name)))
+        return _own_file(Path(stable_track(name)))
     if suffix == COMPACT:
         raise TrackNotFound(
             f"'{name}' is a file for TorcsLite-v0; Torcs-v0 has the game's own tracks ({LISTED}) "
@@ -105,7 +105,7 @@ def kind_without_game(track: Any) -> str | None:
     return COMPACT if _suffix(track) == COMPACT else None
 
 
-def lasting_track(track: Any) -> Any:
+def stable_track(track: Any) -> Any:
     """
     Say a track so that it means the same in another working folder.
 
@@ -113,19 +113,19 @@ def lasting_track(track: Any) -> Any:
     :return: the same, with absolute paths
     """
     if isinstance(track, (list, tuple)) and not isinstance(track, TrackFile):
-        return [lasting_track(item) for item in track]
+        return [stable_track(item) for item in track]
     is_path = _suffix(track) in (XML, COMPACT)
     return str(Path(os.path.expanduser(track)).absolute()) if is_path else track
 
 
-def lasting_kwargs(env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
+def stable_kwargs(env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
     """
-    Say the track in arguments of an environment as :func:`lasting_track` does.
+    Say the track in arguments of an environment as :func:`stable_track` does.
 
     :param env_kwargs: as of ``gym.make``
     :return: a copy
     """
-    track = {"track": lasting_track(env_kwargs["track"])} if "track" in env_kwargs else {}
+    track = {"track": stable_track(env_kwargs["track"])} if "track" in env_kwargs else {}
     return {**env_kwargs, **track}
 
 

@@ -21,7 +21,7 @@ from sb3_torcs.tracks.generator import random_track
 from sb3_torcs.tracks.torcs_xml import read_track_xml
 from sb3_torcs.tracks.track import Track, TrackSummary, closed
 
-__all__ = ["CATEGORIES", "available_tracks", "lasting_name", "load_track", "summaries", "tracks_of"]
+__all__ = ["CATEGORIES", "available_tracks", "load_track", "stable_name", "summaries", "tracks_of"]
 
 
 CATEGORIES = ("road", "oval", "dirt")
@@ -103,7 +103,7 @@ def tracks_of(name: str) -> list[str]:
     return [f"{s.category}/{s.name}" for s in available_tracks() if s.category == name]
 
 
-def lasting_name(track: Track) -> str:
+def stable_name(track: Track) -> str:
     """
     Name a track so that :func:`load_track` finds it again, in any folder.
 

@@ -28,7 +28,7 @@ from sb3_torcs.car import check_count
 from sb3_torcs.errors import OutputNotWritable, TrainingDiverged
 from sb3_torcs.files import as_list, lock, writable_folder
 from sb3_torcs.signals import count_interrupts
-from sb3_torcs.torcs.track_names import lasting_kwargs
+from sb3_torcs.torcs.track_names import stable_kwargs
 from sb3_torcs.training import zoo
 from sb3_torcs.training.keeping import REPLAY_BUFFER, SAVING, Keeper, tensorboard_folder
 from sb3_torcs.training.resuming import check_resumable, recorded_entry
@@ -183,7 +183,7 @@ def _entry(options: TrainOptions, resume: Path | None) -> tuple[dict[str, Any], 
     zoo.check_entry(entry, options.algo, options.env, place)
     entry["n_timesteps"] = zoo.timesteps(entry)
     if entry.get("env_kwargs"):
-        entry["env_kwargs"] = lasting_kwargs(entry["env_kwargs"])
+        entry["env_kwargs"] = stable_kwargs(entry["env_kwargs"])
     return entry, place
 
 

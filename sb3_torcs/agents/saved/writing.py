@@ -41,8 +41,8 @@ from sb3_torcs.agents.wrapping import LEFT_OUT
 from sb3_torcs.errors import InvalidOption, ModelMismatch
 from sb3_torcs.files import atomic_file
 from sb3_torcs.policies.inputs import columns_of
-from sb3_torcs.torcs.track_names import lasting_kwargs
-from sb3_torcs.tracks.catalogue import lasting_name
+from sb3_torcs.torcs.track_names import stable_kwargs
+from sb3_torcs.tracks.catalogue import stable_name
 from sb3_torcs.tracks.track import Track
 
 __all__ = ["RecordCallback", "recipe", "write_driver", "write_record"]
@@ -64,7 +64,7 @@ def recipe(
     :param hyperparameters: the entry of the hyperparameter file, changes applied
     :return: the first part of a record
     """
-    kwargs = _plain_part(lasting_kwargs(hyperparameters.get("env_kwargs") or {}))
+    kwargs = _plain_part(stable_kwargs(hyperparameters.get("env_kwargs") or {}))
     entry = {**_plain_part(hyperparameters), **({"env_kwargs": kwargs} if kwargs else {})}
     return {"algo": algo, "env_id": env_id, "env_kwargs": kwargs, "hyperparameters": entry}
 
@@ -224,9 +224,9 @@ def _recipe_of_environment(model: BaseAlgorithm) -> Recipe:
     kwargs = {name: value for name, value in spec.kwargs.items() if name != "render_mode"}
     tracks = kwargs.get("track")
     if isinstance(tracks, Track):
-        kwargs["track"] = lasting_name(tracks)
+        kwargs["track"] = stable_name(tracks)
     elif isinstance(tracks, (list, tuple)):
-        kwargs["track"] = [lasting_name(t) if isinstance(t, Track) else t for t in tracks]
+        kwargs["track"] = [stable_name(t) if isinstance(t, Track) else t for t in tracks]
     return recipe(algo, spec.id, {"env_kwargs": kwargs, **seen})
 
 

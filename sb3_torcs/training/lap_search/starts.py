@@ -19,7 +19,7 @@ from sb3_torcs.car import DEFAULT_CAR, CarState, Controls, FloatArray
 from sb3_torcs.errors import InvalidOption, RobotUnavailable
 from sb3_torcs.evaluation.protocol import KEPT, RACE_LAPS, time_limit
 from sb3_torcs.torcs.installation import find_game
-from sb3_torcs.torcs.track_names import lasting_track
+from sb3_torcs.torcs.track_names import stable_track
 from sb3_torcs.training.lap_search.line import waypoint
 
 __all__ = ["FirstDrive", "find_starts", "ghost_environment"]
@@ -52,7 +52,7 @@ def ghost_environment(driver: NamedDriver, given: Mapping[str, Any]) -> dict[str
     kwargs = {**usual, **driver.record.kept(KEPT), **given, "laps": RACE_LAPS}
     require_one("track", kwargs["track"])
     require_one("car", kwargs["car"])
-    kwargs["track"] = lasting_track(kwargs["track"])
+    kwargs["track"] = stable_track(kwargs["track"])
     if kwargs["action"] == "manual":  # the search leaves the gears to the gearbox
         kwargs["action"] = "pedals"
     return kwargs
