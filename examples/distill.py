@@ -107,7 +107,7 @@ class School:
 def _same_for_all(teachers: Sequence[str]) -> dict:
     """Return the options of driving, which all teachers have to share."""
     found = [
-        {"car": DEFAULT_CAR, **driver_record(teacher).kept(("car", *DRIVEN_WITH))}
+        {"car": DEFAULT_CAR, **driver_record(teacher).select(("car", *DRIVEN_WITH))}
         for teacher in teachers
     ]
     for teacher, options in zip(teachers, found, strict=True):

@@ -327,7 +327,7 @@ def how_to_drive(known: str | None) -> dict:
     if known is None:
         return FROM_NOTHING
     record = training_record(find_model(known))
-    drives = {"sensors": ["base"], "action": "pedals", **record.kept(FROM_NOTHING)}
+    drives = {"sensors": ["base"], "action": "pedals", **record.select(FROM_NOTHING)}
     advice = 'take a model of PPO with action="pedal" and BoundedPolicy, such as ppo-any-road'
     if drives["action"] != "pedal":
         raise SystemExit(f"'{known}' drives with action=\"{drives['action']}\"; {advice}")

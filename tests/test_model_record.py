@@ -28,7 +28,7 @@ from sb3_torcs.agents import models
 from sb3_torcs.agents.saved import file as model_file
 from sb3_torcs.agents.saved import policy as model_policy
 from sb3_torcs.agents.saved.writing import RecordCallback, recipe, write_driver
-from sb3_torcs.agents.wrapping import wrapped
+from sb3_torcs.agents.wrapping import wrap_env
 from sb3_torcs.cli import main
 from sb3_torcs.errors import (
     InvalidAction,
@@ -160,7 +160,7 @@ def test_without_a_recipe_the_environment_tells(tmp_path):
         trained(DDPG, "MlpPolicy", env, **OFF_POLICY).save(tmp_path / "m.zip")
     record = models.training_record(tmp_path / "m.zip")
     assert (record.algo, record.env_id) == ("ddpg", "TorcsLite-v0")
-    assert record.kept(("track", "action_repeat")) == {"track": "alpine-1", "action_repeat": 10}
+    assert record.select(("track", "action_repeat")) == {"track": "alpine-1", "action_repeat": 10}
 
 
 def test_arrays_among_the_arguments_of_an_environment_are_recorded_as_lists(tmp_path):
@@ -495,7 +495,7 @@ def test_a_driver_of_ppo_leaves_out_what_only_its_value_function_saw(tmp_path, n
         record = models.training_record(tmp_path / "driver.zip")
         assert record.env_kwargs["sensors"] == sensors
         assert record.hyperparameters["env_kwargs"]["sensors"] == ["base", "line"]
-        with gym.make("TorcsLite-v0", **record.kept(["sensors"])) as env:
+        with gym.make("TorcsLite-v0", **record.select(["sensors"])) as env:
             stock = PPO.load(tmp_path / "driver.zip", env, device="cpu")
             own = seen[:, : env.observation_space.shape[0]]
             for driver in (stock, models.load_driver(tmp_path / "driver.zip", env)):
@@ -564,7 +564,7 @@ def test_gymnasium_s_wrappers_of_a_script_are_rebuilt(tmp_path):
     ]
     assert names == ["FrameStackObservation", "FlattenObservation", "RescaleAction"]
     with behind() as bare:
-        env = wrapped(bare, record.hyperparameters)
+        env = wrap_env(bare, record.hyperparameters)
         (race,) = evaluate(env, models.load_driver(tmp_path / "m.zip", env))
     assert race.distance == info["car"].distance_raced
 

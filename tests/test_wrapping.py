@@ -20,7 +20,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNorm
 import sb3_torcs  # noqa: F401  (registers the environments)
 from sb3_torcs.agents import remote as driving
 from sb3_torcs.agents.models import ModelDriver, load_driver
-from sb3_torcs.agents.wrapping import normalizes, wrapped
+from sb3_torcs.agents.wrapping import normalizes, wrap_env
 from sb3_torcs.cli import main
 from sb3_torcs.errors import ModelMismatch, ModelNotTrusted, PackageMissing
 from sb3_torcs.evaluation.protocol import evaluate
@@ -159,9 +159,9 @@ def test_a_wrapper_from_elsewhere_is_imported_only_if_it_is_trusted(tmp_path, mo
     entry = {"env_wrapper": "from_elsewhere.Marked"}
     with lite() as env:
         with pytest.raises(ModelNotTrusted, match=r"from_elsewhere\.Marked.*add --trust"):
-            wrapped(env, entry)
+            wrap_env(env, entry)
         assert "from_elsewhere" not in sys.modules
-        assert type(wrapped(env, entry, trust=True)).__module__ == "from_elsewhere"
+        assert type(wrap_env(env, entry, trust=True)).__module__ == "from_elsewhere"
 
 
 @pytest.mark.parametrize(("path", "error", "says"), [
@@ -174,15 +174,15 @@ def test_a_wrapper_from_elsewhere_is_imported_only_if_it_is_trusted(tmp_path, mo
 ])  # fmt: skip
 def test_what_cannot_be_put_around_is_told(path, error, says):
     with lite() as env, pytest.raises(error, match=says):
-        wrapped(env, {"env_wrapper": path}, trust=True)
+        wrap_env(env, {"env_wrapper": path}, trust=True)
 
 
 def test_what_only_ends_or_writes_down_a_training_is_left_out():
     entry = {"env_wrapper": [{"gymnasium.wrappers.TimeLimit": {"max_episode_steps": 3}}]}
     with lite(max_episode_steps=9) as env:
-        (race,) = evaluate(wrapped(env, entry), ModelDriver(PPO("MlpPolicy", env, device="cpu")))
+        (race,) = evaluate(wrap_env(env, entry), ModelDriver(PPO("MlpPolicy", env, device="cpu")))
     assert race.end == "time_limit"
-    assert wrapped(env, {}) is env
+    assert wrap_env(env, {}) is env
 
 
 @pytest.mark.parametrize(("entry", "says"), [

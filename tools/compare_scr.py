@@ -103,7 +103,7 @@ def main() -> None:
     words = parser.parse_args()
     tracks = words.tracks.split(",")
     rows, all_equal = [], True
-    settings = driver_record(words.model).kept(("car", *DRIVEN_WITH))
+    settings = driver_record(words.model).select(("car", *DRIVEN_WITH))
     with gym.make("Torcs-v0", **settings) as env:
         driver = load_driver(words.model, env)
     for track in progress(tracks, "racing", console=Console(stderr=True)):

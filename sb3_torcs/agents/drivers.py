@@ -69,7 +69,7 @@ class NamedDriver:
         :param names: of keyword arguments
         :return: those that its training had, and the aids that it got
         """
-        kept = self.record.kept(names)
+        kept = self.record.select(names)
         return {**kept, "aids": (*kept.get("aids", ()), *self.aids)} if self.aids else kept
 
 

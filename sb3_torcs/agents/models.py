@@ -17,9 +17,9 @@ from sb3_torcs.agents.ghosts import GhostDriver, check_fits, is_ghost, read_ghos
 from sb3_torcs.agents.saved.algorithm import algorithm_class, check_same
 from sb3_torcs.agents.saved.driver import ModelDriver
 from sb3_torcs.agents.saved.file import (
-    as_mismatch,
     check_finite,
-    saved_as,
+    find_saved,
+    raise_mismatch,
     saved_data,
     saved_weights,
 )
@@ -32,7 +32,7 @@ from sb3_torcs.agents.saved.record import (
     record_within,
 )
 from sb3_torcs.agents.scripted import SCRIPTED, ScriptedDriver
-from sb3_torcs.agents.wrapping import frames_of, normalizes, stacked_space, unrebuilt
+from sb3_torcs.agents.wrapping import find_unbuildable, frames_of, normalizes, stack_space
 from sb3_torcs.car import range_finder_angles
 from sb3_torcs.errors import (
     BackendUnavailable,
@@ -86,7 +86,7 @@ def find_model(path: str | Path, *, prefer_last: bool = False) -> Path:
     )
     if not isinstance(path, str | Path) or not str(path).strip():  # "" is the present folder
         raise InvalidOption(f"{path!r} names no model; {advice}")
-    given = saved_as(path)
+    given = find_saved(path)
     if given.is_file():
         return given
     shipped = str(path) in shipped_agents()
@@ -217,7 +217,7 @@ def saved_spaces(model: Path, *, trust: bool = False) -> Spaces:
         raise ModelNotTrusted(UNTRUSTED.format(model=model, why="it has no record of its training"))
     from stable_baselines3.common.save_util import json_to_data
 
-    with as_mismatch(f"'{model}' does not tell what it sees and does", "give"):
+    with raise_mismatch(f"'{model}' does not tell what it sees and does", "give"):
         wanted = {name: data[name] for name in ("observation_space", "action_space")}
         loaded = json_to_data(json.dumps(wanted))
         return loaded["observation_space"], loaded["action_space"]
@@ -235,7 +235,7 @@ def check_spaces(
     :param frames: observations that the model is to see at once
     :raises ModelMismatch: if the layouts differ
     """
-    given = (stacked_space(env.observation_space, frames), env.action_space)
+    given = (stack_space(env.observation_space, frames), env.action_space)
     for what, has, needs in zip(("observations", "actions"), saved, given, strict=True):
         if has == needs:
             continue
@@ -255,7 +255,7 @@ def _task(record: TrainingRecord) -> dict[str, Any]:
     """Collect what of a training decides on the layout of observations and actions."""
     wrappers = ("env_wrapper", "frame_stack")
     found = {key: record.hyperparameters[key] for key in wrappers if key in record.hyperparameters}
-    kept = record.kept(DRIVEN_WITH)
+    kept = record.select(DRIVEN_WITH)
     usual = {"sensors": ["base"], "action": "pedals"}  # what else may have been given here
     return {**kept, **{key: value for key, value in usual.items() if key not in kept}, **found}
 
@@ -284,7 +284,7 @@ def load_driver(
     :raises ModelNotTrusted: if the model needs more than plain data and known classes
     """
     if str(path) == SCRIPTED:
-        return _scripted(env)
+        return _make_scripted(env)
     if is_ghost(path):
         ghost = read_ghost(path)
         check_fits(ghost, env, path)
@@ -292,7 +292,7 @@ def load_driver(
     file = find_model(path)
     data = saved_data(file)
     record = _record(file, data)
-    reason = unrebuilt(record.hyperparameters)
+    reason = find_unbuildable(record.hyperparameters)
     if reason is not None:
         raise ModelMismatch(f"'{file}' cannot be driven as it was trained: {reason}")
     frames = frames_of(record.hyperparameters)
@@ -309,7 +309,7 @@ def _policy(file: Path, record: TrainingRecord, seen: Spaces) -> Any:
     if record.policy is None:
         raise ModelNotTrusted(UNTRUSTED.format(model=file, why="it has no record of its training"))
     weights = saved_weights(file)
-    with as_mismatch(f"'{file}' does not load", "give"):
+    with raise_mismatch(f"'{file}' does not load", "give"):
         try:
             policy = build_policy(record.policy, seen)
         except ModelNotTrusted as error:
@@ -327,7 +327,7 @@ def _as_sb3_does(file: Path, algo: str | None) -> Any:
     # need the schedules, which may be from another version, nor a replay buffer, about whose class
     # SB3 would warn after a training with returns over several timesteps.
     kwargs = {"device": "cpu", "buffer_size": 1, "replay_buffer_class": None}
-    with as_mismatch(f"'{file}' does not load as {algo}", "give an --algo that fits, or"):
+    with raise_mismatch(f"'{file}' does not load as {algo}", "give an --algo that fits, or"):
         model = algorithm.load(io.BytesIO(file.read_bytes()), **kwargs)
         check_finite(file, model.policy.state_dict())
         return model
@@ -349,14 +349,14 @@ def _statistics(file: Path, record: TrainingRecord, trust: bool) -> Any:
     if not trust:
         why = f"its statistics, '{record.statistics_file}', are pickled"
         raise ModelNotTrusted(UNTRUSTED.format(model=file, why=why))
-    with as_mismatch(f"'{record.statistics_file}' holds no statistics of VecNormalize", "give"):
+    with raise_mismatch(f"'{record.statistics_file}' holds no statistics of VecNormalize", "give"):
         statistics = pickle.loads(record.statistics_file.read_bytes())
         if not isinstance(statistics, VecNormalize):
             raise TypeError(f"a {type(statistics).__name__}")
         return statistics
 
 
-def _scripted(env: gym.Env[Any, Any]) -> Any:
+def _make_scripted(env: gym.Env[Any, Any]) -> Any:
     """Make the scripted driver, and check that its range finders are those of SCR."""
     angles = env.get_wrapper_attr("range_finder_angles")
     if not np.allclose(angles, range_finder_angles("scr")):

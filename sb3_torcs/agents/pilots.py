@@ -11,7 +11,7 @@ import numpy as np
 from sb3_torcs.agents.drivers import NamedDriver, find_driver
 from sb3_torcs.agents.models import load_driver
 from sb3_torcs.agents.saved.record import DRIVEN_WITH
-from sb3_torcs.agents.wrapping import wrapped
+from sb3_torcs.agents.wrapping import wrap_env
 from sb3_torcs.backends.seats import SeatWorld, SharedRace
 from sb3_torcs.envs.torcs_race import RaceCarEnv
 from sb3_torcs.errors import InvalidAction, InvalidOption, ModelMismatch
@@ -55,7 +55,7 @@ class Pilots:
             if driver.source in policies:
                 policies[driver.source].members.append(number)
                 continue
-            if wrapped(env, driver.record.hyperparameters, trust=trust) is not env:
+            if wrap_env(env, driver.record.hyperparameters, trust=trust) is not env:
                 raise ModelMismatch(
                     f"'{driver.source}' was trained behind a wrapper of its environment, which "
                     "cannot be put around one car of several; race an agent without one"

@@ -10,7 +10,7 @@ import gymnasium as gym
 
 from sb3_torcs.agents.models import driver_name, driver_record, load_driver
 from sb3_torcs.agents.rollout import drive
-from sb3_torcs.agents.wrapping import wrapped
+from sb3_torcs.agents.wrapping import wrap_env
 from sb3_torcs.envs.aids import NEED_RIVALS
 from sb3_torcs.errors import ModelMismatch
 from sb3_torcs.sensors import NEEDS_CAR, NEEDS_RACE
@@ -60,7 +60,7 @@ class Agent:
         name: str = "",
     ) -> None:
         bare = gym.make("sb3_torcs:Torcs-v0", backend="scr", max_episode_steps=-1, **settings)
-        self.env = wrapped(bare, driver_record(model).hyperparameters, trust=trust)
+        self.env = wrap_env(bare, driver_record(model).hyperparameters, trust=trust)
         racing: Any = self.env.unwrapped
         racing.warns_after_end = False  # it drives on beside the road, too
         self.driver = load_driver(model, self.env, algo, trust)

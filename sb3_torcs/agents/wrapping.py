@@ -14,11 +14,11 @@ from typing import Any
 import gymnasium as gym
 from gymnasium import spaces
 
-from sb3_torcs.agents.saved.file import as_mismatch
+from sb3_torcs.agents.saved.file import raise_mismatch
 from sb3_torcs.errors import ModelMismatch, ModelNotTrusted, PackageMissing
 from sb3_torcs.files import as_list, import_advice, path_and_arguments, plain_python
 
-__all__ = ["LEFT_OUT", "frames_of", "normalizes", "stacked_space", "unrebuilt", "wrapped"]
+__all__ = ["LEFT_OUT", "find_unbuildable", "frames_of", "normalizes", "stack_space", "wrap_env"]
 
 TRUSTED_PACKAGES = ("sb3_torcs", "gymnasium", "stable_baselines3", "sb3_contrib", "rl_zoo3")
 """Whose wrappers a record may name: importing them, and putting them around, does no harm."""
@@ -44,7 +44,7 @@ VECTORS = ("sb3_torcs.vec_env", "stable_baselines3.common.vec_env")
 """Where they are defined."""
 
 
-def wrapped(
+def wrap_env(
     env: gym.Env[Any, Any], hyperparameters: Mapping[str, Any], *, trust: bool = False
 ) -> gym.Env[Any, Any]:
     """
@@ -68,8 +68,8 @@ def wrapped(
             continue
         if name in REFUSED:
             raise ModelMismatch(f"{path} {REFUSED[name]}")
-        wrapper = _imported(path, trust)
-        with as_mismatch(f"the training's wrapper {path} does not go around the car", "give"):
+        wrapper = _import(path, trust)
+        with raise_mismatch(f"the training's wrapper {path} does not go around the car", "give"):
             env = wrapper(env, **kwargs)
     return env
 
@@ -88,7 +88,7 @@ def frames_of(hyperparameters: Mapping[str, Any]) -> int | None:
     return frames
 
 
-def stacked_space(space: spaces.Space[Any], frames: int | None) -> spaces.Space[Any]:
+def stack_space(space: spaces.Space[Any], frames: int | None) -> spaces.Space[Any]:
     """
     Return the space of so many observations at once.
 
@@ -124,7 +124,7 @@ def normalizes(normalize: Any) -> bool:
     return normalize is True
 
 
-def unrebuilt(hyperparameters: Mapping[str, Any]) -> str | None:
+def find_unbuildable(hyperparameters: Mapping[str, Any]) -> str | None:
     """
     Find a wrapper that cannot be put around a single car.
 
@@ -152,7 +152,7 @@ def _items(hyperparameters: Mapping[str, Any], key: str) -> Iterator[tuple[str, 
             ) from None
 
 
-def _imported(path: str, trust: bool) -> Any:
+def _import(path: str, trust: bool) -> Any:
     """Import a wrapper by its dotted path."""
     module, _, name = path.rpartition(".")
     if module == "__main__":

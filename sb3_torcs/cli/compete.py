@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
         raise InvalidOption(
             f"'{args.driver}' is a robot, which drives in the game's own races only"
         )
-    settings = driver.record.kept(("track", "car", *DRIVEN_WITH))
+    settings = driver.record.select(("track", "car", *DRIVEN_WITH))
     check_observable(
         args.driver, settings, f"`sb3-torcs race {args.driver} inferno` races it in the engine"
     )

@@ -206,7 +206,7 @@ def _drive(args: argparse.Namespace, driver: NamedDriver, noted: bool) -> Evalua
     env_id = args.env or record.env_id or GAME
     check_racing(env_id)
     check_env_kwargs(given, env_id, "--env-kwargs")
-    kwargs = {**record.kept(KEPT), **given, "laps": args.laps}
+    kwargs = {**record.select(KEPT), **given, "laps": args.laps}
     for name in ("track", "car"):
         require_one(name, kwargs.get(name))
     if args.report is not None and kwargs.get("track") == RANDOM_TRACK:

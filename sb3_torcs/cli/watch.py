@@ -145,7 +145,7 @@ def _show(game: Game, driver: NamedDriver, track: str, args: argparse.Namespace)
     from sb3_torcs.torcs.display import find_display
     from sb3_torcs.torcs.window import Window
 
-    settings = driver.record.kept(("car", *DRIVEN_WITH))
+    settings = driver.record.select(("car", *DRIVEN_WITH))
     settings |= {} if args.car is None else {"car": args.car}
     check_observable(driver.source, settings, "`--video FILE.mp4` records it, driven by the engine")
     opponents = parsed_robots(args.robots, game)

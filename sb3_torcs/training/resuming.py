@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_torcs.agents.models import check_spaces, saved_spaces, saved_timesteps, training_record
 from sb3_torcs.agents.saved.algorithm import check_same
-from sb3_torcs.agents.saved.file import as_mismatch
+from sb3_torcs.agents.saved.file import raise_mismatch
 from sb3_torcs.agents.wrapping import frames_of, normalizes
 from sb3_torcs.car import range_finder_angles
 from sb3_torcs.errors import ModelMismatch, ModelNotTrusted
@@ -39,7 +39,7 @@ def recorded_entry(model: Path, algo: str, env_id: str) -> dict[str, Any]:
     check_same(model, record.algo, algo, to_learn=True)
     if record.env_id != env_id:
         return {}
-    with as_mismatch(f"the hyperparameters in the record of '{model}' cannot be read", "give"):
+    with raise_mismatch(f"the hyperparameters in the record of '{model}' cannot be read", "give"):
         entry = as_data(record.hyperparameters)
         if "n_timesteps" not in entry:
             return entry
@@ -66,7 +66,7 @@ def restore_statistics(env: VecNormalize, model: Path) -> None:
     record = training_record(model)
     if record.statistics_file is not None:
         said = f"'{record.statistics_file}' holds no statistics to continue with"
-        with as_mismatch(said, "give"), record.statistics_file.open("rb") as file:
+        with raise_mismatch(said, "give"), record.statistics_file.open("rb") as file:
             saved = pickle.load(file)
             env.obs_rms, env.ret_rms = saved.obs_rms, saved.ret_rms
     elif record.statistics is not None:
@@ -142,7 +142,7 @@ def check_resumable(
         return False
     n_envs = int(entry.get("n_envs", 1))
     said = f"'{file}' is not a replay buffer to continue with"
-    with as_mismatch(said, "remove it, or give"), file.open("rb") as content:
+    with raise_mismatch(said, "remove it, or give"), file.open("rb") as content:
         buffer = load_from_pkl(content)
         if buffer.n_envs != n_envs:
             raise ModelMismatch(

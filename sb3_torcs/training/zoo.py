@@ -20,7 +20,7 @@ import yaml
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_torcs.agents.saved.algorithm import ALGORITHMS, SBX, algorithm_class
-from sb3_torcs.agents.wrapping import normalizes, unrebuilt, wrapped
+from sb3_torcs.agents.wrapping import find_unbuildable, normalizes, wrap_env
 from sb3_torcs.car import is_count, look_both_ways, range_finder_angles
 from sb3_torcs.errors import InvalidOption, ModelMismatch, ZooConfigError, near_miss
 from sb3_torcs.files import as_list, import_advice, path_and_arguments, read_yaml
@@ -195,7 +195,7 @@ def check_entry(entry: Entry, algo: str, env_id: str, place: Place) -> None:
     for key in ("callback", "env_wrapper", "vec_env_wrapper"):
         for path, arguments in _items(entry.get(key), key, place):
             _check_call(f"{key} {path}", _imported(path, key, place), arguments, place)
-    reason = unrebuilt(entry)
+    reason = find_unbuildable(entry)
     if reason is not None:
         raise ZooConfigError(f"{place}: {reason}; or take it away: 'vec_env_wrapper: null'")
     check_env_kwargs(entry.get("env_kwargs"), env_id, place)
@@ -222,7 +222,7 @@ def checked_env(entry: Entry, env_id: str, place: Place) -> gym.Env[Any, Any]:
     with contextlib.ExitStack() as unless_checked:
         unless_checked.callback(env.close)
         try:
-            driven = wrapped(env, entry, trust=True)
+            driven = wrap_env(env, entry, trust=True)
         except ModelMismatch as error:
             if error.__cause__ is None:
                 raise ZooConfigError(f"{place}: {error}") from error

@@ -20,7 +20,7 @@ __all__ = [
     "SBX",
     "algorithm_class",
     "check_same",
-    "known_parent",
+    "find_base_algorithm",
     "zoo_name",
 ]
 
@@ -64,7 +64,7 @@ def algorithm_class(name: str) -> Any:
     raise InvalidOption(f"{owner} has no algorithm '{name}'{near_miss(name, known, advice)}")
 
 
-def known_parent(own: type) -> type:
+def find_base_algorithm(own: type) -> type:
     """
     Find the algorithm of which another is a subclass, without importing the zoo, which patches.
 

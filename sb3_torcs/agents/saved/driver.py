@@ -50,13 +50,13 @@ class ModelDriver:
         if self.statistics is not None:
             observation = self.statistics.normalize_obs(observation)
         if self.frames is None:
-            return self._asked(observation, state, episode_start, deterministic)
+            return self._ask(observation, state, episode_start, deterministic)
         stack, state = (None, None) if state is None else state
-        stack = self._stacked(observation, stack, episode_start)
-        action, state = self._asked(stack, state, episode_start, deterministic)
+        stack = self._stack(observation, stack, episode_start)
+        action, state = self._ask(stack, state, episode_start, deterministic)
         return action, (stack, state)
 
-    def _asked(self, observation: Any, *how: Any) -> tuple[npt.NDArray[np.float32], Any]:
+    def _ask(self, observation: Any, *how: Any) -> tuple[npt.NDArray[np.float32], Any]:
         """Ask the model, whose distribution refuses what is no number."""
         from sb3_torcs.policies.threads import one_thread
 
@@ -71,7 +71,7 @@ class ModelDriver:
                 "astray"
             ) from error
 
-    def _stacked(
+    def _stack(
         self,
         observation: npt.NDArray[np.float32],
         before: npt.NDArray[np.float32] | None,

@@ -26,10 +26,10 @@ __all__ = [
     "BROKEN",
     "IDLE",
     "VALUES",
-    "as_mismatch",
     "check_finite",
+    "find_saved",
     "learned_weights",
-    "saved_as",
+    "raise_mismatch",
     "saved_data",
     "saved_weights",
 ]
@@ -61,7 +61,7 @@ BROKEN = (
 
 
 @contextmanager
-def as_mismatch(what: str, hint: str) -> Iterator[None]:
+def raise_mismatch(what: str, hint: str) -> Iterator[None]:
     """
     Turn the errors that SB3 and pickle raise for a broken file into one class.
 
@@ -79,7 +79,7 @@ def as_mismatch(what: str, hint: str) -> Iterator[None]:
         ) from error
 
 
-def saved_as(path: str | Path) -> Path:
+def find_saved(path: str | Path) -> Path:
     """
     Find the file that ``model.save(path)`` has written: it adds the ending.
 
@@ -123,7 +123,7 @@ def saved_weights(model: Path) -> dict[str, th.Tensor]:
     import torch as th
 
     what = f"'{model}' has no weights that can be read"
-    with as_mismatch(what, "give"):
+    with raise_mismatch(what, "give"):
         with zipfile.ZipFile(model) as archive:
             content = _part(archive, "policy.pth", MAX_WEIGHTS)
         _check_weights(content)

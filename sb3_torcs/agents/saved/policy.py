@@ -19,7 +19,7 @@ __all__ = [
     "plain",
     "plain_policy",
     "plain_space",
-    "restored_space",
+    "restore_space",
 ]
 
 POLICY_MODULES = (
@@ -112,7 +112,7 @@ def _bound(values: np.ndarray) -> Any:
     return numbers[0] if len(set(numbers)) == 1 else numbers
 
 
-def restored_space(said: Any) -> spaces.Space[Any] | None:
+def restore_space(said: Any) -> spaces.Space[Any] | None:
     """
     Build a space from its description.
 
@@ -149,7 +149,7 @@ def build_policy(said: Mapping[str, Any], seen: Spaces) -> Any:
         raise ModelNotTrusted(str(said["unreadable"]))
     path, kwargs = str(said.get("class")), dict(said.get("kwargs") or {})
     policy_class = _known_class(path, POLICY_MODULES)
-    kwargs = {key: _built(item) for key, item in kwargs.items() if key not in FOR_LEARNING}
+    kwargs = {key: _build(item) for key, item in kwargs.items() if key not in FOR_LEARNING}
     widths = [item for item in _numbers(kwargs) if item > 0]
     counts = [kwargs.get(name) or 1 for name in COUNTS]
     if sum(widths) ** 2 * max(counts) > MAX_NUMBERS:
@@ -175,13 +175,13 @@ def _known_class(path: str, modules: tuple[str, ...]) -> type:
     return found
 
 
-def _built(item: Any) -> Any:
+def _build(item: Any) -> Any:
     """Put the classes back into plain data."""
     if isinstance(item, dict):
         if set(item) == {"class"}:
             return _known_class(str(item["class"]), PART_MODULES)
-        return {key: _built(value) for key, value in item.items()}
-    return [_built(value) for value in item] if isinstance(item, list) else item
+        return {key: _build(value) for key, value in item.items()}
+    return [_build(value) for value in item] if isinstance(item, list) else item
 
 
 def _numbers(item: Any) -> Iterator[int]:

@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 import yaml
 
-from sb3_torcs.agents.saved.file import as_mismatch
-from sb3_torcs.agents.saved.policy import Spaces, restored_space
+from sb3_torcs.agents.saved.file import raise_mismatch
+from sb3_torcs.agents.saved.policy import Spaces, restore_space
 from sb3_torcs.car import DEFAULT_CAR
 from sb3_torcs.errors import ModelMismatch
 from sb3_torcs.files import read_yaml
@@ -104,7 +104,7 @@ class TrainingRecord:
         car = self.env_kwargs.get("car")
         return car if isinstance(car, str) else DEFAULT_CAR
 
-    def kept(self, names: Iterable[str]) -> dict[str, Any]:
+    def select(self, names: Iterable[str]) -> dict[str, Any]:
         """
         Select keyword arguments of the training's environment.
 
@@ -126,27 +126,27 @@ def record_within(model: Path, data: Mapping[str, Any]) -> TrainingRecord | None
     said = data.get(RECORD)
     if said is None:
         return None
-    with as_mismatch(f"the record in '{model}' cannot be read", "give"):
+    with raise_mismatch(f"the record in '{model}' cannot be read", "give"):
         if said["version"] > VERSION:
             raise ValueError(f"it has version {said['version']}; upgrade sb3_torcs")
         # SB3 keeps the attribute when a training resumes without writing a new record.
         if said["start_time"] != data.get("start_time"):
             return None
-        seen = tuple(restored_space(said[name]) for name in ("observation_space", "action_space"))
+        seen = tuple(restore_space(said[name]) for name in ("observation_space", "action_space"))
         return TrainingRecord(
-            algo=_typed(said, "algo", str),
-            env_id=_typed(said, "env_id", str),
-            env_kwargs=_typed(said, "env_kwargs", dict) or {},
-            hyperparameters=_typed(said, "hyperparameters", dict) or {},
+            algo=_take(said, "algo", str),
+            env_id=_take(said, "env_id", str),
+            env_kwargs=_take(said, "env_kwargs", dict) or {},
+            hyperparameters=_take(said, "hyperparameters", dict) or {},
             spaces=None if seen[0] is None or seen[1] is None else (seen[0], seen[1]),
-            policy=_typed(said, "policy", dict),
-            statistics=_statistics(_typed(said, "statistics", dict)),
-            subclass=_typed(said, "subclass", str),
+            policy=_take(said, "policy", dict),
+            statistics=_statistics(_take(said, "statistics", dict)),
+            subclass=_take(said, "subclass", str),
             driver_only=bool(said.get("driver_only")),
         )
 
 
-def _typed(said: Mapping[str, Any], key: str, kind: type) -> Any:
+def _take(said: Mapping[str, Any], key: str, kind: type) -> Any:
     """Take one value of a record."""
     if not isinstance(said.get(key), kind | None):
         raise TypeError(f"{key} is a {type(said[key]).__name__}")
@@ -215,15 +215,15 @@ def _record(folder: Path) -> TrainingRecord | None:
     if not any(file.is_file() for file in (arguments, config, statistics)):
         return None
     return TrainingRecord(
-        algo=_recorded(arguments, "algo", str),
-        env_id=_recorded(arguments, "env", str),
-        env_kwargs=_recorded(config, "env_kwargs", dict) or {},
+        algo=_read_record(arguments, "algo", str),
+        env_id=_read_record(arguments, "env", str),
+        env_kwargs=_read_record(config, "env_kwargs", dict) or {},
         hyperparameters=_read_plain(config),
         statistics_file=statistics if statistics.is_file() else None,
     )
 
 
-def _recorded(file: Path, key: str, kind: type) -> Any:
+def _read_record(file: Path, key: str, kind: type) -> Any:
     """Read one value of the zoo's records."""
     value = _read_plain(file).get(key)
     if not isinstance(value, kind | None):

@@ -24,13 +24,13 @@ from stable_baselines3.common.save_util import data_to_json
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize, unwrap_vec_wrapper
 
 from sb3_torcs import __version__
-from sb3_torcs.agents.saved.algorithm import known_parent, zoo_name
-from sb3_torcs.agents.saved.file import IDLE, VALUES, saved_as, saved_data, saved_weights
+from sb3_torcs.agents.saved.algorithm import find_base_algorithm, zoo_name
+from sb3_torcs.agents.saved.file import IDLE, VALUES, find_saved, saved_data, saved_weights
 from sb3_torcs.agents.saved.policy import (
     plain,
     plain_policy,
     plain_space,
-    restored_space,
+    restore_space,
 )
 from sb3_torcs.agents.saved.record import (
     RECORD,
@@ -108,7 +108,9 @@ def write_record(model: BaseAlgorithm, asked: Recipe) -> None:
         "observation_space": plain_space(model.observation_space),
         "action_space": plain_space(model.action_space),
         "policy": plain_policy(model),
-        "subclass": None if known_parent(own) is own else f"{own.__module__}.{own.__qualname__}",
+        "subclass": None
+        if find_base_algorithm(own) is own
+        else f"{own.__module__}.{own.__qualname__}",
         "statistics": _statistics(model),
         "start_time": model.start_time,  # tells whether a record is of the last training
         "packages": {
@@ -143,7 +145,7 @@ def write_driver(model: str | Path, driver: str | Path, *, value_function: bool 
             f"model is a {type(model).__name__}; write_driver takes the path of a saved one: "
             "model.save('model.zip'), then write_driver('model.zip', 'driver.zip')"
         )
-    model, driver = saved_as(model), Path(os.path.expanduser(driver))
+    model, driver = find_saved(model), Path(os.path.expanduser(driver))
     data, weights = saved_data(model), saved_weights(model)
     if record_within(model, data) is None:
         raise ModelMismatch(
@@ -186,7 +188,7 @@ def _leave_out_sensors(data: dict[str, Any], weights: dict[str, th.Tensor]) -> N
     sensors = record["policy"].get("kwargs", {}).get("actor_sensors")
     if sensors is None:
         return
-    seen = restored_space(record["observation_space"])
+    seen = restore_space(record["observation_space"])
     assert isinstance(seen, spaces.Box)
     columns = columns_of(seen, sensors)
     chosen = spaces.Box(seen.low[columns], seen.high[columns])
@@ -214,7 +216,7 @@ def _recipe_of_environment(model: BaseAlgorithm) -> Recipe:
     env = model.get_env()
     assert env is not None
     (spec,) = env.get_attr("spec", 0)
-    algo = zoo_name(known_parent(type(model)))
+    algo = zoo_name(find_base_algorithm(type(model)))
     seen = _frames_of(env)
     if spec is None:
         return recipe(algo, None, seen)

@@ -13,7 +13,7 @@ from sb3_torcs.agents.drivers import NamedDriver
 from sb3_torcs.agents.models import driver_record, load_driver, require_one
 from sb3_torcs.agents.rollout import drive
 from sb3_torcs.agents.scripted import SCRIPTED
-from sb3_torcs.agents.wrapping import wrapped
+from sb3_torcs.agents.wrapping import wrap_env
 from sb3_torcs.backends.native import make_engine
 from sb3_torcs.car import DEFAULT_CAR, CarState, Controls, FloatArray
 from sb3_torcs.errors import InvalidOption, RobotUnavailable
@@ -49,7 +49,7 @@ def ghost_environment(driver: NamedDriver, given: Mapping[str, Any]) -> dict[str
     """
     car = DEFAULT_CAR if driver.robot is None else find_game().find_robot(*driver.robot).car
     usual = {"track": "aalborg", "car": car, "action_repeat": 5, "action": "pedals"}
-    kwargs = {**usual, **driver.record.kept(KEPT), **given, "laps": RACE_LAPS}
+    kwargs = {**usual, **driver.record.select(KEPT), **given, "laps": RACE_LAPS}
     require_one("track", kwargs["track"])
     require_one("car", kwargs["car"])
     kwargs["track"] = stable_track(kwargs["track"])
@@ -101,7 +101,7 @@ def agents_start(agent: str, env_kwargs: Mapping[str, Any], trust: bool) -> Firs
     """
     bare = gym.make("sb3_torcs:Torcs-v0", max_episode_steps=time_limit(env_kwargs), **env_kwargs)
     try:
-        env = wrapped(bare, driver_record(agent).hyperparameters, trust=trust)
+        env = wrap_env(bare, driver_record(agent).hyperparameters, trust=trust)
         driver = load_driver(agent, env, trust=trust)
         bare.reset(seed=0)
         cars: list[CarState] = [bare.get_wrapper_attr("car")]
