@@ -191,7 +191,7 @@ def _drive(args: argparse.Namespace, driver: NamedDriver, noted: bool) -> Evalua
     import gymnasium as gym
 
     from sb3_torcs.agents.models import load_driver, require_one
-    from sb3_torcs.agents.wrapping import wrapped
+    from sb3_torcs.agents.wrapping import wrap_env
     from sb3_torcs.errors import InvalidOption
     from sb3_torcs.evaluation.protocol import GAME, KEPT, evaluate, time_limit
     from sb3_torcs.evaluation.ticks import log_drives
@@ -213,7 +213,7 @@ def _drive(args: argparse.Namespace, driver: NamedDriver, noted: bool) -> Evalua
         raise InvalidOption("--report compares laps of one track; give --track a name")
     bare = gym.make(env_id, max_episode_steps=time_limit(kwargs), **kwargs)
     with contextlib.closing(bare):
-        env = wrapped(bare, record.hyperparameters, trust=args.trust)
+        env = wrap_env(bare, record.hyperparameters, trust=args.trust)
         model = load_driver(driver.source, env, args.algo, args.trust)
         log = log_drives(bare, driver.name) if noted else DriveLog()
         episodes = evaluate(env, model, episodes=args.episodes, seed=args.seed)

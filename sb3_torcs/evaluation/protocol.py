@@ -143,12 +143,12 @@ def race_environment(
     :param track: instead of the training's
     :param laps: to drive
     :param hyperparameters: of the training, whose wrappers are put around the environment
-    :param trust: as of :func:`~sb3_torcs.agents.wrapping.wrapped`
+    :param trust: as of :func:`~sb3_torcs.agents.wrapping.wrap_env`
     :return: the environment, whose time limit never ends a race
     :raises InvalidOption: if ``laps`` is no whole number of at least 1, if there is no ``env_id``,
         or if no environment has such an argument
     """
-    from sb3_torcs.agents.wrapping import wrapped
+    from sb3_torcs.agents.wrapping import wrap_env
 
     check_count("laps", laps, MANY_LAPS)
     if not isinstance(env_id, str):
@@ -161,7 +161,7 @@ def race_environment(
     kwargs = {name: env_kwargs[name] for name in KEPT if name in env_kwargs}
     kwargs.update({"laps": laps}, **({} if track is None else {"track": track}))
     env = gym.make(env_id, max_episode_steps=time_limit(kwargs), **kwargs)
-    return wrapped(env, hyperparameters, trust=trust)
+    return wrap_env(env, hyperparameters, trust=trust)
 
 
 def _check_names(env_kwargs: Mapping[str, Any], env_id: str) -> None:
