@@ -356,7 +356,7 @@ def test_weights_that_are_no_numbers_are_told_by_name(env, file):
 ])  # fmt: skip
 def test_a_space_comes_back_from_plain_data(space):
     said = json.loads(json.dumps(model_policy.plain_space(space)))
-    assert model_policy.restored_space(said) == space
+    assert model_policy.restore_space(said) == space
 
 
 def test_a_model_of_discrete_actions_keeps_its_spaces(tmp_path):
